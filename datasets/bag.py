@@ -1,0 +1,298 @@
+"""Writing standard rosbag2 recordings: one method per kind of message, used by the converters and the simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from fgloc.recording.messages import default_typestore
+
+
+class BagWriter:
+    """Writes a rosbag2 folder. Stamps are integer nanoseconds; ``received_ns`` defaults to the stamp.
+
+    Example:
+        >>> with BagWriter(Path("out/run")) as bag:  # doctest: +SKIP
+        ...     bag.command("/cmd_vel", 1_000_000_000, v=0.2, omega=0.0)
+    """
+
+    def __init__(self, path: Path, storage: str = "mcap", overwrite: bool = False) -> None:
+        """Open a new bag folder.
+
+        Args:
+            path: folder to be made.
+            storage: "mcap" or "sqlite3".
+            overwrite: replace an existing bag folder (one that holds a metadata.yaml).
+
+        Raises:
+            FileExistsError: the folder exists and is not to be replaced.
+        """
+        if path.exists():
+            if not (overwrite and (path / "metadata.yaml").is_file()):
+                raise FileExistsError(f"{path} exists; give another folder or remove it")
+            for file in path.iterdir():
+                file.unlink()
+            path.rmdir()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._store = default_typestore()
+        plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
+        self._writer = Writer(path, version=9, storage_plugin=plugin)
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> BagWriter:
+        self._writer.open()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._writer.close()
+
+    # --- messages ---
+
+    def command(
+        self, topic: str, stamp_ns: int, v: float, omega: float, received_ns: int | None = None, frame_id: str = ""
+    ) -> None:
+        """``geometry_msgs/TwistStamped``: v [m/s], omega [rad/s]."""
+        twist = self._twist([v, 0.0, 0.0], [0.0, 0.0, omega])
+        self._write(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, received_ns, frame_id, dict(twist=twist))
+
+    def odometry(
+        self,
+        topic: str,
+        stamp_ns: int,
+        pose: Sequence[float],
+        twist: Sequence[float],
+        received_ns: int | None = None,
+        pose_cov: ArrayLike | None = None,
+        twist_cov: ArrayLike | None = None,
+        frame_id: str = "odom",
+        child_frame_id: str = "base_link",
+    ) -> None:
+        """``nav_msgs/Odometry``: pose x, y, yaw; twist v, omega; covariances (6, 6) in ROS order or None (zeros)."""
+        content = dict(
+            child_frame_id=child_frame_id,
+            pose=self._make(
+                "geometry_msgs/msg/PoseWithCovariance", pose=self._planar_pose(pose), covariance=_cov36(pose_cov)
+            ),
+            twist=self._make(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self._twist([twist[0], 0.0, 0.0], [0.0, 0.0, twist[1]]),
+                covariance=_cov36(twist_cov),
+            ),
+        )
+        self._write(topic, "nav_msgs/msg/Odometry", stamp_ns, received_ns, frame_id, content)
+
+    def joints(
+        self,
+        topic: str,
+        stamp_ns: int,
+        names: Sequence[str],
+        position: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+        received_ns: int | None = None,
+    ) -> None:
+        """``sensor_msgs/JointState``: rad, rad/s, Nm; an empty sequence is left empty."""
+        content = dict(
+            name=list(names),
+            position=np.asarray(position, dtype=float),
+            velocity=np.asarray(velocity, dtype=float),
+            effort=np.asarray(effort, dtype=float),
+        )
+        self._write(topic, "sensor_msgs/msg/JointState", stamp_ns, received_ns, "", content)
+
+    def imu(
+        self,
+        topic: str,
+        stamp_ns: int,
+        angular_velocity: Sequence[float],
+        linear_acceleration: Sequence[float],
+        received_ns: int | None = None,
+        frame_id: str = "imu_link",
+        angular_velocity_variance: float = 0.0,
+        linear_acceleration_variance: float = 0.0,
+    ) -> None:
+        """``sensor_msgs/Imu`` without orientation (its covariance starts with -1, as REP 145 says)."""
+        no_orientation = np.zeros(9)
+        no_orientation[0] = -1.0
+        content = dict(
+            orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=no_orientation,
+            angular_velocity=self._vector(angular_velocity),
+            angular_velocity_covariance=np.eye(3).ravel() * angular_velocity_variance,
+            linear_acceleration=self._vector(linear_acceleration),
+            linear_acceleration_covariance=np.eye(3).ravel() * linear_acceleration_variance,
+        )
+        self._write(topic, "sensor_msgs/msg/Imu", stamp_ns, received_ns, frame_id, content)
+
+    def compressed_image(
+        self,
+        topic: str,
+        stamp_ns: int,
+        data: bytes,
+        image_format: str = "jpeg",
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``sensor_msgs/CompressedImage`` of encoded bytes."""
+        content = dict(format=image_format, data=np.frombuffer(data, dtype=np.uint8))
+        self._write(topic, "sensor_msgs/msg/CompressedImage", stamp_ns, received_ns, frame_id, content)
+
+    def camera_info(
+        self,
+        topic: str,
+        stamp_ns: int,
+        width: int,
+        height: int,
+        K: ArrayLike,
+        D: Sequence[float],
+        distortion_model: str = "plumb_bob",
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``sensor_msgs/CameraInfo`` of an unrectified camera, K (3, 3)."""
+        matrix = np.asarray(K, dtype=float).reshape(3, 3)
+        projection = np.zeros((3, 4))
+        projection[:, :3] = matrix
+        content = dict(
+            height=height,
+            width=width,
+            distortion_model=distortion_model,
+            d=np.asarray(D, dtype=float),
+            k=matrix.ravel(),
+            r=np.eye(3).ravel(),
+            p=projection.ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=self._make(
+                "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            ),
+        )
+        self._write(topic, "sensor_msgs/msg/CameraInfo", stamp_ns, received_ns, frame_id, content)
+
+    def static_transform(
+        self,
+        stamp_ns: int,
+        parent: str,
+        child: str,
+        translation: Sequence[float],
+        quaternion: Sequence[float],
+        received_ns: int | None = None,
+        topic: str = "/tf_static",
+    ) -> None:
+        """``tf2_msgs/TFMessage`` with one transform ``T_parent_child``; quaternion x, y, z, w."""
+        transform = self._make(
+            "geometry_msgs/msg/Transform",
+            translation=self._vector(translation),
+            rotation=self._quaternion(quaternion),
+        )
+        stamped = self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=transform,
+        )
+        message = self._make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+        self.write(topic, "tf2_msgs/msg/TFMessage", message, stamp_ns if received_ns is None else received_ns)
+
+    def truth(
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        received_ns: int | None = None,
+        frame_id: str = "map",
+    ) -> None:
+        """``geometry_msgs/PoseStamped``; quaternion x, y, z, w."""
+        pose = self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", **_xyz(position)),
+            orientation=self._quaternion(quaternion),
+        )
+        self._write(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, received_ns, frame_id, dict(pose=pose))
+
+    def range_bearing(
+        self,
+        topic: str,
+        stamp_ns: int,
+        sightings: Iterable[tuple[int, float, float]],
+        received_ns: int | None = None,
+        frame_id: str = "base_link",
+    ) -> None:
+        """``landmark_msgs/LandmarkArray`` of (id, range [m], bearing [rad])."""
+        landmarks = [
+            self._make(
+                "landmark_msgs/msg/Landmark",
+                id=i,
+                hamming=0,
+                goodness=1.0,
+                decision_margin=1.0,
+                range=r,
+                bearing=b,
+            )
+            for i, r, b in sightings
+        ]
+        content = dict(landmarks=landmarks)
+        self._write(topic, "landmark_msgs/msg/LandmarkArray", stamp_ns, received_ns, frame_id, content)
+
+    def write(self, topic: str, message_type: str, message: Any, received_ns: int) -> None:
+        """Write any message of the typestore."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, message_type, typestore=self._store)
+        raw = self._store.serialize_cdr(message, message_type)
+        self._writer.write(self._connections[topic], received_ns, raw)
+
+    def make(self, message_type: str, **fields: Any) -> Any:
+        """A message of the typestore, for `write`."""
+        return self._make(message_type, **fields)
+
+    # --- parts of messages ---
+
+    def _make(self, message_type: str, **fields: Any) -> Any:
+        return self._store.types[message_type](**fields)
+
+    def _write(
+        self, topic: str, kind: str, stamp_ns: int, received_ns: int | None, frame_id: str, content: dict[str, Any]
+    ) -> None:
+        message = self._make(kind, header=self._header(stamp_ns, frame_id), **content)
+        self.write(topic, kind, message, stamp_ns if received_ns is None else received_ns)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        time = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+    def _vector(self, xyz: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", **_xyz(xyz))
+
+    def _quaternion(self, xyzw: Sequence[float]) -> Any:
+        x, y, z, w = (float(value) for value in xyzw)
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def _twist(self, linear: Sequence[float], angular: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector(angular))
+
+    def _planar_pose(self, pose: Sequence[float]) -> Any:
+        x, y, yaw = pose
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", **_xyz((x, y, 0.0))),
+            orientation=self._quaternion((0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))),
+        )
+
+
+def _xyz(values: Sequence[float]) -> dict[str, float]:
+    x, y, z = (float(value) for value in values)
+    return {"x": x, "y": y, "z": z}
+
+
+def _cov36(cov: ArrayLike | None) -> Any:
+    return np.zeros(36) if cov is None else np.asarray(cov, dtype=float).reshape(36)

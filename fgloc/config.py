@@ -1,0 +1,239 @@
+"""Configuration: strict pydantic models, read from ``robot.yaml`` and written out, resolved, beside every result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from fgloc.errors import ConfigError
+
+
+class Section(BaseModel):
+    """A part of the configuration: unknown keys are errors, values are immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Role = Literal["odometry", "command", "joints", "imu", "image", "camera_info", "sightings", "truth"]
+
+
+class TopicsConfig(Section):
+    """Topic of each role. None: found by message type; "none": not used although it is there."""
+
+    odometry: str | None = None
+    command: str | None = None
+    joints: str | None = None
+    imu: str | None = None
+    image: str | None = None
+    camera_info: str | None = None
+    sightings: str | None = None
+    truth: str | None = None
+
+
+class RecordingConfig(Section):
+    """How to read a recording."""
+
+    topics: TopicsConfig = TopicsConfig()
+    received_stamps: tuple[Role, ...] = Field((), description="roles whose header stamps are wrong: use receive times")
+    stamp_offset_s: dict[Role, float] = Field({}, description="added to a role's stamps [s]: a known clock offset")
+    base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
+    sightings_pose: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="sensor in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+    )
+    sightings_axes: Literal["body", "optical"] | None = Field(
+        None,
+        description="axes that sightings_pose or marker poses refer to: x forward, or z forward; None: optical for "
+        "cameras (images, corners), body for the rest",
+    )
+
+
+class GateConfig(Section):
+    """What is too wrong to enter the graph."""
+
+    max_speed: float = Field(5.0, gt=0, description="m/s")
+    max_yaw_rate: float = Field(10.0, gt=0, description="rad/s")
+    max_wheel_rate: float = Field(500.0, gt=0, description="rad/s")
+    max_position: float = Field(1e6, gt=0, description="m, of an odometry or truth pose")
+    max_range: float = Field(50.0, gt=0, description="m, of a sighting")
+    min_range: float = Field(0.02, gt=0, description="m")
+    max_variance: float = Field(1e6, gt=0, description="above it a variance says 'unknown'")
+    quaternion_tolerance: float = Field(0.05, gt=0, description="less off unit length: normalised; more: rejected")
+    gap_s: float = Field(1.0, gt=0, description="a silence of a sensor longer than this is reported")
+    clock_jump_s: float = Field(60.0, gt=0, description="a jump ahead larger than this starts a new segment")
+    clock_back_s: float = Field(1.0, gt=0, description="a jump back larger than this starts a new segment")
+    min_marker_side_px: float = Field(8.0, gt=0, description="a smaller marker is not believed")
+
+
+class KeyframesConfig(Section):
+    """When a pose is added to the graph."""
+
+    max_interval_s: float = Field(0.2, gt=0)
+    min_interval_s: float = Field(0.05, ge=0)
+    reorder_s: float = Field(0.1, ge=0, description="late messages wait this long to be put in order")
+    history_s: float = Field(2.0, ge=0, description="commands before a step that the learned motion may read")
+
+
+class NoiseDensity(Section):
+    """White-noise densities: standard deviation per square root of distance, rotation or time.
+
+    The variance over a step is the sum of each squared density times the metres, radians and seconds travelled, so that
+    splitting a step leaves the covariance as it was.
+    """
+
+    x_per_sqrt_m: float = Field(0.03, ge=0, description="m/√m, along the motion")
+    y_per_sqrt_m: float = Field(0.015, ge=0, description="m/√m, across the motion")
+    yaw_per_sqrt_m: float = Field(0.03, ge=0, description="rad/√m")
+    xy_per_sqrt_rad: float = Field(0.01, ge=0, description="m/√rad")
+    yaw_per_sqrt_rad: float = Field(0.05, ge=0, description="rad/√rad")
+    xy_per_sqrt_s: float = Field(0.002, ge=0, description="m/√s, also at rest")
+    yaw_per_sqrt_s: float = Field(0.002, ge=0, description="rad/√s, also at rest")
+
+
+class WheelsConfig(Section):
+    """Wheel odometry."""
+
+    source: Literal["auto", "twist", "pose", "ticks", "command", "none"] = Field(
+        "auto",
+        description="twist or pose differences of the odometry, wheel angles of the joints, or (no encoder) the "
+        "commands; auto: ticks if the wheels' geometry is given, else twist unless it is zero while the pose moves, "
+        "else pose, else command",
+    )
+    left_joint: str | None = None
+    right_joint: str | None = None
+    left_radius: float | None = Field(None, gt=0, le=2.0, description="m")
+    right_radius: float | None = Field(None, gt=0, le=2.0, description="m")
+    track: float | None = Field(None, gt=0, le=5.0, description="m, between the wheels' contact points")
+    angle_range: float | None = Field(None, gt=0, description="rad: the angle rolls over after this much; None: never")
+    scale_v: float = Field(1.0, gt=0, description="true over reported forward speed")
+    scale_omega: float = Field(1.0, gt=0, description="true over reported yaw rate")
+    delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
+    hold_s: float = Field(0.5, gt=0, description="a twist is held for this long when the next one is missing")
+    zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
+    zero_yaw_rate: float = Field(0.0, ge=0, description="rad/s below which a reported rate is rest")
+    noise: NoiseDensity = NoiseDensity()
+
+
+class CameraConfig(Section):
+    """The camera, where the recording does not say."""
+
+    file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
+    rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
+
+
+class MarkersConfig(Section):
+    """Marker detection in images."""
+
+    dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
+    default_size_m: float | None = Field(None, gt=0, le=5.0, description="side, for maps that give none")
+    sigma_px: float = Field(0.5, gt=0, description="noise of one corner coordinate")
+    cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
+    max_sightings: int = Field(12, gt=0, description="the largest markers of an image that are used")
+
+
+class LandmarksConfig(Section):
+    """Range/bearing and marker-pose sightings."""
+
+    range_sigma_m: float = Field(0.1, gt=0)
+    range_sigma_per_m: float = Field(0.0, ge=0, description="added range sigma per metre of range")
+    bearing_sigma_rad: float = Field(0.02, gt=0)
+    range_scale: float = Field(1.0, gt=0, description="true over reported range")
+    range_bias_m: float = Field(0.0, description="subtracted from the reported range")
+    bearing_bias_rad: float = Field(0.0, description="subtracted from the reported bearing")
+    yaw_sigma_rad: float | None = Field(
+        None, gt=0, description="of a marker pose's yaw; None: marker poses are used as range and bearing only"
+    )
+    cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
+    min_sightings: int = Field(3, gt=0, description="sightings that an unknown landmark needs before it is believed")
+    repeat_s: float = Field(
+        0.0,
+        ge=0,
+        description="correlation time of one landmark's errors: sightings closer than this share their information",
+    )
+
+
+class MotionConfig(Section):
+    """The learned motion model."""
+
+    model: Path | None = Field(None, description="a .safetensors file of training.export")
+    use: bool = True
+    correlation: Literal["joint", "independent"] = Field(
+        "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
+    )
+
+
+class EstimatorConfig(Section):
+    """The incremental estimator."""
+
+    kind: Literal["fixed_lag", "isam2"] = "fixed_lag"
+    lag_s: float = Field(10.0, gt=0)
+    relinearize_threshold: float = Field(0.01, gt=0)
+    initial_pose: tuple[float, float, float] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
+    initial_sigmas: tuple[float, float, float] = (0.05, 0.05, 0.05)
+    initialise_s: float = Field(5.0, gt=0, description="how long to collect sightings for the first pose")
+    gate_probability: float = Field(0.9999, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
+    lost_after: int = Field(20, gt=0, description="consecutive rejected sightings that mean LOST")
+    dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
+
+
+class BatchConfig(Section):
+    """The batch smoother."""
+
+    outer_iterations: int = Field(2, ge=1, description="learned motion is re-evaluated at the smoothed velocities")
+    max_iterations: int = Field(50, ge=1, description="of Levenberg–Marquardt, each")
+
+
+class TruthConfig(Section):
+    """What is known of the truth's frame. Only evaluation reads it."""
+
+    yaw_offset_rad: float = Field(0.0, description="yaw of the truth's body axes in the base frame; subtracted")
+    align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
+    max_gap_s: float = Field(0.2, gt=0, description="the truth is not interpolated across longer gaps")
+
+
+class Config(Section):
+    """Everything. ``robot.yaml`` holds the parts that differ from these defaults."""
+
+    recording: RecordingConfig = RecordingConfig()
+    gate: GateConfig = GateConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
+    wheels: WheelsConfig = WheelsConfig()
+    camera: CameraConfig = CameraConfig()
+    markers: MarkersConfig = MarkersConfig()
+    landmarks: LandmarksConfig = LandmarksConfig()
+    motion: MotionConfig = MotionConfig()
+    estimator: EstimatorConfig = EstimatorConfig()
+    batch: BatchConfig = BatchConfig()
+    truth: TruthConfig = TruthConfig()
+
+
+_PATH_KEYS = (("camera", "file"), ("motion", "model"))
+
+
+def load_config(path: Path) -> Config:
+    """Read a YAML configuration. Relative paths in it are relative to the file.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or has an unknown key or a value out of range; all are named.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file with --config") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not YAML: {error}") from error
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected a mapping of sections, got {type(data).__name__}")
+    for section, key in _PATH_KEYS:
+        part = data.get(section)
+        if isinstance(part, dict) and isinstance(part.get(key), str):
+            part[key] = path.parent / part[key]
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+        raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error

@@ -1,0 +1,50 @@
+"""Every error the package raises on purpose.
+
+    FglocError
+    ├── ConfigError          a configuration file or value
+    ├── RecordingError       a bag, its topics or its messages
+    ├── MapError             a marker map file
+    ├── CameraError          a calibration: file, CameraInfo or extrinsic
+    ├── ModelError           a learned motion model file
+    ├── CovarianceError      a covariance that is not one
+    ├── TrajectoryError      a trajectory file, or two that do not overlap
+    └── EstimatorError       the estimator was given what it cannot use
+
+A message gives the value found, what was expected and the remedy. The command line turns these into exit code 1.
+"""
+
+
+class FglocError(Exception):
+    """Base of all errors raised on purpose."""
+
+
+class ConfigError(FglocError):
+    """A configuration file or value cannot be used."""
+
+
+class RecordingError(FglocError):
+    """A recording cannot be read, or lacks what the task needs."""
+
+
+class MapError(FglocError):
+    """A marker map cannot be used."""
+
+
+class CameraError(FglocError):
+    """A camera calibration or extrinsic cannot be used."""
+
+
+class ModelError(FglocError):
+    """A learned motion model cannot be used."""
+
+
+class CovarianceError(FglocError):
+    """A matrix is not a covariance: not symmetric, not finite or not positive definite."""
+
+
+class TrajectoryError(FglocError):
+    """A trajectory cannot be read, or trajectories cannot be compared."""
+
+
+class EstimatorError(FglocError):
+    """The estimator was given something that it cannot use."""

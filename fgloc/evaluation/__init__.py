@@ -1,0 +1,1 @@
+"""Metrics, consistency, plots (the only matplotlib importer), report."""

@@ -1,0 +1,70 @@
+"""Frame names, and the one place that reorders ROS and GTSAM covariances and flattens 3D poses to the plane."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MAP, ODOM, BASE, CAM, MARKER = "map", "odom", "base", "cam", "marker"
+
+BASE_NAMES = ("base_link", "base_footprint", "base")  # what robots call our "base", first match wins
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z in ROS order
+_ROS_TO_GTSAM = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+
+
+def planar_cov(cov_ros: FloatArray) -> FloatArray:
+    """x, y, yaw block ``(3, 3)`` of a ROS pose or twist covariance ``(6, 6)``."""
+    return cov_ros[_PLANAR].copy()
+
+
+def ros_to_gtsam_cov(cov_ros: FloatArray) -> FloatArray:
+    """Reorder ``(6, 6)`` from translation, rotation (ROS) to rotation, translation (GTSAM Pose3); its own inverse."""
+    return cov_ros[_ROS_TO_GTSAM].copy()
+
+
+def quaternion_yaw(quaternion: Sequence[float] | FloatArray) -> float:
+    """Yaw [rad] of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def yaw_quaternion(yaw: float) -> FloatArray:
+    """Quaternion x, y, z, w of a rotation about z by yaw [rad]."""
+    return np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
+
+
+def quaternion_matrix(quaternion: Sequence[float] | FloatArray) -> FloatArray:
+    """Rotation matrix ``(3, 3)`` of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def transform_matrix(translation: Sequence[float] | FloatArray, quaternion: Sequence[float] | FloatArray) -> FloatArray:
+    """Homogeneous ``(4, 4)`` of a translation [m] and a unit quaternion x, y, z, w."""
+    T = np.eye(4)
+    T[:3, :3] = quaternion_matrix(quaternion)
+    T[:3, 3] = translation
+    return T
+
+
+def rpy_matrix(roll: float, pitch: float, yaw: float) -> FloatArray:
+    """Rotation matrix ``(3, 3)`` of fixed-axis roll, pitch, yaw [rad], as ROS and URDF use them."""
+    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

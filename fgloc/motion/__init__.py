@@ -1,0 +1,1 @@
+"""Learned motion, inference only: numpy and safetensors, no torch."""

@@ -1,0 +1,1 @@
+"""Recordings in (bags to events, the only rosbags importer) and results out."""

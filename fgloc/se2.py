@@ -1,0 +1,108 @@
+"""SE(2) in plain numpy: composition, exponential, logarithm, adjoint.
+
+A pose or motion is ``(3,)``: x [m], y [m], yaw [rad]. The tangent order is x, y, yaw; perturbations act on the right
+(in the body frame), as in GTSAM's ``Pose2``.
+
+Source: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, section on SE(2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Triple = Sequence[float] | FloatArray
+_SMALL = 1e-9
+
+
+def wrap(angle: float) -> float:
+    """Wrap an angle [rad] into [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def wrap_array(angles: FloatArray) -> FloatArray:
+    """Wrap angles [rad] of any shape into [-pi, pi)."""
+    return np.asarray((np.asarray(angles, dtype=float) + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def compose(a: Triple, b: Triple) -> FloatArray:
+    """``T_a ∘ T_b``; the yaw is wrapped."""
+    ax, ay, at = a
+    bx, by, bt = b
+    c, s = math.cos(at), math.sin(at)
+    return np.array([ax + c * bx - s * by, ay + s * bx + c * by, wrap(at + bt)])
+
+
+def inverse(a: Triple) -> FloatArray:
+    """``T_a⁻¹``."""
+    ax, ay, at = a
+    c, s = math.cos(at), math.sin(at)
+    return np.array([-c * ax - s * ay, s * ax - c * ay, wrap(-at)])
+
+
+def between(a: Triple, b: Triple) -> FloatArray:
+    """``T_a⁻¹ ∘ T_b``: b seen from a."""
+    return compose(inverse(a), b)
+
+
+def exp(twist: Triple) -> FloatArray:
+    """Exponential map of (dx, dy, dyaw): the exact pose after constant body twist for unit time."""
+    x, y, t = twist
+    if abs(t) < _SMALL:
+        a, b = 1.0, 0.5 * t
+    else:
+        a, b = math.sin(t) / t, (1.0 - math.cos(t)) / t
+    return np.array([a * x - b * y, b * x + a * y, wrap(t)])
+
+
+def log(pose: Triple) -> FloatArray:
+    """Logarithm: the constant body twist that reaches the pose in unit time."""
+    x, y, t = pose
+    t = wrap(t)
+    half = 0.5 * t
+    a = 1.0 - half * half / 3.0 if abs(t) < 1e-5 else half / math.tan(half)
+    return np.array([a * x + half * y, -half * x + a * y, t])
+
+
+def adjoint(pose: Triple) -> FloatArray:
+    """Adjoint ``(3, 3)``: moves a right perturbation through the pose, ``Ad(T) ξ = log(T exp(ξ) T⁻¹)``."""
+    x, y, t = pose
+    c, s = math.cos(t), math.sin(t)
+    return np.array([[c, -s, y], [s, c, -x], [0.0, 0.0, 1.0]])
+
+
+def compose_cov(cov_a: FloatArray, b: Triple, cov_b: FloatArray) -> FloatArray:
+    """Covariance ``(3, 3)`` of ``T_a ∘ T_b`` for independent right perturbations of both.
+
+    Source: first order, ``Ad(b⁻¹) Σ_a Ad(b⁻¹)ᵀ + Σ_b``.
+    """
+    ad = adjoint(inverse(b))
+    return np.asarray(ad @ cov_a @ ad.T + cov_b)
+
+
+def rotate_cov(cov: FloatArray, yaw: float) -> FloatArray:
+    """Turn the x and y of a body-frame covariance ``(3, 3)`` into the frame in which the body has this yaw [rad]."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    r = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(r @ cov @ r.T)
+
+
+def interpolate(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: NDArray[np.int64]) -> FloatArray:
+    """Poses ``(m, 3)`` at the asked times, linear in x, y and in the shorter way round in yaw.
+
+    Args:
+        stamps_ns: ``(n,)`` increasing times of the known poses.
+        poses: ``(n, 3)``.
+        at_ns: ``(m,)`` times inside the known range; outside it the nearest pose is held.
+    """
+    origin = int(stamps_ns[0])
+    known = (stamps_ns - origin) * 1e-9
+    asked = (at_ns - origin) * 1e-9
+    yaw = np.interp(asked, known, np.unwrap(poses[:, 2]))
+    return np.column_stack(
+        [np.interp(asked, known, poses[:, 0]), np.interp(asked, known, poses[:, 1]), wrap_array(yaw)]
+    )

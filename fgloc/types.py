@@ -1,0 +1,379 @@
+"""What crosses module borders: events, steps, measurements, estimates.
+
+Data flows one way: ``Event → gate → Step → Measurement → weigh → factor → Estimate``. Everything here is frozen. Times
+are ``stamp_ns`` (when the sensor measured) and ``received_ns`` (when the recorder got it), both integers; everything
+else is SI. Arrays are float64 and are not to be written to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+# --- Events: one message (or one transform of one), as recorded, before the gate -------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Event:
+    """Something a recording or a live stream said at one time."""
+
+    stamp_ns: int
+    received_ns: int
+    topic: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryEvent(Event):
+    """``nav_msgs/Odometry``: pose of ``child_frame_id`` in ``frame_id`` and body twist."""
+
+    frame_id: str
+    child_frame_id: str
+    position: FloatArray  # (3,) m
+    orientation: FloatArray  # (4,) quaternion x, y, z, w
+    pose_cov: FloatArray  # (6, 6) ROS order: translation, rotation
+    linear: FloatArray  # (3,) m/s
+    angular: FloatArray  # (3,) rad/s
+    twist_cov: FloatArray  # (6, 6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommandEvent(Event):
+    """``geometry_msgs/Twist`` or ``TwistStamped``: what the robot was told to do."""
+
+    v: float  # m/s, forward
+    omega: float  # rad/s, counter-clockwise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointsEvent(Event):
+    """``sensor_msgs/JointState``. An array that the message left empty has length 0."""
+
+    names: tuple[str, ...]
+    position: FloatArray  # (n,) rad
+    velocity: FloatArray  # (n,) rad/s
+    effort: FloatArray  # (n,) Nm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuEvent(Event):
+    """``sensor_msgs/Imu``."""
+
+    frame_id: str
+    angular_velocity: FloatArray  # (3,) rad/s
+    linear_acceleration: FloatArray  # (3,) m/s²
+    angular_velocity_cov: FloatArray  # (3, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageEvent(Event):
+    """``sensor_msgs/Image`` or ``CompressedImage``, not decoded."""
+
+    frame_id: str
+    encoding: str  # ROS encoding ("mono8", "bgr8", ...); for a compressed image its format ("jpeg", "png", ...)
+    compressed: bool
+    width: int  # 0 if compressed
+    height: int
+    step: int  # bytes per row; 0 if compressed
+    is_bigendian: bool
+    data: NDArray[np.uint8]  # (n,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraInfoEvent(Event):
+    """``sensor_msgs/CameraInfo``."""
+
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str
+    K: FloatArray  # (3, 3)
+    D: FloatArray  # (n,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TransformEvent(Event):
+    """One transform of ``/tf`` or ``/tf_static``: ``T_parent_child``."""
+
+    parent: str
+    child: str
+    translation: FloatArray  # (3,)
+    rotation: FloatArray  # (4,) quaternion x, y, z, w
+    static: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerCorners:
+    """One marker in one image. Corners: top-left, top-right, bottom-right, bottom-left of the upright marker."""
+
+    marker_id: int
+    corners_px: FloatArray  # (4, 2) u, v in the recorded (distorted) image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPose:
+    """One marker's pose in the sensor frame."""
+
+    marker_id: int
+    position: FloatArray  # (3,)
+    orientation: FloatArray  # (4,) quaternion x, y, z, w
+    cov: FloatArray  # (6, 6) ROS order; zeros if the message gives none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeBearing:
+    """Distance and direction to one landmark in the sensor's plane (x forward, bearing counter-clockwise)."""
+
+    landmark_id: int
+    range_m: float
+    bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornersEvent(Event):
+    """Markers found in one image: ``apriltag_msgs/AprilTagDetectionArray``, or our detector on an ImageEvent."""
+
+    frame_id: str
+    sightings: tuple[MarkerCorners, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPosesEvent(Event):
+    """``aruco_msgs/MarkerArray`` or ``vision_msgs/Detection3DArray``."""
+
+    frame_id: str
+    sightings: tuple[MarkerPose, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeBearingEvent(Event):
+    """``landmark_msgs/LandmarkArray``."""
+
+    frame_id: str
+    sightings: tuple[RangeBearing, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthEvent(Event):
+    """Pose from an external positioning system. Never reaches the estimator."""
+
+    frame_id: str
+    position: FloatArray  # (3,)
+    orientation: FloatArray  # (4,) quaternion x, y, z, w
+
+
+SightingsEvent = CornersEvent | MarkerPosesEvent | RangeBearingEvent
+
+
+# --- Maps and cameras -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Intrinsics and mounting.
+
+    ``model`` is ``"plumb_bob"`` (D: k1 k2 p1 p2 [k3]) or ``"equidistant"`` (fisheye, D: k1 k2 k3 k4).
+    """
+
+    width: int
+    height: int
+    model: str
+    K: FloatArray  # (3, 3)
+    D: FloatArray  # (n,)
+    T_base_cam: FloatArray  # (4, 4), cam is the optical frame: z forward, x right, y down
+    frame_id: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A marker or beacon of the map.
+
+    ``size_m`` is the side of the black square, 0 if the landmark is a point; ``rotation`` is of the marker frame: x to
+    the marker's right as seen, y to its top, z out of its face towards the viewer.
+    """
+
+    landmark_id: int
+    position: FloatArray  # (3,) m in the map frame
+    rotation: FloatArray  # (3, 3) R_map_marker; identity for a point
+    size_m: float
+    cov: FloatArray | None = None  # (2, 2) of x, y for an estimated landmark
+
+    def corners(self) -> FloatArray:
+        """Corners ``(4, 3)`` in the map frame, in the order of MarkerCorners."""
+        h = 0.5 * self.size_m
+        local = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+        return np.asarray(self.position + local @ self.rotation.T)
+
+    @property
+    def planar(self) -> FloatArray:
+        """``(3,)`` x, y, yaw: yaw of the face normal if the marker stands, of its x axis if it lies."""
+        axis = self.rotation[:, 2] if abs(self.rotation[2, 2]) < 0.7 else self.rotation[:, 0]
+        return np.array([self.position[0], self.position[1], np.arctan2(axis[1], axis[0])])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """Landmarks by id; ``dictionary`` is OpenCV's name (``"DICT_4X4_50"``) or empty."""
+
+    landmarks: Mapping[int, Landmark]
+    dictionary: str = ""
+    source: str = ""
+
+    def __contains__(self, landmark_id: int) -> bool:
+        return landmark_id in self.landmarks
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+
+# --- Steps ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """All that was heard between two keyframes, gated and in order of stamp.
+
+    Each sensor's tuple holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the last one
+    at or before the start, and the first one at or after the end where known. ``commands`` reach back ``history_s``
+    further. ``sightings`` were made at ``stamp_ns`` (the keyframe) or, arriving late, at their own stamps in the lag.
+    """
+
+    index: int
+    segment: int  # counts up where the clock jumped; a new segment shares no motion with the one before
+    start_ns: int
+    stamp_ns: int
+    odometry: tuple[OdometryEvent, ...] = ()
+    commands: tuple[CommandEvent, ...] = ()
+    joints: tuple[JointsEvent, ...] = ()
+    imu: tuple[ImuEvent, ...] = ()
+    sightings: tuple[SightingsEvent, ...] = ()
+
+    @property
+    def dt(self) -> float:
+        """Length [s]."""
+        return (self.stamp_ns - self.start_ns) * 1e-9
+
+
+# --- Measurements -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionMeasurement:
+    """``T_start_end`` of the base, from ``source`` ("wheels" or "learned"), with right-perturbation covariance."""
+
+    source: str
+    start_ns: int
+    stamp_ns: int
+    motion: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerMeasurement:
+    """Four corners of one marker, rid of what Cal3DS2 cannot model, with isotropic noise."""
+
+    stamp_ns: int
+    landmark_id: int
+    corners_px: FloatArray  # (4, 2)
+    sigma_px: float
+    camera: Camera  # plumb_bob, whose D explains corners_px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeBearingMeasurement:
+    """A landmark's direction and distance from the base (the sensor's offset is already taken out)."""
+
+    stamp_ns: int
+    landmark_id: int
+    range_m: float
+    bearing_rad: float
+    cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPoseMeasurement:
+    """A standing marker's planar pose ``T_base_marker`` (see Landmark.planar) with right-perturbation covariance."""
+
+    stamp_ns: int
+    landmark_id: int
+    pose: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+
+
+LandmarkMeasurement = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
+Measurement = MotionMeasurement | LandmarkMeasurement
+
+
+# --- Results ----------------------------------------------------------------------------------------------------------
+
+
+class Mode(StrEnum):
+    """How the estimate came about."""
+
+    OK = "OK"
+    DEAD_RECKONING = "DEAD_RECKONING"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """What became of one measurement: a row of ``steps.csv``."""
+
+    step: int
+    stamp_ns: int
+    kind: str  # "wheels", "learned", "corners", "range_bearing", "marker_pose", "prior"
+    landmark_id: int  # -1 for motion
+    residual: float  # norm of the whitened residual against the prediction
+    nis: float
+    dof: int
+    weight: float  # 1 as given, less if inflated, 0 if rejected
+    reason: str  # "" if used as given
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """``T_map_base`` at one keyframe. ``cov`` is in the map frame."""
+
+    stamp_ns: int
+    pose: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+    mode: Mode = Mode.OK
+    decisions: tuple[Decision, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses over time. ``covs`` is in the map frame; None where unknown (a truth)."""
+
+    stamps_ns: IntArray  # (n,) strictly increasing
+    poses: FloatArray  # (n, 3)
+    covs: FloatArray | None = None  # (n, 3, 3)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """A whole run, ready to be evaluated and written."""
+
+    trajectory: Trajectory
+    modes: tuple[Mode, ...]  # one per pose
+    decisions: tuple[Decision, ...]
+    counts: Mapping[str, int]  # factors held, by kind
+    rejections: Mapping[str, int]  # items rejected, by reason
+    notes: tuple[str, ...]  # what the user should know, one sentence each
+    step_ms: FloatArray  # (n,) wall time of each update
+    wall_s: float
+    truth: Trajectory | None = None
+    landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
+    spans: Mapping[str, FloatArray] = field(default_factory=dict)  # sensor -> (n,) s from start
+    source: Path | None = None
