@@ -140,6 +140,9 @@ class LandmarksConfig(Section):
     range_sigma_per_m: float = Field(0.0, ge=0, description="added range sigma per metre of range")
     bearing_sigma_rad: float = Field(0.02, gt=0)
     range_scale: float = Field(1.0, gt=0, description="true over reported range")
+    range_along_axis: bool = Field(
+        False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
+    )
     range_bias_m: float = Field(0.0, description="subtracted from the reported range")
     bearing_bias_rad: float = Field(0.0, description="subtracted from the reported bearing")
     yaw_sigma_rad: float | None = Field(
