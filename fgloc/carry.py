@@ -1,0 +1,53 @@
+"""Sightings made a little before or after a keyframe, as they would have been made at it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.types import (
+    CornerMeasurement,
+    FloatArray,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+)
+
+
+def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
+    """Move a sighting to the keyframe.
+
+    Args:
+        m: the sighting, as made from the base at its own time.
+        motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
+        cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+    """
+    if isinstance(m, CornerMeasurement):
+        x, y, yaw = motion
+        T = np.eye(4)
+        T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        T[:2, 3] = x, y
+        camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
+        return dataclasses.replace(m, camera=camera)
+    if isinstance(m, MarkerPoseMeasurement):
+        pose = se2.compose(motion, m.pose)
+        return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov))
+    x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
+    px, py, _ = se2.compose(motion, (x, y, 0.0))
+    r, bearing = math.hypot(px, py), math.atan2(py, px)
+    return dataclasses.replace(
+        m, range_m=r, bearing_rad=bearing, cov=m.cov + _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
+    )
+
+
+def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
+    """Covariance ``(2, 2)`` (bearing, range) that an uncertain motion adds to a sighted point."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    R = np.array([[c, -s], [s, c]])
+    J_point = np.column_stack([R, R @ np.array([-point[1], point[0]])])  # of motion ∘ point, by right perturbation
+    cb, sb = math.cos(bearing), math.sin(bearing)
+    J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
+    J = J_polar @ J_point
+    return np.asarray(J @ cov @ J.T)

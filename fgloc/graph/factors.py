@@ -1,0 +1,192 @@
+"""Measurements to GTSAM factors: the one place that knows both.
+
+A known landmark enters as a unary factor; an unknown one is a variable. Motion factors are Gaussian, landmark factors
+robust (Cauchy), as design.md §6 has it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import gtsam
+import numpy as np
+
+from fgloc import se2
+from fgloc.errors import CovarianceError, EstimatorError
+from fgloc.types import (
+    Camera,
+    CornerMeasurement,
+    FloatArray,
+    Landmark,
+    LandmarkMap,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+    MotionMeasurement,
+    RangeBearingMeasurement,
+)
+
+MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
+
+
+def pose_key(k: int) -> int:
+    """Key of the pose of keyframe k."""
+    return int(gtsam.symbol("x", k))
+
+
+def landmark_key(landmark_id: int) -> int:
+    """Key of an estimated landmark."""
+    return int(gtsam.symbol("l", landmark_id))
+
+
+def gaussian(cov: FloatArray) -> gtsam.noiseModel.Base:
+    """Noise model of a covariance, which is checked because GTSAM does not.
+
+    Raises:
+        CovarianceError: not finite, not symmetric or not positive definite.
+    """
+    if not np.isfinite(cov).all():
+        raise CovarianceError(f"covariance with NaN or Inf: {cov.tolist()}; reject the measurement before it gets here")
+    if abs(cov - cov.T).max() > 1e-9 * abs(cov).max():
+        raise CovarianceError(f"asymmetric covariance: {cov.tolist()}")
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError as error:
+        raise CovarianceError(f"covariance is not positive definite: {cov.tolist()}") from error
+    return gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+def robust(noise: gtsam.noiseModel.Base, cauchy_k: float | None) -> gtsam.noiseModel.Base:
+    """Wrap a noise model in a Cauchy kernel (k in units of sigma); None leaves it Gaussian."""
+    if cauchy_k is None:
+        return noise
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_k), noise)
+
+
+def motion_factor(k: int, m: MotionMeasurement) -> gtsam.NonlinearFactor:
+    """Between-factor from keyframe k - 1 to k."""
+    return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), gaussian(m.cov))
+
+
+def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFactor:
+    """Prior on keyframe k; the covariance is a right perturbation's."""
+    return gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), gaussian(cov))
+
+
+class LandmarkFactors:
+    """Makes factors of landmark sightings, against a known map or against variables.
+
+    Cameras and landmark corners are converted once and kept.
+    """
+
+    def __init__(self, landmark_map: LandmarkMap | None) -> None:
+        self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
+        self._corners: dict[int, FloatArray] = {}
+        self._cameras: dict[int, tuple[Camera, gtsam.Pose3, gtsam.Cal3DS2]] = {}
+        self._corner_noises: dict[tuple[float, float | None], gtsam.noiseModel.Base] = {}
+
+    @property
+    def known(self) -> bool:
+        """Whether the map is given; otherwise landmarks are variables."""
+        return self._known is not None
+
+    def make(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> list[gtsam.NonlinearFactor]:
+        """Factors of one sighting at keyframe k.
+
+        Raises:
+            EstimatorError: the landmark is not in the known map, or corners were given for an unknown map.
+            CovarianceError: the measurement's covariance is not one.
+        """
+        if self._known is None:
+            return [self._unknown(k, m, cauchy_k)]
+        landmark = self._known.get(m.landmark_id)
+        if landmark is None:
+            raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
+        if isinstance(m, CornerMeasurement):
+            return self._corner_factors(k, m, landmark, cauchy_k)
+        if isinstance(m, RangeBearingMeasurement):
+            point, cov = cartesian(m)
+            noise = robust(gaussian(cov), cauchy_k)
+            return [gtsam.KnownLandmarkFactorPose2(pose_key(k), landmark.position[:2], point, noise)]
+        pose = se2.compose(landmark.planar, se2.inverse(m.pose))
+        ad = se2.adjoint(m.pose)  # perturbation of T_base_marker, moved to the robot's side
+        noise = robust(gaussian(_symmetric(ad @ m.cov @ ad.T)), cauchy_k)
+        return [gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), noise)]
+
+    def depth(self, m: CornerMeasurement, pose: FloatArray) -> float:
+        """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""
+        if self._known is None:
+            raise EstimatorError("the depth of a marker needs a known map")
+        x, y, yaw = pose
+        c, s = math.cos(yaw), math.sin(yaw)
+        corners = self._landmark_corners(self._known[m.landmark_id])
+        dx, dy = corners[:, 0] - x, corners[:, 1] - y
+        base = np.column_stack([c * dx + s * dy, -s * dx + c * dy, corners[:, 2]])
+        T = m.camera.T_base_cam
+        return float(((base - T[:3, 3]) @ T[:3, 2]).min())
+
+    def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
+        if isinstance(m, RangeBearingMeasurement):
+            noise = robust(gaussian(m.cov), cauchy_k)
+            bearing = gtsam.Rot2(m.bearing_rad)
+            return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
+        if isinstance(m, MarkerPoseMeasurement):
+            noise = robust(gaussian(m.cov), cauchy_k)
+            measured = gtsam.Pose2(*m.pose)
+            return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), measured, noise)
+        raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
+
+    def _corner_factors(
+        self, k: int, m: CornerMeasurement, landmark: Landmark, cauchy_k: float | None
+    ) -> list[gtsam.NonlinearFactor]:
+        corners = self._landmark_corners(landmark)
+        bTc, calibration = self._camera(m.camera)
+        noise_key = (m.sigma_px, cauchy_k)
+        if noise_key not in self._corner_noises:
+            self._corner_noises[noise_key] = robust(gtsam.noiseModel.Isotropic.Sigma(2, m.sigma_px), cauchy_k)
+        noise, key = self._corner_noises[noise_key], pose_key(k)
+        return [
+            gtsam.PlanarProjectionFactor1(key, corners[i], m.corners_px[i], bTc, calibration, noise) for i in range(4)
+        ]
+
+    def _landmark_corners(self, landmark: Landmark) -> FloatArray:
+        if landmark.landmark_id not in self._corners:
+            self._corners[landmark.landmark_id] = landmark.corners()
+        return self._corners[landmark.landmark_id]
+
+    def _camera(self, camera: Camera) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
+        held = self._cameras.get(id(camera))
+        if held is None or held[0] is not camera:
+            if len(self._cameras) > 64:  # cameras moved to a keyframe (late images) come and go
+                self._cameras.clear()
+            K, D = camera.K, np.concatenate([camera.D, np.zeros(4)])[:4]
+            calibration = gtsam.Cal3DS2(K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *D)
+            held = (camera, gtsam.Pose3(camera.T_base_cam), calibration)
+            self._cameras[id(camera)] = held
+        return held[1], held[2]
+
+
+def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
+    """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
+
+    The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
+    bearing's sigma, which is exact enough below 0.2 rad.
+    """
+    c, s = math.cos(m.bearing_rad), math.sin(m.bearing_rad)
+    r = m.range_m
+    J = np.array([[-r * s, c], [r * c, s]])  # columns: bearing, range
+    return np.array([r * c, r * s]), _symmetric(J @ m.cov @ J.T)
+
+
+def whitened(factors: list[gtsam.NonlinearFactor], values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
+    """Whitened residual ``(d,)`` and Jacobian ``(d, 3)`` of unary pose factors at the values in ``values``."""
+    residuals, jacobians = [], []
+    for factor in factors:
+        A, b = factor.linearize(values).jacobian()
+        jacobians.append(A)
+        residuals.append(-b)
+    return np.concatenate(residuals), np.vstack(jacobians)
+
+
+def _symmetric(m: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (m + m.T))

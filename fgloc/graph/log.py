@@ -1,0 +1,65 @@
+"""The measurement log: what every keyframe was told. Graphs are built from it, never copied from one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
+
+
+@dataclass(slots=True, eq=False)
+class Belief:
+    """A pose ``(3,)`` with the covariance ``(3, 3)`` of its right perturbation (the body frame)."""
+
+    pose: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A landmark measurement as the graph takes it: carried to its keyframe, with its kernel."""
+
+    measurement: LandmarkMeasurement
+    cauchy_k: float | None
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """One pose of the graph and every measurement that ends at it."""
+
+    k: int
+    stamp_ns: int
+    elapsed_s: float  # the estimator's own time: runs on through clock jumps
+    belief: Belief  # filtered: initial value for the batch, prior for a rebuilt window
+    prior: Belief | None = None  # first keyframe of a segment
+    motions: tuple[MotionMeasurement, ...] = ()
+    sightings: tuple[Sighting, ...] = ()
+    refused: tuple[Sighting, ...] = ()  # not believed online; the batch looks again
+
+
+@dataclass(slots=True)
+class MeasurementLog:
+    """Keyframes in order. ``window_s`` bounds it; None keeps all (batch)."""
+
+    window_s: float | None = None
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+
+    def append(self, keyframe: Keyframe) -> None:
+        """Add the newest keyframe; forget those that the window has left behind."""
+        self.keyframes[keyframe.k] = keyframe
+        if self.window_s is None:
+            return
+        horizon = keyframe.elapsed_s - self.window_s
+        while self.keyframes:
+            oldest = next(iter(self.keyframes))
+            if self.keyframes[oldest].elapsed_s >= horizon:
+                break
+            del self.keyframes[oldest]
+
+    def since(self, elapsed_s: float) -> Iterator[Keyframe]:
+        """Keyframes not older than the given time of the estimator's own clock."""
+        return (frame for frame in self.keyframes.values() if frame.elapsed_s >= elapsed_s)
+
+    def __len__(self) -> int:
+        return len(self.keyframes)

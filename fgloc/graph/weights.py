@@ -1,0 +1,147 @@
+"""What a sighting is worth: its covariance, and whether it is believed at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Sequence
+from functools import lru_cache
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
+from fgloc.graph.log import Belief, Sighting
+from fgloc.types import (
+    CornerMeasurement,
+    Decision,
+    FloatArray,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+    RangeBearingMeasurement,
+)
+
+KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
+_GAUSS_NEWTON_STEPS = 4
+
+
+@lru_cache(maxsize=256)
+def chi2_bound(probability: float, dof: int) -> float:
+    """χ² quantile."""
+    return float(chi2.ppf(probability, dof))
+
+
+class Weights:
+    """Weighs the sightings of one step against the prediction.
+
+    Attributes:
+        rejections: refused sightings by reason.
+        refused_in_a_row: sightings refused since the last one believed.
+    """
+
+    def __init__(self, config: Config, factors: LandmarkFactors) -> None:
+        self._config = config
+        self._factors = factors
+        self._last_used_ns: dict[int, int] = {}
+        self._seen: Counter[int] = Counter()
+        self.rejections: Counter[str] = Counter()
+        self.refused_in_a_row = 0
+
+    def weigh(
+        self, k: int, stamp_ns: int, measurements: Sequence[LandmarkMeasurement], predicted: Belief
+    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
+        """Sort sightings into believed and refused, with the decision on each.
+
+        The NIS is that of the prediction; where it fails the χ² gate it is taken again at the pose that best explains
+        prediction and sighting together (Gauss–Newton), because after dead reckoning the linear one is far too large.
+        """
+        believed, refused, decisions = [], [], []
+        values = gtsam.Values()
+        values.insert(pose_key(k), gtsam.Pose2(*predicted.pose))
+        for given in measurements:
+            m, weight = self._share_information(given)
+            sighting = Sighting(m, self._cauchy(m))
+            nis, dof, reason = self._judge(k, m, predicted, values)
+            if reason:
+                refused.append(sighting)
+                self.rejections[f"sightings.{reason}"] += 1
+            else:
+                believed.append(sighting)
+                self._last_used_ns[m.landmark_id] = m.stamp_ns
+            decisions.append(
+                Decision(
+                    k,
+                    stamp_ns,
+                    KINDS[type(m)],
+                    m.landmark_id,
+                    math.sqrt(nis),
+                    nis,
+                    dof,
+                    0.0 if reason else weight,
+                    reason,
+                )
+            )
+        if believed:
+            self.refused_in_a_row = 0
+        else:
+            self.refused_in_a_row += len(refused)
+        return believed, refused, decisions
+
+    def _judge(self, k: int, m: LandmarkMeasurement, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:
+        """NIS, its degrees of freedom, and why the sighting is refused ("" if it is believed)."""
+        if not self._factors.known:
+            self._seen[m.landmark_id] += 1
+            few = self._seen[m.landmark_id] < self._config.landmarks.min_sightings
+            return math.nan, 0, "seen_too_seldom" if few else ""
+        if isinstance(m, CornerMeasurement) and self._factors.depth(m, predicted.pose) < MIN_DEPTH_M:
+            return math.nan, 8, "behind_camera"
+        factors = self._factors.make(k, m, None)
+        residual, J = whitened(factors, values)
+        dof = len(residual)
+        bound = chi2_bound(self._config.estimator.gate_probability, dof)
+        S = J @ predicted.cov @ J.T
+        S[np.diag_indices(dof)] += 1.0
+        nis = float(residual @ np.linalg.solve(S, residual))
+        if nis > bound:
+            nis = min(nis, joint_nis(k, m, predicted, self._factors, residual, J))
+        return nis, dof, "gate" if nis > bound else ""
+
+    def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
+        """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
+        correlation_s = self._config.landmarks.repeat_s
+        last = self._last_used_ns.get(m.landmark_id)
+        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement):
+            return m, 1.0
+        apart = max((m.stamp_ns - last) * 1e-9, 0.01)
+        scale = max(1.0, correlation_s / apart)
+        return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
+
+    def _cauchy(self, m: LandmarkMeasurement) -> float:
+        section = self._config.markers if isinstance(m, CornerMeasurement) else self._config.landmarks
+        return section.cauchy_k
+
+
+def joint_nis(
+    k: int, m: LandmarkMeasurement, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
+) -> float:
+    """Least ``|x ⊖ predicted|²_P + |h(x)|²_R`` over poses x: the NIS without the linearisation at the prediction."""
+    information = np.linalg.inv(predicted.cov)
+    made = factors.make(k, m, None)
+    pose, best = predicted.pose, float(residual @ residual)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        offset = se2.log(se2.between(predicted.pose, pose))
+        H = information + J.T @ J
+        step = np.asarray(np.linalg.solve(H, -(information @ offset + J.T @ residual)), dtype=np.float64)
+        pose = se2.compose(pose, se2.exp(step))
+        if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+            break
+        values = gtsam.Values()
+        values.insert(pose_key(k), gtsam.Pose2(*pose))
+        residual, J = whitened(made, values)
+        offset = se2.log(se2.between(predicted.pose, pose))
+        best = min(best, float(offset @ information @ offset + residual @ residual))
+    return best

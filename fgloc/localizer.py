@@ -1,0 +1,205 @@
+"""The core loop. Replay and live streams call `Localizer.update` alike."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.carry import carry
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.incremental import IncrementalEstimator
+from fgloc.graph.log import Belief
+from fgloc.graph.weights import Weights
+from fgloc.initializer import Initializer
+from fgloc.motion.joint import JointCalibration
+from fgloc.motion.source import LearnedMotion
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.timing import Stopwatch
+from fgloc.types import (
+    Decision,
+    Estimate,
+    FloatArray,
+    LandmarkMap,
+    LandmarkMeasurement,
+    Mode,
+    MotionMeasurement,
+    Step,
+)
+
+_UNKNOWN_MAP_PRIOR = np.diag([1e-6, 1e-6, 1e-6])  # the first pose is the map's origin
+
+
+class Localizer:
+    """Estimates ``T_map_base``, one Step at a time.
+
+    Attributes:
+        estimator: the incremental estimator, whose log the batch smoother starts from.
+        factors: maker of landmark factors, shared with the batch smoother.
+        counts: factors added, by kind.
+        rejections: what was not used, by reason.
+        stopwatch: time spent in each phase.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        wheels: WheelMotion,
+        landmarks: LandmarkSensor,
+        learned: LearnedMotion | None = None,
+        joint: JointCalibration | None = None,
+        keep_all: bool = False,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            config: everything tunable.
+            landmark_map: the known map; None: landmarks become variables and the first pose is the origin.
+            wheels: wheel odometry.
+            landmarks: sightings to measurements.
+            learned: the learned motion, if any.
+            joint: its correlation with the wheels; None: the two are taken as independent.
+            keep_all: keep the measurement log of the whole run, for the batch smoother.
+        """
+        self.config = config
+        self.factors = LandmarkFactors(landmark_map)
+        self.estimator = IncrementalEstimator(config.estimator, self.factors, keep_all)
+        self.weights = Weights(config, self.factors)
+        self.counts: Counter[str] = Counter()
+        self.rejections: Counter[str] = Counter()
+        self.stopwatch = Stopwatch()
+        self._wheels = wheels
+        self._learned = learned
+        self._joint = joint
+        self._landmarks = landmarks
+        self._initializer = Initializer(config, landmark_map, self.factors)
+        self._segment = -1
+        self._last_fix_s = 0.0
+        self._clock_s = 0.0
+        self._lost = False
+
+    def update(self, step: Step) -> Estimate | None:
+        """Take in one step; return the newest pose, or None while the first pose is not yet known."""
+        self._clock_s += step.dt
+        if step.segment != self._segment:
+            self._segment = step.segment
+            self._initializer.reset()
+        # 1. Measure: one call per sensor; a silent sensor yields nothing
+        with self.stopwatch("motion"):
+            motions = self._measure_motion(step)
+        with self.stopwatch("sightings"):
+            sightings = self._measure_landmarks(step)
+        if self._initializer.waiting:
+            return self._initialize(step, motions, sightings)
+        return self._advance(step, motions, sightings)
+
+    def _measure_motion(self, step: Step) -> list[MotionMeasurement]:
+        if step.dt <= 0.0:
+            return []
+        wheels = self._wheels.measure(step)
+        learned = self._learned.measure(step, None) if self._learned is not None else None
+        if wheels is not None and learned is not None and self._joint is not None:
+            learned = self._joint.decorrelate(wheels, learned)
+        return [m for m in (wheels, learned) if m is not None]
+
+    def _measure_landmarks(self, step: Step) -> list[LandmarkMeasurement]:
+        measured: list[LandmarkMeasurement] = []
+        for event in step.sightings:
+            found = self._landmarks.measure(event)
+            if found and event.stamp_ns != step.stamp_ns:
+                motion, cov = self._wheels.carry(step, step.stamp_ns, event.stamp_ns)
+                found = tuple(carry(m, motion, cov) for m in found)
+            measured.extend(found)
+        return measured
+
+    def _initialize(
+        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
+    ) -> Estimate | None:
+        """Collect steps until the first pose is clear, then run them all through the estimator."""
+        started = self._initializer.collect(step, motions, sightings)
+        if started is None:
+            return None
+        estimate = None
+        for buffered in started.steps:
+            if buffered.first:
+                estimate = self._start(buffered.step, started.prior, buffered.sightings)
+            else:
+                estimate = self._advance(buffered.step, buffered.motions, buffered.sightings)
+        return estimate
+
+    def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        believed, _, decisions = self.weights.weigh(self.estimator.k + 1, step.stamp_ns, sightings, prior)
+        belief = self.estimator.start(step.stamp_ns, prior, believed)
+        self.counts["prior"] += 1
+        self._count_landmarks(decisions)
+        self._last_fix_s = self._clock_s
+        return self._estimate(step, belief, decisions)
+
+    def _advance(
+        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
+    ) -> Estimate:
+        k = self.estimator.k + 1
+        if not motions:
+            motions = [self._unknown_motion(step)]
+        # 2. Weigh: sightings against the prediction
+        with self.stopwatch("weigh"):
+            predicted = self.estimator.predict(motions)
+            believed, refused, decisions = self.weights.weigh(k, step.stamp_ns, sightings, predicted)
+        # 3. Fuse
+        with self.stopwatch("fuse"):
+            rebuilt = self.estimator.rebuilt
+            belief = self.estimator.update(step.stamp_ns, step.dt, motions, believed, refused)
+        if self.estimator.rebuilt > rebuilt:
+            self.rejections["estimator.window_rebuilt"] += 1
+            believed = []
+        self.counts.update(m.source for m in motions)
+        self._count_landmarks(decisions)
+        if believed:
+            self._last_fix_s = self._clock_s
+        self._watch_for_loss(believed)
+        decisions = [*motion_decisions(k, motions), *decisions]
+        return self._estimate(step, belief, decisions)
+
+    def _unknown_motion(self, step: Step) -> MotionMeasurement:
+        """Nothing spoke: the robot may have gone anywhere within its speed limits."""
+        self.rejections["motion.silent"] += 1
+        spread = np.array([self.config.gate.max_speed, self.config.gate.max_speed, self.config.gate.max_yaw_rate])
+        cov = np.diag((0.2 * spread * max(step.dt, 0.01)) ** 2)
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
+
+    def _watch_for_loss(self, believed: Sequence[object]) -> None:
+        """After many refusals without one belief in between, look for the robot anywhere on the map."""
+        if believed:
+            self._lost = False
+        elif self.weights.refused_in_a_row >= self.config.estimator.lost_after and self.factors.known:
+            self._lost = True
+            self.weights.refused_in_a_row = 0
+            self._initializer.reset()
+
+    def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
+        mode = Mode.OK
+        if self._lost:
+            mode = Mode.LOST
+        elif self._clock_s - self._last_fix_s > self.config.estimator.dead_reckoning_after_s:
+            mode = Mode.DEAD_RECKONING
+        cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+        return Estimate(step.stamp_ns, belief.pose, cov, mode, tuple(decisions))
+
+    def _count_landmarks(self, decisions: Sequence[Decision]) -> None:
+        self.counts.update(d.kind for d in decisions if not d.reason)
+
+
+def motion_decisions(k: int, motions: Sequence[MotionMeasurement]) -> list[Decision]:
+    """Rows of ``steps.csv`` for motion factors: the residual is that against the first of them (the wheels)."""
+    rows = []
+    first = motions[0]
+    for m in motions:
+        difference: FloatArray = se2.log(se2.between(first.motion, m.motion))
+        nis = float(difference @ np.linalg.solve(first.cov + m.cov, difference))
+        rows.append(Decision(k, m.stamp_ns, m.source, -1, nis**0.5, nis, 3, 1.0, ""))
+    return rows
