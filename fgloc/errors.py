@@ -8,6 +8,7 @@
     ├── ModelError           a learned motion model file
     ├── CovarianceError      a covariance that is not one
     ├── TrajectoryError      a trajectory file, or two that do not overlap
+    ├── OutputError          a result that cannot be written
     └── EstimatorError       the estimator was given what it cannot use
 
 A message gives the value found, what was expected and the remedy. The command line turns these into exit code 1.
@@ -44,6 +45,10 @@ class CovarianceError(FglocError):
 
 class TrajectoryError(FglocError):
     """A trajectory cannot be read, or trajectories cannot be compared."""
+
+
+class OutputError(FglocError):
+    """A result file cannot be written."""
 
 
 class EstimatorError(FglocError):

@@ -1,0 +1,59 @@
+# From a fresh clone each target does everything: it makes .venv, installs what it needs, and runs.
+# Another interpreter: `make demo PYTHON=python3.12`. No CUDA build of torch: see CONTRIBUTING.md.
+PYTHON ?= python3
+JOBS ?= 2
+BENCHMARKS ?= steps real
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+BIN := .venv/bin
+
+# One thread per process: the work is many small problems, and JOBS processes share the cores.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help demo test test-all check format bench clean
+
+help:
+	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
+	@echo "make test      the quick tests"
+	@echo "make test-all  all tests"
+	@echo "make check     ruff format, ruff, mypy"
+	@echo "make bench     the figures of the README"
+	@echo "make clean     remove .venv, caches and demo-out/"
+
+demo: .venv/.base
+	$(BIN)/fgloc demo
+
+test: .venv/.dev
+	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+
+test-all: .venv/.dev
+	$(BIN)/python -m pytest -n $(JOBS)
+
+check: .venv/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: .venv/.dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: .venv/.dev
+	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
+
+clean:
+	rm -rf .venv build demo-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || \
+		{ echo "error: $(PYTHON) is not Python 3.11 to 3.13; give one: make demo PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/.base: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	@touch $@
+
+.venv/.dev: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch .venv/.base $@
