@@ -109,6 +109,7 @@ class WheelsConfig(Section):
     angle_range: float | None = Field(None, gt=0, description="rad: the angle rolls over after this much; None: never")
     scale_v: float = Field(1.0, gt=0, description="true over reported forward speed")
     scale_omega: float = Field(1.0, gt=0, description="true over reported yaw rate")
+    yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
     delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
     hold_s: float = Field(0.5, gt=0, description="a twist is held for this long when the next one is missing")
     zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
