@@ -1,1 +1,19 @@
 """Learned motion, inference only: numpy and safetensors, no torch."""
+
+from fgloc.motion.card import ModelCard
+from fgloc.motion.joint import JointCalibration
+from fgloc.motion.load import load_model, save_model
+from fgloc.motion.models import DisplacementModel, MotionModel, MotionPrediction, VelocityModel
+from fgloc.motion.source import LearnedMotion
+
+__all__ = [
+    "DisplacementModel",
+    "JointCalibration",
+    "LearnedMotion",
+    "ModelCard",
+    "MotionModel",
+    "MotionPrediction",
+    "VelocityModel",
+    "load_model",
+    "save_model",
+]

@@ -1,0 +1,116 @@
+"""What a model file says about itself: the JSON in the safetensors header, checked field by field."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from fgloc.config import NoiseDensity, Section
+
+FORMAT = "fgloc-motion"
+VERSION = 1
+
+Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Matrix = tuple[Row, Row, Row]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
+    if len(edges) < 2 or edges[0] < 0 or any(b <= a for a, b in pairwise(edges)):
+        raise ValueError(f"expected at least two increasing ages >= 0, got {edges}")
+    return edges
+
+
+class Kinematics(Section):
+    """Calibrated kinematics: the robot does what it was told, scaled and later. Fitted on the training recordings."""
+
+    scale_v: Positive = 1.0
+    scale_omega: Positive = 1.0
+    delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)] = 0.0
+
+
+class JointErrors(Section):
+    """Error covariances of wheels (W) and model (N) over windows, and C = E[e_n e_wᵀ]; body frame at the window's end.
+
+    Source: design.md §4, "Correlation of the two".
+    """
+
+    window_s: Positive
+    W: Matrix
+    N: Matrix
+    C: Matrix
+
+
+class Split(Section):
+    """Recordings by name: what the weights, the early stopping with the calibration, and the figures have seen."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    test: tuple[str, ...] = ()
+
+
+class ModelCard(Section):
+    """Everything but the weights.
+
+    A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later; a ``displacement`` model maps the mean
+    commands of the age bins ``edges_s`` (and, if ``inputs`` says so, the velocity's innovation) to a residual twist on
+    the calibrated kinematics and three log-variances.
+    """
+
+    format: Literal["fgloc-motion"] = "fgloc-motion"
+    version: Literal[1] = 1
+    kind: Literal["velocity", "displacement"]
+    robot: str
+    inputs: tuple[Literal["commands", "velocity"], ...]
+    dt_s: Positive = Field(description="longest sub-step: a step is cut into equal parts no longer than this")
+    hidden: tuple[Annotated[int, Field(gt=0, le=4096)], ...]
+    hold_s: Positive = Field(description="a command is believed to hold for this long when the next one is missing")
+    history_s: Positive = Field(description="seconds of commands before a step that the model wants")
+    kinematics: Kinematics = Kinematics()
+    edges_s: tuple[FiniteFloat, ...] = Field((), description="displacement: limits of the age bins, youngest first")
+    velocity_decay_s: Positive = Field(0.3, description="displacement: time constant of the velocity's innovation")
+    input_mean: tuple[FiniteFloat, ...]
+    input_std: tuple[Positive, ...]
+    output_scale: tuple[Positive, ...]
+    noise: NoiseDensity | None = Field(None, description="velocity: densities of the error")
+    variance_scale: tuple[Positive, Positive, Positive] = Field(
+        (1.0, 1.0, 1.0), description="displacement: calibration of the predicted variance densities"
+    )
+    joint: JointErrors | None = None
+    wheels_noise: NoiseDensity | None = Field(None, description="of the calibrated kinematics as wheel odometry")
+    split: Split
+    figures: dict[str, FiniteFloat] = Field({}, description="on the test recordings, or else the validation's")
+    made_by: str = Field("", description="command and configuration that made the file")
+
+    @property
+    def n_inputs(self) -> int:
+        """Width of the network's input that this card implies."""
+        if self.kind == "velocity":
+            return 5
+        return 2 * (len(self.edges_s) - 1) + 2 * ("velocity" in self.inputs)
+
+    @property
+    def n_outputs(self) -> int:
+        """Width of the network's output."""
+        return 2 if self.kind == "velocity" else 6
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> ModelCard:
+        needed = {"velocity": {"commands", "velocity"}, "displacement": {"commands"}}[self.kind]
+        if missing := needed - set(self.inputs):
+            raise ValueError(f"a {self.kind} model needs the inputs {sorted(needed)}, the card lacks {sorted(missing)}")
+        if self.kind == "displacement":
+            _increasing(self.edges_s)
+        elif self.noise is None:
+            raise ValueError("a velocity model needs the noise densities of its error; the card has none")
+        n_scales = {"velocity": 2, "displacement": 3}[self.kind]
+        for name, values, wanted in (
+            ("input_mean", self.input_mean, self.n_inputs),
+            ("input_std", self.input_std, self.n_inputs),
+            ("output_scale", self.output_scale, n_scales),
+        ):
+            if len(values) != wanted:
+                raise ValueError(f"normalization {name} has {len(values)} values, the inputs and outputs need {wanted}")
+        return self

@@ -1,0 +1,88 @@
+"""Two motion measurements with correlated errors, made independent without losing what they say together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fgloc import se2
+from fgloc.errors import CovarianceError
+from fgloc.types import FloatArray, MotionMeasurement
+
+MAX_GAIN = 0.95  # of ‖K‖: nearer to 1 the difference of the two would be blown up
+MAX_CORRELATION = 0.99  # at 1 one of the two would say nothing of its own and its covariance would be singular
+
+
+class JointCalibration:
+    """How the errors of wheel odometry (W) and of learned motion (N) go together.
+
+    Kept as the dimensionless ``R = L_n⁻¹ C L_w⁻ᵀ`` with the Cholesky factors of N and W, so that a calibration from
+    long windows serves a step of any length and any predicted covariance: ``C = L_n R L_wᵀ`` of that step.
+
+    Source: design.md §4; conditional mean of the joint Gaussian.
+    """
+
+    def __init__(self, W: ArrayLike, N: ArrayLike, C: ArrayLike) -> None:
+        """Take covariances estimated over windows.
+
+        Args:
+            W: ``(3, 3)`` of the wheels' error.
+            N: ``(3, 3)`` of the learned motion's error.
+            C: ``(3, 3)`` E[e_n e_wᵀ].
+
+        Raises:
+            CovarianceError: W or N is not a covariance, or the three are not a joint one.
+        """
+        L_w, L_n = _cholesky(np.asarray(W, dtype=float), "W"), _cholesky(np.asarray(N, dtype=float), "N")
+        self.correlation = np.linalg.solve(L_n, np.linalg.solve(L_w, np.asarray(C, dtype=float).T).T)
+        norm = float(np.linalg.norm(self.correlation, 2))
+        if not norm <= 1.0 + 1e-9:
+            raise CovarianceError(
+                f"W, N and C are not a joint covariance: their correlation has norm {norm:.4g}, expected at most 1; "
+                "estimate the three from the same windows"
+            )
+        if norm > MAX_CORRELATION:
+            self.correlation *= MAX_CORRELATION / norm
+
+    def gain(self, W: FloatArray, N: FloatArray) -> FloatArray:
+        """K = C W⁻¹ ``(3, 3)`` for a step with these covariances.
+
+        Shrunk until its norm, in units of the wheels' sigmas, is at most 0.95.
+        """
+        L_w, L_n = _cholesky(W, "the wheels' covariance"), _cholesky(N, "the learned covariance")
+        return self._gain(L_w, L_n)
+
+    def decorrelate(self, wheels: MotionMeasurement, learned: MotionMeasurement) -> MotionMeasurement:
+        """The learned measurement that may enter beside the unchanged wheels' as if independent.
+
+        Raises:
+            CovarianceError: a covariance is not one.
+            ValueError: the two measure different steps.
+        """
+        if (wheels.start_ns, wheels.stamp_ns) != (learned.start_ns, learned.stamp_ns):
+            raise ValueError(
+                f"wheels measure [{wheels.start_ns}, {wheels.stamp_ns}] ns, learned motion [{learned.start_ns}, "
+                f"{learned.stamp_ns}] ns; only measurements of one step can be decorrelated"
+            )
+        K = self.gain(wheels.cov, learned.cov)
+        inverse = np.linalg.inv(np.eye(3) - K)
+        difference = se2.log(se2.between(wheels.motion, learned.motion))
+        motion = se2.compose(wheels.motion, se2.exp(inverse @ difference))
+        cov = inverse @ (learned.cov - K @ wheels.cov @ K.T) @ inverse.T
+        return MotionMeasurement(learned.source, learned.start_ns, learned.stamp_ns, motion, 0.5 * (cov + cov.T))
+
+    def _gain(self, L_w: FloatArray, L_n: FloatArray) -> FloatArray:
+        scaled = np.linalg.solve(L_w, L_n @ self.correlation)  # K as the wheels' sigmas see it
+        norm = float(np.linalg.norm(scaled, 2))
+        if norm > MAX_GAIN:
+            scaled *= MAX_GAIN / norm
+        return np.asarray(L_w @ np.linalg.solve(L_w.T, scaled.T).T)
+
+
+def _cholesky(cov: FloatArray, name: str) -> FloatArray:
+    try:
+        if not np.isfinite(cov).all():
+            raise np.linalg.LinAlgError("not finite")
+        return np.asarray(np.linalg.cholesky(cov))
+    except np.linalg.LinAlgError as error:
+        raise CovarianceError(f"{name} is not positive definite ({error}): {cov.tolist()}") from error

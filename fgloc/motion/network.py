@@ -1,0 +1,51 @@
+"""A multilayer perceptron in numpy: float32, ReLU, every intermediate result in a buffer made once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+
+
+class Network:
+    """``y = W_n relu(... relu(W_0 (x - mean) / std + b_0) ...) + b_n`` for a batch of rows.
+
+    The normalization is folded into the first layer. Not for concurrent use: calls share buffers.
+    """
+
+    def __init__(
+        self,
+        layers: list[tuple[Float32Array, Float32Array]],
+        mean: NDArray[np.float64],
+        std: NDArray[np.float64],
+    ) -> None:
+        """Take the layers.
+
+        Args:
+            layers: (weight (out, in), bias (out,)) from input to output.
+            mean: ``(in,)`` of the inputs.
+            std: ``(in,)`` of the inputs.
+        """
+        first = layers[0][0].astype(np.float64) / std
+        bias = layers[0][1] - first @ mean
+        folded = [(first, bias), *layers[1:]]
+        self._weights = [np.ascontiguousarray(w.T, dtype=np.float32) for w, _ in folded]
+        self._biases = [b.astype(np.float32) for _, b in folded]
+        self._buffers: dict[int, list[Float32Array]] = {}
+
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """Outputs ``(rows, out)`` of inputs ``(rows, in)``. The result is overwritten by the next call."""
+        rows = len(x)
+        buffers = self._buffers.get(rows)
+        if buffers is None:
+            buffers = [np.empty((rows, w.shape[1]), dtype=np.float32) for w in self._weights]
+            self._buffers[rows] = buffers
+        last = len(buffers) - 1
+        for i, (w, b, y) in enumerate(zip(self._weights, self._biases, buffers, strict=True)):
+            np.matmul(x, w, out=y)
+            np.add(y, b, out=y)
+            if i < last:
+                np.maximum(y, 0.0, out=y)
+            x = y
+        return x

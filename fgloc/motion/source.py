@@ -1,0 +1,68 @@
+"""Learned motion as a source of measurements, step by step."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from fgloc.config import MotionConfig
+from fgloc.motion.joint import JointCalibration
+from fgloc.motion.models import MotionModel
+from fgloc.types import FloatArray, MotionMeasurement, Step
+
+
+class LearnedMotion:
+    """Turns the commands of a step into a `MotionMeasurement` of source "learned".
+
+    Between contiguous steps it carries the model's own velocity; a gap or a new segment forgets it, and the model
+    starts from what the commands before the step say.
+
+    Attributes:
+        joint: calibration against wheel odometry, None if the model has none.
+        rejections: steps without a measurement, by reason: ``learned.no_commands``, ``learned.stale_commands``,
+            ``learned.non_finite``.
+    """
+
+    def __init__(self, model: MotionModel, config: MotionConfig) -> None:
+        """Take a loaded model."""
+        self.model = model
+        self.rejections: Counter[str] = Counter()
+        joint = model.card.joint
+        self.joint = None if joint is None else JointCalibration(joint.W, joint.N, joint.C)
+        self._use = config.use
+        self._velocity: FloatArray | None = None
+        self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
+
+    def measure(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+        """Predict the step.
+
+        Args:
+            step: its commands must reach ``model.card.history_s`` back for a start from nothing.
+            velocity: ``(2,)`` body velocity v [m/s], ω [rad/s] at the start, if known better than by the model itself.
+
+        Returns:
+            None if the model is not used or has nothing to say; the reason is counted in `rejections`.
+        """
+        if not self._use:
+            return None
+        if reason := self._unusable(step):
+            return self._reject(reason)
+        if velocity is None and self._reached == (step.segment, step.start_ns):
+            velocity = self._velocity
+        prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity)
+        if prediction is None:
+            return self._reject("learned.non_finite")
+        self._velocity = prediction.velocity
+        self._reached = (step.segment, step.stamp_ns)
+        return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
+
+    def _unusable(self, step: Step) -> str:
+        known = [c.stamp_ns for c in step.commands if c.stamp_ns <= step.stamp_ns]
+        if not known:
+            return "learned.no_commands"
+        if (step.stamp_ns - known[-1]) * 1e-9 > self.model.card.hold_s:
+            return "learned.stale_commands"
+        return ""
+
+    def _reject(self, reason: str) -> None:
+        self.rejections[reason] += 1
+        self._velocity = self._reached = None
