@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from fgloc.errors import ModelError
+from fgloc.errors import CovarianceError, ModelError
 from fgloc.motion.card import FORMAT, VERSION, ModelCard
 from fgloc.motion.models import DisplacementModel, MotionModel, VelocityModel
 from fgloc.motion.network import Network
@@ -32,7 +32,10 @@ def load_model(path: Path) -> MotionModel:
     tensors, card = read_model(path)
     layers = _layers(tensors, card, path)
     network = Network(layers, np.array(card.input_mean), np.array(card.input_std))
-    return VelocityModel(card, network) if card.kind == "velocity" else DisplacementModel(card, network)
+    try:
+        return VelocityModel(card, network) if card.kind == "velocity" else DisplacementModel(card, network)
+    except CovarianceError as error:
+        raise ModelError(f"{path}: its joint calibration cannot be used: {error}; {_REMEDY}") from error
 
 
 def read_model(path: Path) -> tuple[Tensors, ModelCard]:

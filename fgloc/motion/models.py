@@ -17,6 +17,7 @@ from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.motion.card import Kinematics, ModelCard
 from fgloc.motion.commands import CommandTrack
+from fgloc.motion.joint import JointCalibration
 from fgloc.motion.network import Network
 from fgloc.types import CommandEvent, FloatArray
 
@@ -34,9 +35,10 @@ class MotionPrediction:
 
 
 class MotionModel(Protocol):
-    """What the localizer knows of a learned model."""
+    """What the localizer knows of a learned model: its card, its calibration against the wheels, its predictions."""
 
     card: ModelCard
+    joint: JointCalibration | None
 
     def predict(
         self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
@@ -69,6 +71,7 @@ class VelocityModel:
         if card.noise is None:
             raise ModelError("a velocity model's card needs noise densities")
         self.card = card
+        self.joint = _joint(card)
         self._network = network
         self._noise = card.noise
         self._scale = np.array(card.output_scale)
@@ -122,6 +125,7 @@ class DisplacementModel:
     def __init__(self, card: ModelCard, network: Network) -> None:
         """Take a checked card and its network."""
         self.card = card
+        self.joint = _joint(card)
         self._network = network
         self._scale = np.array(card.output_scale)
         self._ages = np.array(card.edges_s)
@@ -178,6 +182,10 @@ def noise_density(noise: NoiseDensity, v: float, omega: float) -> FloatArray:
     turning = noise.xy_per_sqrt_rad**2 * omega + noise.xy_per_sqrt_s**2
     yaw = noise.yaw_per_sqrt_m**2 * v + noise.yaw_per_sqrt_rad**2 * omega + noise.yaw_per_sqrt_s**2
     return np.array([noise.x_per_sqrt_m**2 * v + turning, noise.y_per_sqrt_m**2 * v + turning, yaw])
+
+
+def _joint(card: ModelCard) -> JointCalibration | None:
+    return None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
 
 
 def _duration(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) -> float:

@@ -27,11 +27,11 @@ class Network:
             mean: ``(in,)`` of the inputs.
             std: ``(in,)`` of the inputs.
         """
-        first = layers[0][0].astype(np.float64) / std
-        bias = layers[0][1] - first @ mean
-        folded = [(first, bias), *layers[1:]]
-        self._weights = [np.ascontiguousarray(w.T, dtype=np.float32) for w, _ in folded]
-        self._biases = [b.astype(np.float32) for _, b in folded]
+        self._weights = [np.ascontiguousarray(w.T) for w, _ in layers]
+        self._biases = [b for _, b in layers]
+        first = layers[0][0] / std
+        self._weights[0] = np.ascontiguousarray(first.T, dtype=np.float32)
+        self._biases[0] = (layers[0][1] - first @ mean).astype(np.float32)
         self._buffers: dict[int, list[Float32Array]] = {}
 
     def __call__(self, x: Float32Array) -> Float32Array:

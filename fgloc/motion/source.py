@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 from fgloc.config import MotionConfig
-from fgloc.motion.joint import JointCalibration
 from fgloc.motion.models import MotionModel
 from fgloc.types import FloatArray, MotionMeasurement, Step
 
@@ -17,7 +16,6 @@ class LearnedMotion:
     starts from what the commands before the step say.
 
     Attributes:
-        joint: calibration against wheel odometry, None if the model has none.
         rejections: steps without a measurement, by reason: ``learned.no_commands``, ``learned.stale_commands``,
             ``learned.non_finite``.
     """
@@ -26,8 +24,6 @@ class LearnedMotion:
         """Take a loaded model."""
         self.model = model
         self.rejections: Counter[str] = Counter()
-        joint = model.card.joint
-        self.joint = None if joint is None else JointCalibration(joint.W, joint.N, joint.C)
         self._use = config.use
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
@@ -45,12 +41,14 @@ class LearnedMotion:
         if not self._use:
             return None
         if reason := self._unusable(step):
-            return self._reject(reason)
+            self._reject(reason)
+            return None
         if velocity is None and self._reached == (step.segment, step.start_ns):
             velocity = self._velocity
         prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity)
         if prediction is None:
-            return self._reject("learned.non_finite")
+            self._reject("learned.non_finite")
+            return None
         self._velocity = prediction.velocity
         self._reached = (step.segment, step.stamp_ns)
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
