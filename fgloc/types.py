@@ -180,7 +180,8 @@ SightingsEvent = CornersEvent | MarkerPosesEvent | RangeBearingEvent
 class Camera:
     """Intrinsics and mounting.
 
-    ``model`` is ``"plumb_bob"`` (D: k1 k2 p1 p2 [k3]) or ``"equidistant"`` (fisheye, D: k1 k2 k3 k4).
+    ``model`` is ``"plumb_bob"`` (D: k1 k2 p1 p2 [k3]), ``"rational_polynomial"`` (D: k1 k2 p1 p2 k3 k4 k5 k6) or
+    ``"equidistant"`` (fisheye, D: k1 k2 k3 k4). A width and height of 0 say that the calibration names no image size.
     """
 
     width: int
@@ -190,6 +191,7 @@ class Camera:
     D: FloatArray  # (n,)
     T_base_cam: FloatArray  # (4, 4), cam is the optical frame: z forward, x right, y down
     frame_id: str = ""
+    notes: tuple[str, ...] = ()  # what was assumed when the calibration was read
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,6 +228,7 @@ class LandmarkMap:
     landmarks: Mapping[int, Landmark]
     dictionary: str = ""
     source: str = ""
+    notes: tuple[str, ...] = ()  # what was assumed or left out when the file was read
 
     def __contains__(self, landmark_id: int) -> bool:
         return landmark_id in self.landmarks
