@@ -31,7 +31,8 @@ from fgloc.types import (
     Step,
 )
 
-_UNKNOWN_MAP_PRIOR = np.diag([1e-6, 1e-6, 1e-6])  # the first pose is the map's origin
+_ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
+_ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
 class Localizer:
@@ -79,6 +80,7 @@ class Localizer:
         self._landmarks = landmarks
         self._initializer = Initializer(config, landmark_map, self.factors)
         self._segment = -1
+        self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
         self._last_fix_s = 0.0
         self._clock_s = 0.0
         self._lost = False
@@ -87,22 +89,22 @@ class Localizer:
         """Take in one step; return the newest pose, or None while the first pose is not yet known."""
         self._clock_s += step.dt
         if step.segment != self._segment:
-            self._segment = step.segment
-            self._initializer.reset()
+            self._begin_segment(step)
         # 1. Measure: one call per sensor; a silent sensor yields nothing
         with self.stopwatch("motion"):
-            motions = self._measure_motion(step)
+            motions = self.measure_motion(step)
         with self.stopwatch("sightings"):
             sightings = self._measure_landmarks(step)
         if self._initializer.waiting:
             return self._initialize(step, motions, sightings)
         return self._advance(step, motions, sightings)
 
-    def _measure_motion(self, step: Step) -> list[MotionMeasurement]:
+    def measure_motion(self, step: Step, velocity: FloatArray | None = None) -> list[MotionMeasurement]:
+        """Motion factors of a step; ``velocity`` ``(2,)`` at its start, if known better than by the learned model itself."""
         if step.dt <= 0.0:
             return []
         wheels = self._wheels.measure(step)
-        learned = self._learned.measure(step, None) if self._learned is not None else None
+        learned = self._learned.measure(step, velocity) if self._learned is not None else None
         if wheels is not None and learned is not None and self._joint is not None:
             learned = self._joint.decorrelate(wheels, learned)
         return [m for m in (wheels, learned) if m is not None]
@@ -117,19 +119,36 @@ class Localizer:
             measured.extend(found)
         return measured
 
+    def _begin_segment(self, step: Step) -> None:
+        """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
+        self._segment = step.segment
+        self._initializer.reset()
+        given = self.config.estimator.initial_pose
+        last = self.estimator.belief
+        if given is not None and last is None:
+            self._prior = Belief(np.array(given), np.diag(np.square(self.config.estimator.initial_sigmas)))
+        elif not self.factors.known:
+            self._prior = Belief(np.zeros(3), _ORIGIN) if last is None else Belief(last.pose, last.cov + _ANYWHERE)
+        else:
+            self._prior = None
+
     def _initialize(
         self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
     ) -> Estimate | None:
         """Collect steps until the first pose is clear, then run them all through the estimator."""
+        if self._prior is not None:
+            self._initializer.waiting = False
+            return self._start(step, self._prior, sightings)
         started = self._initializer.collect(step, motions, sightings)
         if started is None:
-            return None
-        estimate = None
-        for buffered in started.steps:
-            if buffered.first:
-                estimate = self._start(buffered.step, started.prior, buffered.sightings)
-            else:
-                estimate = self._advance(buffered.step, buffered.motions, buffered.sightings)
+            return self._advance(step, motions, ()) if self._lost else None
+        if self._lost:
+            self._lost = False
+            return self._start(step, started.newest, ())
+        first, *rest = started.steps
+        estimate = self._start(first.step, started.first, first.sightings)
+        for later in rest:
+            estimate = self._advance(later.step, later.motions, later.sightings)
         return estimate
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:

@@ -60,8 +60,7 @@ class Weights:
         prediction and sighting together (Gauss–Newton), because after dead reckoning the linear one is far too large.
         """
         believed, refused, decisions = [], [], []
-        values = gtsam.Values()
-        values.insert(pose_key(k), gtsam.Pose2(*predicted.pose))
+        values = _values(k, predicted.pose)
         for given in measurements:
             m, weight = self._share_information(given)
             sighting = Sighting(m, self._cauchy(m))
@@ -131,17 +130,64 @@ def joint_nis(
     """Least ``|x ⊖ predicted|²_P + |h(x)|²_R`` over poses x: the NIS without the linearisation at the prediction."""
     information = np.linalg.inv(predicted.cov)
     made = factors.make(k, m, None)
-    pose, best = predicted.pose, float(residual @ residual)
+    pose, offset, best = predicted.pose, np.zeros(3), float(residual @ residual)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        offset = se2.log(se2.between(predicted.pose, pose))
-        H = information + J.T @ J
-        step = np.asarray(np.linalg.solve(H, -(information @ offset + J.T @ residual)), dtype=np.float64)
-        pose = se2.compose(pose, se2.exp(step))
+        pose = se2.compose(pose, _newton_step(information, offset, residual, J))
         if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
             break
-        values = gtsam.Values()
-        values.insert(pose_key(k), gtsam.Pose2(*pose))
-        residual, J = whitened(made, values)
+        residual, J = whitened(made, _values(k, pose))
         offset = se2.log(se2.between(predicted.pose, pose))
         best = min(best, float(offset @ information @ offset + residual @ residual))
     return best
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A pose that sightings alone give: covariance of the right perturbation, robust cost and its degrees of freedom."""
+
+    pose: FloatArray
+    cov: FloatArray
+    cost: float
+    dof: int
+
+
+def joint_fit(
+    start: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
+) -> Fit | None:
+    """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
+
+    Gauss–Newton with Cauchy weights, so that one wrong sighting does not spoil the place.
+    """
+    pose, previous = start, math.inf
+    for _ in range(4 * _GAUSS_NEWTON_STEPS):
+        normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
+        for m in sightings:
+            if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+                return None
+            r, J = whitened(factors.make(0, m, None), _values(0, pose))
+            k2 = (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k ** 2
+            square = float(r @ r) / len(r) * 2.0  # as if of one two-dimensional sighting
+            weight = k2 / (k2 + square)
+            cost += k2 * math.log1p(square / k2) * len(r) / 2.0
+            dof += len(r)
+            normal += weight * J.T @ J
+            pull += weight * J.T @ r
+        if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
+            return None
+        if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
+            break
+        previous = cost
+        pose = se2.compose(pose, se2.exp(-np.linalg.solve(normal, pull)))
+    cov = np.linalg.inv(normal)
+    return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
+
+
+def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:
+    gradient = information @ offset + J.T @ residual
+    return se2.exp(np.asarray(np.linalg.solve(information + J.T @ J, -gradient), dtype=np.float64))
+
+
+def _values(k: int, pose: FloatArray) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(pose_key(k), gtsam.Pose2(*pose))
+    return values

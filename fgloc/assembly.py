@@ -1,0 +1,193 @@
+"""From a recording, a map and a configuration to the parts of a run, checked before the run begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.errors import CameraError, ConfigError, RecordingError
+from fgloc.frames import BASE_NAMES, rpy_matrix
+from fgloc.gate import Gate
+from fgloc.localizer import Localizer
+from fgloc.motion import load_model
+from fgloc.motion.source import LearnedMotion
+from fgloc.recording.reader import Recording
+from fgloc.sensors.cameras import camera_from_info, load_camera, rescaled
+from fgloc.sensors.images import decode
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.stepper import Stepper
+from fgloc.types import (
+    Camera,
+    CameraInfoEvent,
+    CornersEvent,
+    Event,
+    FloatArray,
+    ImageEvent,
+    LandmarkMap,
+    MarkerPosesEvent,
+    OdometryEvent,
+    RangeBearingEvent,
+)
+
+_OPTICAL_TO_BODY = np.array(
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+)  # optical axes in body axes (REP 103)
+_SCAN_EVENTS = 20_000  # how far into a recording the first message of a kind is looked for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assembly:
+    """All parts of one run."""
+
+    config: Config
+    landmark_map: LandmarkMap | None
+    gate: Gate
+    detector: MarkerDetector | None
+    stepper: Stepper
+    wheels: WheelMotion
+    landmarks: LandmarkSensor
+    learned: LearnedMotion | None
+    localizer: Localizer
+    notes: tuple[str, ...]
+
+
+def assemble(recording: Recording, map_path: Path | None, config: Config, keep_all: bool) -> Assembly:
+    """Build and check the parts.
+
+    Raises:
+        RecordingError: nothing in the recording says how the robot moves, or a frame is missing.
+        CameraError: the calibration is missing, unusable or does not fit the images.
+        MapError, ModelError, ConfigError: as their loaders have it.
+    """
+    if not {"odometry", "joints", "command"} & set(recording.roles):
+        raise RecordingError(
+            f"{recording.path}: no odometry, joint states or commands; a run needs one of them. Topics: "
+            f"{', '.join(f'{t.name} ({t.message_type})' for t in recording.topics) or 'none'}"
+        )
+    landmark_map = load_map(map_path) if map_path is not None else None
+    notes = list(landmark_map.notes) if landmark_map is not None else []
+    first = _first_events(recording)
+    camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
+    T_base_sensor = None if camera is not None else _sensor_pose(recording, config, first, notes)
+    if landmark_map is None and config.estimator.kind != "isam2":
+        config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
+        notes.append(
+            "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is the "
+            "map's origin; for long runs build the map once with `fgloc map`."
+        )
+    detector = None
+    if "image" in recording.roles:
+        dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
+        if not dictionary:
+            raise ConfigError(
+                "no marker dictionary: set markers.dictionary (such as DICT_4X4_50) in --config or the map"
+            )
+        detector = MarkerDetector(dictionary, config.markers)
+    learned = joint = None
+    if config.motion.use and config.motion.model is not None:
+        model = load_model(config.motion.model)
+        learned = LearnedMotion(model, config.motion)
+        joint = model.joint if config.motion.correlation == "joint" else None
+    wheels = WheelMotion(config.wheels)
+    landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
+    return Assembly(
+        config=config,
+        landmark_map=landmark_map,
+        gate=Gate(config.gate, None if landmark_map is None else set(landmark_map.landmarks)),
+        detector=detector,
+        stepper=Stepper(config.keyframes, config.gate, config.estimator.lag_s),
+        wheels=wheels,
+        landmarks=landmarks,
+        learned=learned,
+        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all),
+        notes=tuple(notes),
+    )
+
+
+def _first_events(recording: Recording) -> dict[type[Event], Event]:
+    """The first event of each kind, near the beginning."""
+    found: dict[type[Event], Event] = {}
+    events: Iterator[Event] = recording.events()
+    for _, event in zip(range(_SCAN_EVENTS), events, strict=False):
+        found.setdefault(type(event), event)
+    return found
+
+
+def _base_frame(recording: Recording, config: Config, first: dict[type[Event], Event]) -> str:
+    if config.recording.base_frame is not None:
+        return config.recording.base_frame
+    for name in BASE_NAMES:
+        if name in recording.frames:
+            return name
+    odometry = first.get(OdometryEvent)
+    return odometry.child_frame_id if isinstance(odometry, OdometryEvent) else BASE_NAMES[0]
+
+
+def _camera(recording: Recording, config: Config, first: dict[type[Event], Event]) -> Camera:
+    info = first.get(CameraInfoEvent)
+    image = first.get(ImageEvent)
+    frame = next((e.frame_id for e in (info, image, first.get(CornersEvent)) if hasattr(e, "frame_id")), "")
+    T_base_cam = given_pose(config, default_axes="optical")
+    if T_base_cam is None:
+        T_base_cam = recording.frames.lookup(_base_frame(recording, config, first), frame)
+    if config.camera.file is not None:
+        camera = load_camera(config.camera.file, T_base_cam)
+    elif isinstance(info, CameraInfoEvent):
+        camera = camera_from_info(info, T_base_cam)
+    else:
+        raise CameraError(
+            f"{recording.path}: images or marker corners, but no sensor_msgs/CameraInfo; "
+            "set camera.file to a calibration YAML in --config"
+        )
+    if isinstance(image, ImageEvent):
+        height, width = decode(image).shape
+        if (width, height) != (camera.width, camera.height):
+            if not config.camera.rescale:
+                raise CameraError(
+                    f"{recording.path}: images are {width}x{height}, the calibration is for "
+                    f"{camera.width}x{camera.height}; calibrate at this size, or set camera.rescale: true"
+                )
+            camera = rescaled(camera, width, height)
+    return camera
+
+
+def given_pose(config: Config, default_axes: str) -> FloatArray | None:
+    """``T_base_sensor (4, 4)`` as configured: z forward for optical axes; None if it is not configured."""
+    if config.recording.sightings_pose is None:
+        return None
+    x, y, z, roll, pitch, yaw = config.recording.sightings_pose
+    T = np.eye(4)
+    T[:3, :3] = rpy_matrix(roll, pitch, yaw)
+    if (config.recording.sightings_axes or default_axes) == "optical":
+        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
+    T[:3, 3] = x, y, z
+    return T
+
+
+def _sensor_pose(
+    recording: Recording, config: Config, first: dict[type[Event], Event], notes: list[str]
+) -> FloatArray | None:
+    """Place of a sensor that reports landmarks, without images: as configured, or from tf, or at the base."""
+    given = given_pose(config, default_axes="body")
+    event = first.get(RangeBearingEvent) or first.get(MarkerPosesEvent)
+    if given is not None or not isinstance(event, RangeBearingEvent | MarkerPosesEvent):
+        return given
+    base = _base_frame(recording, config, first)
+    T = np.eye(4)
+    if event.frame_id in recording.frames and base in recording.frames:
+        T = recording.frames.lookup(base, event.frame_id)
+    else:
+        notes.append(
+            f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at the "
+            "base; set recording.sightings_pose otherwise."
+        )
+        if config.recording.sightings_axes == "optical":
+            T[:3, :3] = _OPTICAL_TO_BODY
+    return T

@@ -1,0 +1,144 @@
+"""The first pose: found from sightings alone, carried along by the motion until they agree on one place."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.carry import carry
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.incremental import fuse
+from fgloc.graph.log import Belief
+from fgloc.graph.weights import joint_fit
+from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
+from fgloc.types import (
+    CornerMeasurement,
+    FloatArray,
+    LandmarkMap,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+    MotionMeasurement,
+    RangeBearingMeasurement,
+    Step,
+)
+
+_WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
+_MAX_COST_PER_DOF = 4.0
+_MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
+_SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
+_MAX_STEPS = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Collected:
+    """One step of the time before the first pose was known."""
+
+    step: Step
+    motions: tuple[MotionMeasurement, ...]
+    sightings: tuple[LandmarkMeasurement, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The place that explains the collected sightings.
+
+    Attributes:
+        steps: what was collected, oldest first; the first one's motions are to be ignored.
+        first: weak prior for the oldest step, to be followed by all its sightings.
+        newest: pose at the newest step with the covariance that the sightings give.
+    """
+
+    steps: tuple[Collected, ...]
+    first: Belief
+    newest: Belief
+
+
+class Initializer:
+    """Collects steps while the pose is unknown.
+
+    Attributes:
+        waiting: whether the first pose is still looked for.
+    """
+
+    def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
+        self._config = config
+        self._map = landmark_map
+        self._factors = factors
+        self._steps: deque[Collected] = deque(maxlen=_MAX_STEPS)
+        self.waiting = True
+
+    def reset(self) -> None:
+        """Look for the pose again."""
+        self._steps.clear()
+        self.waiting = True
+
+    def collect(
+        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
+    ) -> Start | None:
+        """Add a step; return the start once one place explains what was seen and no other does."""
+        self._steps.append(Collected(step, tuple(motions), tuple(sightings)))
+        horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
+        while self._steps[0].step.stamp_ns < horizon:
+            self._steps.popleft()
+        newest = self._solve() if sightings else None
+        if newest is None:
+            return None
+        self.waiting = False
+        back = se2.inverse(self._travelled())
+        steps = tuple(self._steps)
+        self._steps.clear()
+        return Start(steps, Belief(se2.compose(newest.pose, back), _WEAK_PRIOR.copy()), newest)
+
+    def _solve(self) -> Belief | None:
+        here = list(self._carried())
+        attempts = [joint_fit(candidate, here, self._factors, self._config) for candidate in self._candidates(here)]
+        fits = sorted((fit for fit in attempts if fit is not None), key=lambda fit: fit.cost)
+        if not fits:
+            return None
+        best = fits[0]
+        rivals = [f for f in fits[1:] if (abs(se2.log(se2.between(best.pose, f.pose))) > _SAME_PLACE).any()]
+        if best.dof < 4 or best.cost > _MAX_COST_PER_DOF * best.dof:
+            return None
+        if rivals and rivals[0].cost < best.cost + _MARGIN:
+            return None
+        return Belief(best.pose, best.cov)
+
+    def _candidates(self, sightings: Sequence[LandmarkMeasurement]) -> Iterator[FloatArray]:
+        if self._map is None:
+            return
+        points = []
+        for m in sightings:
+            landmark = self._map.landmarks[m.landmark_id]
+            if isinstance(m, CornerMeasurement):
+                yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
+            elif isinstance(m, MarkerPoseMeasurement):
+                yield se2.compose(landmark.planar, se2.inverse(m.pose))
+            elif isinstance(m, RangeBearingMeasurement):
+                points.append((landmark.position[:2], m.range_m, m.bearing_rad))
+        yield from candidates_from_points(points)
+
+    def _carried(self) -> Iterator[LandmarkMeasurement]:
+        """Every collected sighting as seen from the newest step."""
+        motion, cov = np.zeros(3), np.zeros((3, 3))  # T_newest_then, and its covariance
+        for index in range(len(self._steps) - 1, -1, -1):
+            collected = self._steps[index]
+            for m in collected.sightings:
+                yield carry(m, motion, cov)
+            if collected.motions and index > 0:
+                step, step_cov = fuse(collected.motions)
+                back = se2.inverse(step)
+                ad = se2.adjoint(step)
+                motion, cov = se2.compose(motion, back), se2.compose_cov(cov, back, ad @ step_cov @ ad.T)
+
+    def _travelled(self) -> FloatArray:
+        """``T_oldest_newest``."""
+        travelled = np.zeros(3)
+        for collected in list(self._steps)[1:]:
+            if collected.motions:
+                travelled = se2.compose(travelled, fuse(collected.motions)[0])
+        return travelled

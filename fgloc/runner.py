@@ -1,0 +1,217 @@
+"""One run: a recording goes in, a RunResult comes out. Batch replays the events and then smooths; online does not."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.assembly import Assembly, assemble
+from fgloc.config import Config
+from fgloc.errors import EstimatorError
+from fgloc.frames import quaternion_yaw
+from fgloc.recording.reader import open_recording
+from fgloc.sensors.markers import detect_stream
+from fgloc.smoothing import smooth_run
+from fgloc.types import (
+    CornersEvent,
+    Decision,
+    Estimate,
+    Event,
+    FloatArray,
+    ImageEvent,
+    LandmarkMap,
+    RunResult,
+    Step,
+    Trajectory,
+    TruthEvent,
+)
+
+RunMode = Literal["batch", "online"]
+Progress = Callable[[float, float], None]
+"""Called with seconds of the recording done, and its length."""
+
+
+def find_beside(bag: Path, name: str) -> Path | None:
+    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
+    folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def run(
+    recording_path: Path,
+    map_path: Path | None,
+    config: Config,
+    mode: RunMode,
+    progress: Progress | None = None,
+    pace: float | None = None,
+    on_step: Callable[[Step, Estimate | None], None] | None = None,
+) -> RunResult:
+    """Localise one recording.
+
+    Args:
+        recording_path: any bag that `open_recording` reads.
+        map_path: marker map; None: landmarks are estimated too.
+        config: all settings.
+        mode: "batch" smooths after the replay; "online" keeps the filtered estimates.
+        progress: called now and then.
+        pace: replay at this multiple of real time; None: as fast as possible.
+        on_step: called after each step (online displays, benchmarks).
+
+    Raises:
+        FglocError: the input cannot be used, or no pose was ever found.
+    """
+    began = time.perf_counter()
+    with open_recording(recording_path, config.recording) as recording:
+        parts = assemble(recording, map_path, config, keep_all=mode == "batch" or map_path is None)
+        replay = _Replay(parts, recording.duration_s, progress, pace, mode == "batch")
+        for step in replay.steps(recording.events()):
+            start = time.perf_counter()
+            estimate = parts.localizer.update(step)
+            replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
+            if on_step is not None:
+                on_step(step, estimate)
+        notes = (*recording.notes, *parts.notes, *parts.gate.notes, *parts.stepper.notes, *parts.wheels.notes)
+        rejections = replay.rejections()
+        rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
+    if not replay.estimates:
+        raise EstimatorError(_never_found(replay, rejections))
+    estimates = replay.estimates
+    landmarks: LandmarkMap | None = parts.landmark_map
+    if mode == "batch":
+        estimates, landmarks, more = smooth_run(parts, replay.history, estimates)
+        notes = (*notes, *more)
+    return RunResult(
+        trajectory=_trajectory(estimates),
+        modes=tuple(e.mode for e in estimates),
+        decisions=tuple(replay.decisions),
+        counts=dict(parts.localizer.counts),
+        rejections=dict(sorted(rejections.items())),
+        notes=tuple(dict.fromkeys(notes)),
+        step_ms=np.array(replay.step_ms),
+        wall_s=time.perf_counter() - began,
+        truth=replay.truth(parts.config.truth.yaw_offset_rad),
+        landmarks=landmarks,
+        spans=replay.spans(),
+        source=recording_path,
+    )
+
+
+class _Replay:
+    """Events of one recording on their way to steps, and what is noted on the way."""
+
+    def __init__(
+        self, parts: Assembly, duration_s: float, progress: Progress | None, pace: float | None, keep_steps: bool
+    ) -> None:
+        self._parts = parts
+        self._duration_s = duration_s
+        self._progress = progress
+        self._pace = pace
+        self._image_rejections: Counter[str] = Counter()
+        self._truth: list[TruthEvent] = []
+        self._heard: dict[str, list[int]] = {}
+        self._first_ns: int | None = None
+        self.estimates: list[Estimate] = []
+        self.decisions: list[Decision] = []
+        self.step_ms: list[float] = []
+        self._keep_steps = keep_steps
+        self.history: list[Step] = []
+
+    def steps(self, events: Iterator[Event]) -> Iterator[Step]:
+        """Gate, detect and cut into steps."""
+        gated = self._gated(events)
+        if self._parts.detector is not None:
+            gated = self._regated(detect_stream(gated, self._parts.detector, self._image_rejections))
+        for event in gated:
+            self._heard.setdefault(event.topic, []).append(event.stamp_ns)
+            yield from self._parts.stepper.push(event)
+        yield from self._parts.stepper.flush()
+
+    def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
+        """Note one step's outcome."""
+        self.step_ms.append(milliseconds)
+        if self._keep_steps:
+            self.history.append(step)
+        if estimate is not None:
+            self.estimates.append(estimate)
+            self.decisions.extend(estimate.decisions)
+
+    def rejections(self) -> Counter[str]:
+        """Everything refused anywhere, by reason."""
+        parts = self._parts
+        total = Counter(parts.gate.rejections)
+        sources = [
+            parts.stepper.rejections,
+            parts.wheels.rejections,
+            parts.landmarks.rejections,
+            self._image_rejections,
+        ]
+        sources += [parts.localizer.rejections, parts.localizer.weights.rejections]
+        if parts.learned is not None:
+            sources.append(parts.learned.rejections)
+        for source in sources:
+            total.update(source)
+        return total
+
+    def truth(self, yaw_offset_rad: float) -> Trajectory | None:
+        """The truth as a planar trajectory with increasing stamps; None if there is none."""
+        rows = {
+            e.stamp_ns: (e.position[0], e.position[1], se2.wrap(quaternion_yaw(e.orientation) - yaw_offset_rad))
+            for e in self._truth
+        }
+        if len(rows) < 2:
+            return None
+        stamps = np.array(sorted(rows), dtype=np.int64)
+        return Trajectory(stamps, np.array([rows[int(s)] for s in stamps]))
+
+    def spans(self) -> dict[str, FloatArray]:
+        """Times [s from the first estimate] at which each topic was heard."""
+        origin = self.estimates[0].stamp_ns if self.estimates else 0
+        return {topic: (np.array(stamps) - origin) * 1e-9 for topic, stamps in sorted(self._heard.items())}
+
+    def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
+        began = time.perf_counter()
+        for event in events:
+            if self._first_ns is None:
+                self._first_ns = event.received_ns
+            elapsed = (event.received_ns - self._first_ns) * 1e-9
+            if self._pace is not None:
+                time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
+            if self._progress is not None:
+                self._progress(elapsed, self._duration_s)
+            passed = self._parts.gate.check(event)
+            if isinstance(passed, TruthEvent):
+                self._truth.append(passed)
+            elif passed is not None:
+                yield passed
+
+    def _regated(self, events: Iterator[Event]) -> Iterator[Event]:
+        """Pass what the detector found through the gate."""
+        for event in events:
+            if isinstance(event, ImageEvent):
+                continue
+            passed = self._parts.gate.check(event) if isinstance(event, CornersEvent) else event
+            if passed is not None:
+                yield passed
+
+
+def _trajectory(estimates: list[Estimate]) -> Trajectory:
+    return Trajectory(
+        np.array([e.stamp_ns for e in estimates], dtype=np.int64),
+        np.array([e.pose for e in estimates]),
+        np.array([e.cov for e in estimates]),
+    )
+
+
+def _never_found(replay: _Replay, rejections: Counter[str]) -> str:
+    heard = ", ".join(f"{topic} {len(spans)}" for topic, spans in replay.spans().items()) or "nothing"
+    why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
+    return (
+        f"the first pose was never found in {len(replay.step_ms)} steps. Heard: {heard}. Rejected: {why}. "
+        "Check the map's ids and sizes, or give estimator.initial_pose"
+    )
