@@ -1,0 +1,395 @@
+"""The gate: every event is validated, repaired or rejected here, before anything is estimated from it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from fgloc.config import GateConfig
+from fgloc.types import (
+    CommandEvent,
+    CornersEvent,
+    Event,
+    FloatArray,
+    ImageEvent,
+    ImuEvent,
+    JointsEvent,
+    MarkerCorners,
+    MarkerPose,
+    MarkerPosesEvent,
+    OdometryEvent,
+    RangeBearing,
+    RangeBearingEvent,
+    TransformEvent,
+    TruthEvent,
+)
+from fgloc.validate import PLANAR, judge_corners, judge_covariance, judge_quaternion
+
+_RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
+_MAX_ANGLE = 1e9  # rad, of a joint
+_MAX_ACCELERATION = 1e3  # m/s²
+_NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
+_NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
+
+Changes = dict[str, Any]  # fields of a repaired copy
+
+
+@dataclass(slots=True)
+class _Topic:
+    """What is remembered of one topic."""
+
+    newest_ns: int
+    recent: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    gaps: int = 0
+    longest_gap_ns: int = 0
+    back: bool = False  # the last stamp was far behind the newest
+
+
+class Gate:
+    """Validates events one by one; what it lets through can be computed with.
+
+    An event comes back as it was, or as a repaired copy, or not at all (None). Repairs:
+
+    - A nearly unit quaternion is normalised; a nearly symmetric covariance is made symmetric.
+    - A covariance that says nothing (a zero, NaN or absurdly large variance where one is needed) becomes all zeros:
+      "use the configured default". The odometry's is judged by x, y, yaw, the others' whole.
+    - A part that cannot be used is NaN in the copy and the rest is kept. Odometry: ``position`` and ``orientation``, or
+      ``linear`` and ``angular``. Joints: single entries of ``position``, ``velocity``, ``effort``. IMU:
+      ``linear_acceleration``. Events without any usable part are rejected whole.
+    - Bad entries of sightings are taken out; if none is left the event is rejected. Bearings in [pi, 2 pi] are wrapped.
+
+    ``rejections`` counts what was lost, by "sensor.reason". Sensors: odometry, command, joints, imu, image, sightings,
+    truth, transform. Reasons: stamp_zero, duplicate_stamp; non_finite, speed_bound, yaw_rate_bound, range_bound,
+    position_bound, quaternion, negative_variance, asymmetric_cov, indefinite_cov (of odometry with ``pose_`` or
+    ``twist_`` before them); length, position_non_finite, velocity_non_finite, effort_non_finite, position_bound,
+    wheel_rate_bound (joints); unavailable, acceleration (imu); empty, truncated (image); unknown_id,
+    corners_degenerate, corners_small, bearing_bound, bearing_unit (sightings).
+
+    Camera information passes unseen: whoever makes a camera of it validates it. Transforms may have stamp 0.
+    """
+
+    def __init__(self, config: GateConfig, known_ids: Collection[int] | None = None) -> None:
+        """Set up.
+
+        Args:
+            config: bounds.
+            known_ids: ids of the map; None if no map is given: then every id passes.
+        """
+        self.rejections: Counter[str] = Counter()
+        self._config = config
+        self._known = None if known_ids is None else frozenset(known_ids)
+        self._notes: dict[str, None] = {}  # an ordered set
+        self._unknown: set[int] = set()
+        self._seen: Counter[str] = Counter()  # events by sensor
+        self._topics: dict[str, _Topic] = {}
+        self._bearings: dict[str, list[int]] = {}  # by topic: beyond 2 pi, all
+        self._covs: dict[tuple[str, str], tuple[bytes, FloatArray | str]] = {}  # last covariance and its verdict
+        self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {
+            OdometryEvent: ("odometry", self._odometry),
+            CommandEvent: ("command", self._command),
+            JointsEvent: ("joints", self._joints),
+            ImuEvent: ("imu", self._imu),
+            ImageEvent: ("image", self._image),
+            TruthEvent: ("truth", self._truth),
+            CornersEvent: ("sightings", lambda e: self._sightings(e, self._corners)),
+            MarkerPosesEvent: ("sightings", lambda e: self._sightings(e, self._marker_pose)),
+            RangeBearingEvent: ("sightings", lambda e: self._sightings(e, self._range_bearing)),
+        }
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each; nothing is said twice."""
+        notes = list(self._notes)
+        if self._unknown:
+            ids = ", ".join(str(i) for i in sorted(self._unknown)[:12]) + (", ..." if len(self._unknown) > 12 else "")
+            notes.append(f"sightings of ids that are not in the map are ignored: {ids}")
+        for reason in ("odometry.twist_yaw_rate_bound", "command.yaw_rate_bound", "imu.yaw_rate_bound"):
+            bad, seen = self.rejections[reason], self._seen[reason.split(".")[0]]
+            if bad >= 10 and bad > 0.1 * seen:
+                notes.append(
+                    f"{bad} of {seen} yaw rates ({reason}) exceed {self._config.max_yaw_rate:g} rad/s: perhaps degrees "
+                    "were given for radians; else raise gate.max_yaw_rate"
+                )
+        for name, topic in self._topics.items():
+            if topic.gaps:
+                notes.append(
+                    f"{name}: {topic.gaps} silence(s) longer than {self._config.gap_s:g} s, "
+                    f"the longest {topic.longest_gap_ns * 1e-9:.1f} s"
+                )
+        return tuple(notes)
+
+    def check(self, event: Event) -> Event | None:
+        """The event, a repaired copy, or None if it was rejected (and counted)."""
+        entry = self._checks.get(type(event))
+        if entry is None:
+            checked = self._transform(event) if isinstance(event, TransformEvent) else event
+            if isinstance(checked, str):
+                self.rejections[f"transform.{checked}"] += 1
+                return None
+            return checked
+        sensor, check = entry
+        self._seen[sensor] += 1
+        topic = self._topics.get(event.topic)
+        reason = self._stamp(event, topic)
+        if not reason:
+            checked = check(event)
+            if not isinstance(checked, str):
+                self._remember(event, topic)
+                return checked
+            reason = checked
+        if reason != "emptied":  # its parts are counted already
+            self.rejections[f"{sensor}.{reason}"] += 1
+        return None
+
+    # --- stamps ---
+
+    def _stamp(self, event: Event, topic: _Topic | None) -> str:
+        """Reason to reject the event for its stamp, or ""."""
+        stamp = event.stamp_ns
+        if stamp <= 0:
+            self._note(
+                f"{event.topic}: messages with stamp 0 are rejected; if all are, list its role in "
+                "recording.received_stamps"
+            )
+            return "stamp_zero"
+        if topic is None or stamp > topic.newest_ns:
+            return ""
+        far_back = stamp < topic.newest_ns - self._config.clock_back_s * 1e9
+        if far_back and topic.back:  # twice running: the clock was set back (a bag loops), stamps may come again
+            topic.recent.clear()
+            topic.newest_ns = stamp
+            far_back = False
+        topic.back = far_back
+        return "duplicate_stamp" if stamp in topic.recent else ""
+
+    def _remember(self, event: Event, topic: _Topic | None) -> None:
+        stamp = event.stamp_ns
+        if topic is None:
+            topic = self._topics[event.topic] = _Topic(stamp)
+        elif stamp > topic.newest_ns:
+            gap = stamp - topic.newest_ns
+            if gap > self._config.gap_s * 1e9:
+                topic.gaps += 1
+                topic.longest_gap_ns = max(topic.longest_gap_ns, gap)
+            topic.newest_ns = stamp
+            topic.back = False
+        topic.recent.append(stamp)
+
+    # --- one method per kind of event: the event, a repaired copy, or the reason for rejection ---
+
+    def _odometry(self, event: OdometryEvent) -> Event | str:
+        config = self._config
+        changes: Changes = {}
+        vx, vy, vz = event.linear.tolist()
+        wx, wy, wz = event.angular.tolist()
+        if not math.isfinite(vx + vy + vz + wx + wy + wz):
+            twist = "non_finite"
+        elif max(abs(vx), abs(vy), abs(vz)) > config.max_speed:
+            twist = "speed_bound"
+        elif max(abs(wx), abs(wy), abs(wz)) > config.max_yaw_rate:
+            twist = "yaw_rate_bound"
+        else:
+            twist = self._cov(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
+        x, y, z = event.position.tolist()
+        if not math.isfinite(x + y + z):
+            pose = "non_finite"
+        elif max(abs(x), abs(y), abs(z)) > config.max_position:
+            pose = "position_bound"
+        else:
+            pose = self._quaternion(event.orientation, "orientation", changes) or self._cov(
+                event.topic, "pose", event.pose_cov, PLANAR, "pose_cov", changes
+            )
+        if twist:
+            self.rejections[f"odometry.twist_{twist}"] += 1
+            changes |= _NO_TWIST
+        if pose:
+            self.rejections[f"odometry.pose_{pose}"] += 1
+            changes |= _NO_POSE
+        if twist and pose:
+            return "emptied"
+        return replace(event, **changes) if changes else event
+
+    def _command(self, event: CommandEvent) -> Event | str:
+        if not math.isfinite(event.v + event.omega):
+            return "non_finite"
+        if abs(event.v) > self._config.max_speed:
+            return "speed_bound"
+        return "yaw_rate_bound" if abs(event.omega) > self._config.max_yaw_rate else event
+
+    def _joints(self, event: JointsEvent) -> Event | str:
+        n = len(event.names)
+        changes: Changes = {}
+        usable = 0  # angles and rates
+        for name, bound, wild in (
+            ("position", _MAX_ANGLE, "position_bound"),
+            ("velocity", self._config.max_wheel_rate, "wheel_rate_bound"),
+            ("effort", math.inf, ""),
+        ):
+            array: FloatArray = getattr(event, name)
+            values: list[float] = array.tolist()
+            if n == 0 or len(values) not in (0, n):
+                return "length"
+            good = [abs(value) <= bound and math.isfinite(value) for value in values]
+            if name != "effort":
+                usable += sum(good)
+            if all(good):
+                continue
+            if all(math.isnan(value) for value in values):  # a driver's way to say that it has none
+                self._note(f"{event.topic}: every {name} is NaN in some messages; taken as not given")
+                changes[name] = np.empty(0)
+            else:
+                finite = all(math.isfinite(value) for value in values)
+                self.rejections["joints." + (wild if finite else f"{name}_non_finite")] += 1
+                changes[name] = np.where(good, array, np.nan)
+        if not usable:
+            return "non_finite"
+        return replace(event, **changes) if changes else event
+
+    def _imu(self, event: ImuEvent) -> Event | str:
+        changes: Changes = {}
+        cov = event.angular_velocity_cov
+        if cov[0, 0] == -1.0:  # REP 145
+            self._note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")
+            return "unavailable"
+        wx, wy, wz = event.angular_velocity.tolist()
+        if not math.isfinite(wx + wy + wz):
+            return "non_finite"
+        if max(abs(wx), abs(wy), abs(wz)) > self._config.max_yaw_rate:
+            return "yaw_rate_bound"
+        if reason := self._cov(event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes):
+            return reason
+        ax, ay, az = event.linear_acceleration.tolist()
+        if not abs(ax) + abs(ay) + abs(az) <= _MAX_ACCELERATION:  # also NaN
+            self.rejections["imu.acceleration"] += 1
+            changes["linear_acceleration"] = np.full(3, np.nan)
+        return replace(event, **changes) if changes else event
+
+    def _image(self, event: ImageEvent) -> Event | str:
+        size = len(event.data)
+        if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
+            return "empty"
+        return "truncated" if not event.compressed and size < event.height * event.step else event
+
+    def _truth(self, event: TruthEvent) -> Event | str:
+        changes: Changes = {}
+        x, y, z = event.position.tolist()
+        if not math.isfinite(x + y + z):
+            return "non_finite"
+        if max(abs(x), abs(y), abs(z)) > self._config.max_position:
+            return "position_bound"
+        if reason := self._quaternion(event.orientation, "orientation", changes):
+            return reason
+        return replace(event, **changes) if changes else event
+
+    def _transform(self, event: TransformEvent) -> Event | str:
+        changes: Changes = {}
+        if not np.isfinite(event.translation).all():
+            return "non_finite"
+        if reason := self._quaternion(event.rotation, "rotation", changes):
+            return reason
+        return replace(event, **changes) if changes else event
+
+    # --- sightings: as above, for one entry ---
+
+    def _sightings(self, event: Any, check: Callable[[str, Any], Any]) -> Any:
+        """The event with what ``check`` lets through of its sightings."""
+        after = []
+        changed = False
+        for sighting in event.sightings:
+            checked = check(event.topic, sighting)
+            if isinstance(checked, str):
+                self.rejections[f"sightings.{checked}"] += 1
+                changed = True
+            else:
+                after.append(checked)
+                changed = changed or checked is not sighting
+        if not changed:
+            return event
+        return replace(event, sightings=tuple(after)) if after else "emptied"
+
+    def _unknown_id(self, landmark_id: int) -> bool:
+        if self._known is None or landmark_id in self._known:
+            return False
+        if len(self._unknown) < 1000:
+            self._unknown.add(landmark_id)
+        return True
+
+    def _corners(self, topic: str, sighting: MarkerCorners) -> MarkerCorners | str:
+        if self._unknown_id(sighting.marker_id):
+            return "unknown_id"
+        return judge_corners(sighting.corners_px, self._config.min_marker_side_px) or sighting
+
+    def _marker_pose(self, topic: str, sighting: MarkerPose) -> MarkerPose | str:
+        if self._unknown_id(sighting.marker_id):
+            return "unknown_id"
+        changes: Changes = {}
+        distance = math.hypot(*sighting.position.tolist())
+        if not math.isfinite(distance):
+            return "non_finite"
+        if not self._config.min_range <= distance <= self._config.max_range:
+            return "range_bound"
+        reason = self._quaternion(sighting.orientation, "orientation", changes)
+        reason = reason or self._cov(topic, "marker pose", sighting.cov, range(6), "cov", changes)
+        if reason:
+            return reason
+        return replace(sighting, **changes) if changes else sighting
+
+    def _range_bearing(self, topic: str, sighting: RangeBearing) -> RangeBearing | str:
+        if self._unknown_id(sighting.landmark_id):
+            return "unknown_id"
+        distance, bearing = sighting.range_m, sighting.bearing_rad
+        if not math.isfinite(distance + bearing):
+            return "non_finite"
+        if not self._config.min_range <= distance <= self._config.max_range:
+            return "range_bound"
+        bearings = self._bearings.setdefault(topic, [0, 0])
+        bearings[1] += 1
+        if abs(bearing) > 2.0 * math.pi:
+            bearings[0] += 1
+            return "bearing_bound"
+        if bearings[0] >= 3 and bearings[0] > 0.2 * bearings[1]:
+            self._note(
+                f"{topic}: many bearings lie beyond 2 pi: probably degrees where radians were expected; none is used "
+                "while that is so: convert the recording"
+            )
+            return "bearing_unit"
+        if abs(bearing) > math.pi:
+            return replace(sighting, bearing_rad=math.remainder(bearing, 2.0 * math.pi))
+        return sighting
+
+    # --- parts: "" or the reason for rejection; a repaired copy goes into ``changes`` ---
+
+    def _quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
+        verdict = judge_quaternion(quaternion, self._config.quaternion_tolerance)
+        if isinstance(verdict, str):
+            return verdict
+        if verdict is not quaternion:
+            changes[name] = verdict
+        return ""
+
+    def _cov(
+        self, topic: str, what: str, cov: FloatArray, axes: tuple[int, ...] | range, name: str, changes: Changes
+    ) -> str:
+        raw = cov.tobytes()
+        key = (topic, what)
+        last = self._covs.get(key)
+        if last is not None and last[0] == raw:  # most drivers send the same one for ever
+            verdict = last[1]
+        else:
+            verdict, was = judge_covariance(cov, axes, self._config.max_variance)
+            if was:
+                self._note(f"{topic}: {what} covariance is {was}; the configured default is used")
+            self._covs[key] = (raw, verdict)
+        if isinstance(verdict, str):
+            return verdict
+        if verdict is not cov and verdict.tobytes() != raw:
+            changes[name] = verdict
+        return ""
+
+    def _note(self, text: str) -> None:
+        self._notes.setdefault(text)

@@ -1,0 +1,101 @@
+"""Is this a covariance, a quaternion, a marker? Pure judgements that the gate acts on.
+
+A judgement is the thing itself (perhaps a repaired copy) or a ``str``: the reason why it cannot be used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fgloc.types import FloatArray
+
+_ASYMMETRY = 1e-4  # of a correlation: less is rounding, more is a mistake
+_INDEFINITE = 1e-6  # an eigenvalue of a correlation matrix may be this negative
+_MAX_PIXEL = 1e5
+PLANAR = (0, 1, 5)  # x, y, yaw of a ROS covariance
+
+
+def judge_quaternion(quaternion: FloatArray, tolerance: float) -> FloatArray | str:
+    """The quaternion ``(4,)``, made exactly unit if its norm is within ``tolerance`` of 1."""
+    x, y, z, w = quaternion.tolist()
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not abs(norm - 1.0) <= tolerance:  # also NaN
+        return "quaternion" if math.isfinite(norm) else "non_finite"
+    return quaternion if abs(norm - 1.0) <= 1e-6 else quaternion / norm
+
+
+def judge_covariance(cov: FloatArray, axes: Sequence[int], max_variance: float) -> tuple[FloatArray | str, str]:
+    """Judge the block of a covariance that somebody will read.
+
+    Args:
+        cov: ``(n, n)``.
+        axes: rows and columns that are read. Of the others only the variances are looked at: planar robots like to
+            fill them with 1e6 or infinity.
+        max_variance: above it a variance says "unknown".
+
+    Returns:
+        The verdict and, if the verdict is all zeros ("unknown: use the default"), what the covariance was. A negative
+        variance, an asymmetric or an indefinite block gives a reason instead; rounding is repaired.
+    """
+    n = len(cov)
+    flat: list[float] = cov.ravel().tolist()
+    variances = flat[:: n + 1]
+    needed = [variances[i] for i in axes]
+    if any(value != value for value in flat):
+        return np.zeros_like(cov), "NaN"
+    if min(variances) < 0.0:
+        return "negative_variance", ""
+    if max(needed) > max_variance:
+        return np.zeros_like(cov), f"larger than {max_variance:g}"
+    if flat.count(0.0) - variances.count(0.0) < n * n - n:  # not diagonal
+        sigmas = [math.sqrt(value) or 1.0 for value in needed]  # a zero variance allows no correlation
+        asymmetry, r = 0.0, []
+        for k, i in enumerate(axes):
+            for m, j in enumerate(axes[:k]):
+                a, b = flat[i * n + j] / sigmas[k] / sigmas[m], flat[j * n + i] / sigmas[k] / sigmas[m]
+                asymmetry = max(asymmetry, abs(a - b) if math.isfinite(a - b) else math.inf)
+                r.append(0.5 * (a + b))
+        if asymmetry > _ASYMMETRY:
+            return "asymmetric_cov", ""
+        if _indefinite(r, [float(value > 0.0) for value in needed]):
+            return "indefinite_cov", ""
+        if asymmetry > 0.0:
+            cov = cov.copy()
+            block = cov[np.ix_(axes, axes)]
+            cov[np.ix_(axes, axes)] = 0.5 * (block + block.T)
+    if min(needed) == 0.0:
+        return np.zeros_like(cov), "zero" if max(needed) == 0.0 else "zero in part"
+    return cov, ""
+
+
+def _indefinite(r: list[float], diagonal: list[float]) -> bool:
+    """Whether a correlation matrix, given as lower triangle without and with its diagonal, is not semi-definite."""
+    if any(abs(value) > 1.0 + _INDEFINITE for value in r):
+        return True
+    n = len(diagonal)
+    if n == 3 and min(diagonal) > 0.0:  # spelled out: it runs for each odometry message of a growing covariance
+        a, b, c = r
+        return 1.0 + 2.0 * a * b * c - a * a - b * b - c * c < -_INDEFINITE
+    matrix = np.diag(diagonal)
+    matrix[np.tril_indices(n, -1)] = r
+    return bool(np.linalg.eigvalsh(matrix, UPLO="L")[0] < -_INDEFINITE)
+
+
+def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
+    """Reason why four corners ``(4, 2)`` are no marker, or "": finite, convex and not too small."""
+    if corners_px.shape != (4, 2):
+        return "corners_degenerate"
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners_px.tolist()
+    spread = abs(ax) + abs(ay) + abs(bx) + abs(by) + abs(cx) + abs(cy) + abs(dx) + abs(dy)
+    if not spread <= 8.0 * _MAX_PIXEL:  # also NaN
+        return "non_finite"
+    abx, aby, bcx, bcy, cdx, cdy, dax, day = bx - ax, by - ay, cx - bx, cy - by, dx - cx, dy - cy, ax - dx, ay - dy
+    side = (math.hypot(abx, aby) + math.hypot(bcx, bcy) + math.hypot(cdx, cdy) + math.hypot(dax, day)) / 4.0
+    turns = (abx * bcy - aby * bcx, bcx * cdy - bcy * cdx, cdx * day - cdy * dax, dax * aby - day * abx)
+    flat = 1e-3 * side * side
+    if not (min(turns) > flat or max(turns) < -flat):  # crossed, dented, or on a line
+        return "corners_degenerate"
+    return "corners_small" if side < min_side_px else ""
