@@ -1,0 +1,78 @@
+"""``metadata.yaml`` of a rosbag2 folder: which storage files belong to it. Hostile contents are refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import yaml
+
+from fgloc.errors import RecordingError
+
+_MAX_BYTES = 16 * 1024 * 1024
+_MAX_DEPTH = 50
+
+
+@dataclass(frozen=True, slots=True)
+class BagMetadata:
+    """What of ``metadata.yaml`` is needed to find and to judge the storage files."""
+
+    files: tuple[Path, ...]
+    compressed: bool  # by rosbag2 itself (whole files or single messages), not inside the storage format
+    message_count: int | None
+
+
+def read_metadata(folder: Path) -> BagMetadata | None:
+    """Read ``folder/metadata.yaml``; None if it is absent or is too damaged to be understood.
+
+    Raises:
+        RecordingError: the file has YAML aliases or absurd size or depth, or names a path outside the folder.
+    """
+    path = folder / "metadata.yaml"
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise RecordingError(f"{path}: {path.stat().st_size} bytes, expected less than {_MAX_BYTES}; {_REMEDY}")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return None
+    try:
+        _refuse_bombs(path, text)
+        content = yaml.safe_load(text)
+        information = content["rosbag2_bagfile_information"]
+        names = [_inside(path, name) for name in information["relative_file_paths"]]
+        count = information.get("message_count")
+        return BagMetadata(
+            files=tuple(folder / name for name in dict.fromkeys(names)),
+            compressed=str(information.get("compression_mode") or "none").lower() not in ("none", ""),
+            message_count=count if isinstance(count, int) and count >= 0 else None,
+        )
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+_REMEDY = "do not trust this recording, or delete its metadata.yaml to have the storage files opened directly"
+
+
+def _refuse_bombs(path: Path, text: str) -> None:
+    """Refuse aliases (they let a few lines expand without bound) and deep nesting before anything is built."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise RecordingError(f"{path}: has a YAML alias (*{event.anchor}), which rosbag2 never writes; {_REMEDY}")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _MAX_DEPTH:
+            raise RecordingError(f"{path}: nested deeper than {_MAX_DEPTH} levels; {_REMEDY}")
+
+
+def _inside(path: Path, name: Any) -> str:
+    """File name of a relative path; ros2 foxy put the bag's folder in front of it."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise ValueError(name)
+    parts = PureWindowsPath(name).parts  # splits at / and at \
+    if PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor or ".." in parts:
+        raise RecordingError(f"{path}: relative_file_paths names {name!r}, expected a file in {path.parent}; {_REMEDY}")
+    return parts[-1]

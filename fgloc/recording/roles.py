@@ -1,0 +1,176 @@
+"""Which topic plays which role. Found by message type; what is ambiguous is named, never guessed silently."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+from fgloc.config import Role, TopicsConfig
+from fgloc.recording.decode import CONVERTERS
+
+ROLES: tuple[Role, ...] = get_args(Role)
+
+# Of several candidates for a role, the only one with such a name (alone or below a namespace) is taken.
+CONVENTIONAL_NAMES: Mapping[Role, tuple[str, ...]] = {
+    "odometry": ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
+    "command": ("cmd_vel",),
+    "joints": ("joint_states",),
+    "imu": ("imu", "imu/data"),
+    "image": ("image_raw", "image_raw/compressed", "image", "image/compressed"),
+    "camera_info": ("camera_info",),
+    "sightings": (),
+    "truth": (),
+}
+
+# Words (between / and _) by which a topic says what it is.
+TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "vrpn", "qualisys"})
+_NOT_TRUTH = re.compile(
+    r"goal|initial_?pose|target|setpoint|clicked|plan|waypoint|amcl|ekf|ukf|slam|filter|estimate|combined|"
+    r"aruco|marker|tag|detection|odom",
+    re.IGNORECASE,
+)
+_NOT_IMAGE = re.compile(r"depth|disparity|confidence|mask|debug|result|overlay|rect|costmap", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """One topic of a recording."""
+
+    name: str
+    message_type: str  # "pkg/msg/Name"
+    count: int
+    role: Role | None = None  # the role that it was selected for
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Outcome of the selection."""
+
+    roles: Mapping[Role, str]
+    notes: tuple[str, ...]  # what was taken for what, where that was not obvious
+    problems: tuple[str, ...]  # ambiguities, and configured topics that do not fit
+
+
+def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection:
+    """Find a topic for each role.
+
+    Args:
+        topics: all topics; those without messages are no candidates.
+        config: topics given by the user; they win, and "none" switches a role off.
+    """
+    roles: dict[Role, str] = {}
+    notes: list[str] = []
+    problems: list[str] = []
+    filled = [topic for topic in topics if topic.count > 0]
+    for role in ROLES:
+        given: str | None = getattr(config, role)
+        if given is None or given == "none":
+            continue
+        if problem := _misfit(role, given, topics):
+            problems.append(problem)
+        elif given in roles.values():
+            problems.append(f"recording.topics.{role}: {given} is given for another role too; choose one of them")
+        else:
+            roles[role] = given
+    for role in sorted(ROLES, key=_by_dependence):
+        if getattr(config, role) is not None:
+            continue
+        candidates = [topic.name for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
+        chosen, why = _choose(role, candidates, roles.get("image"))
+        if chosen is not None:
+            roles[role] = chosen
+            if why:
+                notes.append(f"{chosen} is taken as {role}: {why}.")
+        elif not candidates:
+            passed_over = [
+                t.name for t in filled if t.message_type in CONVERTERS[role] and t.name not in roles.values()
+            ]
+            if passed_over and role in ("image", "truth"):
+                notes.append(
+                    f"No {role}: {', '.join(passed_over)} would fit by type but not by name "
+                    f"(to use it all the same: recording.topics.{role}: {passed_over[0]})."
+                )
+        else:
+            problems.append(
+                f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
+                f"configuration (recording.topics.{role}: {candidates[0]}), or none (recording.topics.{role}: none)"
+            )
+    return Selection(roles, tuple(notes), tuple(problems))
+
+
+def _by_dependence(role: Role) -> int:
+    """Truth first, for its Odometry topics are not the odometry; CameraInfo after its image."""
+    return {"truth": 0, "camera_info": 2}.get(role, 1)
+
+
+def _fits(role: Role, topic: TopicInfo) -> bool:
+    if topic.message_type not in CONVERTERS[role]:
+        return False
+    if role == "truth":
+        odometry = topic.message_type in CONVERTERS["odometry"]
+        return _says_truth(topic.name) or not (odometry or _NOT_TRUTH.search(topic.name))
+    if role == "odometry":
+        return not _says_truth(topic.name)
+    if role in ("image", "camera_info"):
+        return not _NOT_IMAGE.search(topic.name)
+    return True
+
+
+def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str | None, str]:
+    """The candidate to take, or None; and why, where that needs saying."""
+    if role == "camera_info" and image is not None:
+        siblings = [name for name in candidates if _camera(name) == _camera(image)]
+        if siblings:
+            candidates = siblings
+    if role == "truth" and (named := [name for name in candidates if _says_truth(name)]):
+        others = [name for name in candidates if name not in named]
+        if len(named) == 1:
+            return named[0], f"its name says so, unlike {', '.join(others)}" if others else ""
+        return None, ""
+    if role == "image" and len(pair := candidates) == 2 and len({_camera(name) for name in pair}) == 1:
+        raw = [name for name in pair if not name.endswith("/compressed")]
+        if len(raw) == 1 and f"{raw[0]}/compressed" in pair:
+            return raw[0], f"not compressed, unlike {raw[0]}/compressed"
+    if len(candidates) == 1:
+        return candidates[0], "it is the only pose there, though its name does not say so" if role == "truth" else ""
+    conventional = [name for name in candidates if _conventional(role, name)]
+    if len(conventional) == 1:
+        others = [name for name in candidates if name not in conventional]
+        return conventional[0], f"its name is the usual one, unlike {', '.join(others)}"
+    return None, ""
+
+
+def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
+    """What is wrong with a configured topic; empty if nothing."""
+    types = CONVERTERS[role]
+    found = next((topic for topic in topics if topic.name == given), None)
+    fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
+    remedy = f"choose {' or '.join(fitting)}" if fitting else f"the recording has no topic for the {role}: use none"
+    if found is None:
+        return f"recording.topics.{role}: {given} is not in the recording; {remedy}"
+    if found.message_type not in types:
+        expected = " or ".join(types)
+        return f"recording.topics.{role}: {given} is a {found.message_type}, expected {expected}; {remedy}"
+    if found.count == 0:
+        return f"recording.topics.{role}: {given} has no messages; {remedy}"
+    return ""
+
+
+def _says_truth(topic: str) -> bool:
+    """Whether one of the words of a topic (between / and _, or in camel case) says so."""
+    return not TRUTH_WORDS.isdisjoint(
+        word.lower()
+        for separators in (r"[/_.-]+", r"[/_.-]+|(?<=[a-z])(?=[A-Z])")
+        for word in re.split(separators, topic)
+    )
+
+
+def _conventional(role: Role, topic: str) -> bool:
+    return any(topic.strip("/") == name or topic.endswith(f"/{name}") for name in CONVENTIONAL_NAMES[role])
+
+
+def _camera(topic: str) -> str:
+    """Namespace of a camera: the folder of its image or CameraInfo."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]

@@ -1,0 +1,274 @@
+"""The files of a recording, opened with rosbags: one interface for all kinds, one error type, salvage where needed."""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rosbags.interfaces import MessageDefinition
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
+
+from fgloc.errors import RecordingError
+from fgloc.recording.metadata import BagMetadata, read_metadata
+from fgloc.recording.recover import recover
+from fgloc.recording.recover_sqlite import sqlite_journals
+
+_KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
+_EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
+
+RawMessage = tuple[str, str, int, bytes]  # topic, message type (pkg/msg/Name), received_ns, serialized message
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """Messages of one type on one topic."""
+
+    topic: str
+    message_type: str
+    count: int
+    definition: MessageDefinition
+
+
+class Storage:
+    """Opened storage files of one recording.
+
+    Attributes:
+        kind: "ros1", "sqlite3" or "mcap".
+        files: the storage files.
+        notes: what went wrong and was got round; grows while messages are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open.
+
+        Raises:
+            RecordingError: nothing can be read, or the recording is hostile; names the file and the reason.
+        """
+        self.notes: list[str] = []
+        self._scratch: TemporaryDirectory[str] | None = None
+        metadata, self.files = _find_files(path, self.notes)
+        self.kind = _kind(self.files[0])
+        self._files: list[_File] = []
+        try:
+            if metadata is not None and metadata.compressed:
+                self._files.append(_File(path, "folder", self._folder, self.notes))
+            else:
+                self._open_files()
+            if metadata is not None and metadata.message_count is not None:
+                self._compare_count(metadata.message_count)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open_files(self) -> None:
+        failures = []
+        for file in self.files:
+            try:
+                self._files.append(_File(file, _kind(file), self._folder, self.notes))
+            except RecordingError as error:
+                failures.append(str(error))
+        if not self._files:
+            raise RecordingError("\n".join(failures))
+        self.notes.extend(failures)
+
+    def _compare_count(self, expected: int) -> None:
+        found = sum(channel.count for channel in self.channels)
+        if found < expected:
+            self.notes.append(
+                f"metadata.yaml counts {expected} messages, the files hold {found}: {1 - found / expected:.1%} lost."
+            )
+
+    def close(self) -> None:
+        """Close all files and delete scratch copies."""
+        for file in self._files:
+            file.close()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+            self._scratch = None
+
+    def _folder(self) -> Path:
+        if self._scratch is None:
+            self._scratch = TemporaryDirectory(prefix="fgloc-")
+        return Path(self._scratch.name)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Topics and types; one entry for each pair."""
+        merged: dict[tuple[str, str], Channel] = {}
+        for file in self._files:
+            for c in file.reader.connections:
+                known = merged.get((c.topic, c.msgtype))
+                count = c.msgcount + (known.count if known else 0)
+                definition = known.definition if known and known.definition.data else c.msgdef
+                merged[c.topic, c.msgtype] = Channel(c.topic, c.msgtype, count, definition)
+        return tuple(merged.values())
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Receive time of the first and of the last message; (0, 0) if there is none."""
+        spans = [(f.reader.start_time, f.reader.end_time - 1) for f in self._files if f.reader.message_count]
+        return (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else (0, 0)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages of the given topics (None: of all) in order of receive time.
+
+        Raises:
+            RecordingError: the storage is damaged and nothing could be read before.
+        """
+        streams = [file.messages(topics) for file in self._files]
+        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda message: message[2])
+
+    def content_hash(self) -> str:
+        """Hex SHA-256 of the storage files' bytes, one after the other."""
+        digest = hashlib.sha256()
+        for file in self.files:
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+        return digest.hexdigest()
+
+
+class _File:
+    """One storage file (or a compressed folder), replaced by a salvaged copy once it proves damaged."""
+
+    def __init__(self, path: Path, kind: str, folder: Callable[[], Path], notes: list[str]) -> None:
+        self._path, self._kind, self._folder, self._notes = path, kind, folder, notes
+        self._recovered = False
+        self.reader: Any = None
+        try:
+            if kind == "sqlite3" and (journals := sqlite_journals(path)):
+                raise RecordingError(f"the recorder was killed, {journals[0].name} is left")
+            self.reader = _open(path, kind)
+        except Exception as error:  # rosbags leaks apsw, struct, decoding and assertion errors
+            self._recover(error)
+
+    def close(self) -> None:
+        reader, self.reader = self.reader, None
+        if reader is not None:
+            reader.close()
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        last_ns = -1
+        at_last: list[tuple[str, bytes]] = []  # what was delivered last, to go on from there in a salvaged copy
+        resume = (last_ns, at_last)
+        while True:
+            reader = self.reader
+            wanted = [c for c in reader.connections if topics is None or c.topic in topics]
+            if not wanted:
+                return
+            try:
+                for connection, received_ns, raw in reader.messages(wanted):
+                    if received_ns < resume[0] or (received_ns == resume[0] and (connection.topic, raw) in resume[1]):
+                        continue
+                    if received_ns != last_ns:
+                        last_ns, at_last = received_ns, []
+                    at_last.append((connection.topic, raw))
+                    yield connection.topic, connection.msgtype, received_ns, raw
+                return
+            except Exception as error:
+                if self.reader is reader:  # else another iterator has already replaced it
+                    try:
+                        self._recover(error)
+                    except RecordingError as final:
+                        if last_ns < 0:
+                            raise
+                        self._note(f"{final} What was read before is kept.")
+                        return
+                resume = (last_ns, at_last)
+
+    def _recover(self, error: Exception) -> None:
+        reason = _reason(error)
+        if self._recovered or self._kind == "folder" or isinstance(error, (PermissionError, FileNotFoundError)):
+            raise RecordingError(f"{self._path}: cannot be read: {reason}.") from error
+        try:
+            recovered = recover(self._path, self._kind, self._folder())
+            reader = _open(recovered.path, _kind(recovered.path)) if recovered.messages else None
+        except Exception as second:
+            raise RecordingError(f"{self._path}: cannot be read: {reason}; nor salvaged: {_reason(second)}.") from error
+        if reader is None:
+            raise RecordingError(
+                f"{self._path}: cannot be read: {reason}; {_EXPECTED}, and no message could be salvaged."
+            ) from error
+        self._recovered = True
+        self.close()
+        self.reader = reader
+        self._note(
+            f"{self._path.name} is damaged ({reason}): salvaged {recovered.messages} messages, "
+            f"{recovered.lost:.1%} of its bytes are lost."
+        )
+
+    def _note(self, text: str) -> None:
+        if text not in self._notes:
+            self._notes.append(text)
+
+
+def _open(path: Path, kind: str) -> Any:
+    reader = Ros1Reader(path) if kind == "ros1" else Ros2Reader(path)
+    reader.open()
+    try:
+        if kind == "mcap" and not reader.storage.chunks:  # type: ignore[union-attr]
+            for _ in reader.messages():  # without an index rosbags finds disorder only when it meets it
+                pass
+        if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
+            raise RecordingError("topic names are damaged")
+    except BaseException:
+        reader.close()
+        raise
+    return reader
+
+
+def _find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
+    """Storage files of a recording, in order, and its metadata where used."""
+    if not path.exists():
+        raise RecordingError(f"{path}: does not exist; {_EXPECTED}")
+    if path.is_file():
+        _kind(path)
+        return None, (path,)
+    metadata = read_metadata(path)
+    if metadata is not None:
+        present = tuple(file for file in metadata.files if file.is_file())
+        if present:
+            missing = [file.name for file in metadata.files if file not in present]
+            if missing:
+                notes.append(f"Named by metadata.yaml but missing: {', '.join(missing)}.")
+            return metadata, present
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for file in sorted(path.iterdir(), key=_natural):
+        if file.is_file() and file.suffix in (".mcap", ".db3"):
+            groups[file.suffix].append(file)
+    if not groups:
+        bags = sorted(file.name for file in path.glob("*.bag"))
+        hint = f"; give one of its ROS 1 bags: {', '.join(bags)}" if bags else f"; {_EXPECTED}"
+        raise RecordingError(f"{path}: a folder without .mcap or .db3{hint}")
+    if len(groups) > 1:
+        names = ", ".join(file.name for files in groups.values() for file in files)
+        raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
+    files = next(iter(groups.values()))
+    state = "damaged" if (path / "metadata.yaml").exists() else "missing"
+    notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
+    return None, tuple(files)
+
+
+def _kind(path: Path) -> str:
+    suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
+    if suffix not in _KINDS:
+        raise RecordingError(f"{path}: unknown kind {suffix!r}; {_EXPECTED}")
+    return _KINDS[suffix]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key: run_2 before run_10."""
+    parts = "".join(c if c.isdigit() else f" {c} " for c in path.name).split()
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _reason(error: Exception) -> str:
+    text = str(error).strip().rstrip(".")
+    return text if isinstance(error, RecordingError) and text else f"{type(error).__name__}: {text}".rstrip(": ")

@@ -1,0 +1,123 @@
+"""The tree of frames that a recording's ``/tf_static`` and ``/tf`` describe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc.errors import RecordingError
+from fgloc.frames import quaternion_matrix, transform_matrix
+from fgloc.types import FloatArray, TransformEvent
+
+_SAME_M = 1e-3
+_SAME_RAD = 1e-3
+_REMEDY = (
+    "record /tf_static, or give the sensor's place in the configuration "
+    "(recording.sightings_pose: [x, y, z, roll, pitch, yaw])"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    T: FloatArray  # (4, 4) T_parent_child
+    moves: bool
+
+
+class FrameTree:
+    """Rigid transforms between frames."""
+
+    def __init__(self, transforms: Iterable[TransformEvent] = ()) -> None:
+        """Collect the transforms. A frame pair that is published again with another pose moves, unless it is static.
+
+        Transforms with a rotation that is not one, or with a frame inside itself, are left out.
+        """
+        self._edges: dict[tuple[str, str], _Edge] = {}
+        for t in transforms:
+            key = (_bare(t.parent), _bare(t.child))
+            norm = float(np.linalg.norm(t.rotation))
+            if key[0] == key[1] or not np.isfinite(t.translation).all() or not abs(norm - 1.0) < 0.05:
+                continue
+            known = self._edges.get(key)
+            if known is None or t.static:
+                self._edges[key] = _Edge(transform_matrix(t.translation, t.rotation / norm), False)
+            elif not known.moves and _differ(known.T, t.translation, t.rotation / norm):
+                self._edges[key] = _Edge(known.T, True)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of all frames, sorted."""
+        return tuple(sorted({name for edge in self._edges for name in edge}))
+
+    def __contains__(self, frame: str) -> bool:
+        return _bare(frame) in self.frames
+
+    def lookup(self, parent: str, child: str) -> FloatArray:
+        """``T_parent_child`` ``(4, 4)``, along whatever transforms join the two frames.
+
+        Raises:
+            RecordingError: a frame is not there, the two are not joined, or one moves against the other.
+        """
+        parent, child = _bare(parent), _bare(child)
+        if parent == child:
+            return np.eye(4)
+        names = self.frames
+        for name in (child, parent):
+            if name not in names:
+                there = f"the frames there are {', '.join(names)}" if names else "the recording has no transforms"
+                raise RecordingError(
+                    f"no transform from {parent!r} to {child!r}: frame {name!r} is missing; {there}; {_REMEDY}"
+                )
+        path = self._path(parent, child)
+        if path is None:
+            raise RecordingError(
+                f"no transform from {parent!r} to {child!r}: both frames are there, but nothing joins them "
+                f"(frames: {', '.join(names)}); {_REMEDY}"
+            )
+        T = np.eye(4)
+        for a, b in path:
+            edge = self._edges.get((a, b)) or self._edges[b, a]
+            if edge.moves:
+                raise RecordingError(
+                    f"no fixed transform from {parent!r} to {child!r}: {b!r} moves against {a!r} during the recording; "
+                    f"{_REMEDY}"
+                )
+            T = T @ (edge.T if (a, b) in self._edges else np.linalg.inv(edge.T))
+        return T
+
+    def _path(self, start: str, end: str) -> list[tuple[str, str]] | None:
+        """Frame pairs from start to end, breadth first; fixed transforms before moving ones."""
+        for fixed_only in (True, False):
+            neighbors: dict[str, list[str]] = {}
+            for (a, b), edge in self._edges.items():
+                if not (fixed_only and edge.moves):
+                    neighbors.setdefault(a, []).append(b)
+                    neighbors.setdefault(b, []).append(a)
+            came_from = {start: start}
+            queue = [start]
+            for name in queue:
+                for other in neighbors.get(name, ()):
+                    if other not in came_from:
+                        came_from[other] = name
+                        queue.append(other)
+            if end in came_from:
+                path = []
+                while end != start:
+                    path.append((came_from[end], end))
+                    end = came_from[end]
+                return path[::-1]
+        return None
+
+
+def _bare(frame: str) -> str:
+    """ROS 1 wrote frames with a leading slash."""
+    return frame.lstrip("/")
+
+
+def _differ(T: FloatArray, translation: FloatArray, rotation: FloatArray) -> bool:
+    if float(np.abs(T[:3, 3] - translation).max()) > _SAME_M:
+        return True
+    cosine = 0.5 * (float(np.trace(T[:3, :3].T @ quaternion_matrix(rotation))) - 1.0)
+    return cosine < math.cos(_SAME_RAD)
