@@ -193,6 +193,7 @@ class TruthConfig(Section):
     """What is known of the truth's frame. Only evaluation reads it."""
 
     yaw_offset_rad: float = Field(0.0, description="yaw of the truth's body axes in the base frame; subtracted")
+    offset_m: tuple[float, float] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
     max_gap_s: float = Field(0.2, gt=0, description="the truth is not interpolated across longer gaps")
 
