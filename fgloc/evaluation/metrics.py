@@ -1,0 +1,288 @@
+"""How far an estimated trajectory is from the truth, and whether its covariance says so.
+
+Errors live in the map frame. Where the truth's frame is another one (``truth.align: se2``), the truth is moved into the
+map by the rigid motion that fits the positions best; the estimate and its covariance stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from fgloc import se2
+from fgloc.config import Config, TruthConfig
+from fgloc.errors import TrajectoryError
+from fgloc.evaluation.consistency import coverage, nees
+from fgloc.types import RunResult, Trajectory
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FEWEST = 2  # matched poses; one cannot be aligned, and is no trajectory
+_LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled
+
+
+class StepTimes(BaseModel):
+    """Wall time of one update [ms]."""
+
+    model_config = ConfigDict(frozen=True)
+
+    median: float
+    p95: float
+    p99: float
+    max: float
+
+
+class Metrics(BaseModel):
+    """What ``metrics.json`` holds. Keys that need a truth are None without one."""
+
+    model_config = ConfigDict(frozen=True)
+
+    duration_s: float
+    keyframes: int
+    ate_mean_m: float | None
+    ate_rmse_m: float | None
+    yaw_mae_deg: float | None
+    end_error_m: float | None
+    drift_percent: float | None
+    nees_over_3: float | None
+    coverage: dict[str, float] | None  # by number of sigmas: "1", "2", "3"
+    real_time_factor: float | None  # seconds of recording per second of work
+    step_ms: StepTimes | None
+    factors: dict[str, int]
+    rejections: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """An estimate and a truth at the same stamps, both in the map frame."""
+
+    stamps_ns: IntArray  # (n,)
+    estimate: FloatArray  # (n, 3)
+    truth: FloatArray  # (n, 3)
+    covs: FloatArray | None  # (n, 3, 3) of the estimate
+    T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
+
+    @property
+    def errors(self) -> FloatArray:
+        """``(n, 3)`` estimate minus truth: x, y [m] and wrapped yaw [rad]."""
+        difference = self.estimate - self.truth
+        difference[:, 2] = se2.wrap_array(difference[:, 2])
+        return difference
+
+    @property
+    def distances(self) -> FloatArray:
+        """``(n,)`` distance from the truth [m]."""
+        return np.asarray(np.hypot(*(self.estimate - self.truth)[:, :2].T))
+
+
+def match(estimate: Trajectory, truth: Trajectory, config: TruthConfig) -> Matched:
+    """Bring the truth to the estimate's stamps and into its frame.
+
+    Equal stamps match exactly; between two stamps of the truth no further apart than ``config.max_gap_s`` the truth is
+    interpolated; elsewhere the estimate has no partner and is left out.
+
+    Raises:
+        TrajectoryError: no pose has a partner, or too few to align.
+    """
+    indices = _matchable(estimate, truth, config.max_gap_s)
+    if len(indices) < _FEWEST:
+        raise TrajectoryError(
+            f"{len(indices)} of {len(estimate)} poses have a truth at their time, expected {_FEWEST} or more: the "
+            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {config.max_gap_s} s are not bridged; "
+            "check the clocks, or raise the largest gap"
+        )
+    stamps = estimate.stamps_ns[indices]
+    poses = estimate.poses[indices]
+    reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
+    reference[:, 2] = se2.wrap_array(reference[:, 2] - config.yaw_offset_rad)
+    T_map_truth = np.zeros(3)
+    if config.align == "se2":
+        T_map_truth = align_se2(reference[:, :2], poses[:, :2])
+        reference = transform(T_map_truth, reference)
+    covs = None if estimate.covs is None else estimate.covs[indices]
+    return Matched(stamps, poses, reference, covs, T_map_truth)
+
+
+def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:
+    """Rigid motion ``(3,)`` that takes the points ``(n, 2)`` of source nearest to those of target, in least squares.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without
+    scale; in the plane the rotation has a closed form.
+    """
+    center_s, center_t = source.mean(axis=0), target.mean(axis=0)
+    s, t = source - center_s, target - center_t
+    yaw = math.atan2(float(np.sum(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])), float(np.sum(s * t)))
+    turned = se2.compose((0.0, 0.0, yaw), (*center_s, 0.0))
+    return np.array([*(center_t - turned[:2]), yaw])
+
+
+def transform(T: FloatArray, poses: FloatArray) -> FloatArray:
+    """Left-multiply poses ``(n, 3)`` by T ``(3,)``."""
+    x, y, yaw = T
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.column_stack(
+        [
+            x + c * poses[:, 0] - s * poses[:, 1],
+            y + s * poses[:, 0] + c * poses[:, 1],
+            se2.wrap_array(poses[:, 2] + yaw),
+        ]
+    )
+
+
+def ate_mean_m(matched: Matched) -> float:
+    """Mean distance from the truth [m]. Source: the paper, eq. 11, over the matched stamps."""
+    return float(np.mean(matched.distances))
+
+
+def ate_rmse_m(matched: Matched) -> float:
+    """Root mean square distance from the truth [m]: evo's APE of the translation."""
+    return float(np.sqrt(np.mean(matched.distances**2)))
+
+
+def yaw_mae_deg(matched: Matched) -> float:
+    """Mean absolute yaw error [°], wrapped. Source: the paper, eq. 12."""
+    return float(np.degrees(np.mean(np.abs(matched.errors[:, 2]))))
+
+
+def end_error_m(matched: Matched) -> float:
+    """Distance from the truth [m] at the last matched stamp."""
+    return float(matched.distances[-1])
+
+
+def path_length_m(positions: FloatArray) -> float:
+    """Length [m] of the path ``(n, 2)``, leaving out moves shorter than the truth's own noise."""
+    total, anchor = 0.0, positions[0]
+    for position in positions[1:]:
+        leg = math.hypot(position[0] - anchor[0], position[1] - anchor[1])
+        if leg >= _LEG_M:
+            total, anchor = total + leg, position
+    return total
+
+
+def drift_percent(matched: Matched) -> float | None:
+    """End error over the distance travelled [%]; None for a robot that stood still."""
+    travelled = path_length_m(matched.truth[:, :2])
+    return 100.0 * end_error_m(matched) / travelled if travelled > 0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeError:
+    """Relative pose error over pairs that are `delta` apart: root mean squares and the number of pairs."""
+
+    translation_m: float
+    rotation_deg: float
+    pairs: int
+
+
+def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"]) -> RelativeError:
+    """Error of the motion between poses that are `delta` frames, or metres of the estimate's path, apart.
+
+    Equals evo's RPE with consecutive pairs. Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
+    systems", 2012, section V.
+
+    Raises:
+        TrajectoryError: the trajectory is too short for one pair.
+    """
+    ends = _frame_ends(len(matched.estimate), delta) if unit == "frames" else _path_ends(matched.estimate, delta)
+    if len(ends) < 2:
+        raise TrajectoryError(f"no two of {len(matched.estimate)} poses are {delta} {unit} apart; give a smaller delta")
+    errors = []
+    for i, j in pairwise(ends):
+        moved = se2.between(matched.estimate[i], matched.estimate[j])
+        errors.append(se2.between(se2.between(matched.truth[i], matched.truth[j]), moved))
+    translation, rotation = np.hypot(*np.array(errors)[:, :2].T), np.array(errors)[:, 2]
+    return RelativeError(_rms(translation), math.degrees(_rms(rotation)), len(errors))
+
+
+def compute_metrics(result: RunResult, config: Config) -> Metrics:
+    """Everything that ``metrics.json`` holds.
+
+    Raises:
+        CovarianceError: a covariance of the estimate is not positive definite.
+    """
+    matched = match_result(result, config)
+    stamps = result.trajectory.stamps_ns
+    duration = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+
+    def against_truth(figure: Callable[[Matched], float | None]) -> float | None:
+        return None if matched is None else figure(matched)
+
+    honest: tuple[float | None, dict[str, float] | None] = (None, None)
+    if matched is not None and matched.covs is not None:
+        errors, covs = matched.errors, matched.covs
+        honest = (float(np.mean(nees(errors, covs))) / 3.0, {str(k): coverage(errors, covs, k) for k in (1, 2, 3)})
+    return Metrics(
+        duration_s=duration,
+        keyframes=len(stamps),
+        ate_mean_m=against_truth(ate_mean_m),
+        ate_rmse_m=against_truth(ate_rmse_m),
+        yaw_mae_deg=against_truth(yaw_mae_deg),
+        end_error_m=against_truth(end_error_m),
+        drift_percent=against_truth(drift_percent),
+        nees_over_3=honest[0],
+        coverage=honest[1],
+        real_time_factor=duration / result.wall_s if result.wall_s > 0 else None,
+        step_ms=_step_times(result.step_ms),
+        factors=dict(sorted(result.counts.items())),
+        rejections=dict(sorted(result.rejections.items())),
+    )
+
+
+def match_result(result: RunResult, config: Config) -> Matched | None:
+    """`match` of a run with its truth; None if there is no truth or it has no pose at the run's time."""
+    truth = result.truth
+    if truth is None or len(truth) == 0 or len(_matchable(result.trajectory, truth, config.truth.max_gap_s)) < _FEWEST:
+        return None
+    return match(result.trajectory, truth, config.truth)
+
+
+def _matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
+    """Indices of the estimate's poses that have a truth at, or around, their stamp."""
+    if len(estimate) == 0 or len(truth) == 0:
+        return np.array([], dtype=np.int64)
+    after = np.searchsorted(truth.stamps_ns, estimate.stamps_ns)
+    inside = np.clip(after, 0, len(truth) - 1)
+    exact = truth.stamps_ns[inside] == estimate.stamps_ns
+    between = (after > 0) & (after < len(truth))
+    gap_ns = truth.stamps_ns[inside] - truth.stamps_ns[np.maximum(inside - 1, 0)]
+    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(max_gap_s * 1e9)))))
+
+
+def _frame_ends(count: int, delta: float) -> list[int]:
+    return list(range(0, count, max(1, round(delta))))
+
+
+def _path_ends(poses: FloatArray, delta: float) -> list[int]:
+    ends, travelled = [0], 0.0
+    for i, step in enumerate(np.hypot(*np.diff(poses[:, :2], axis=0).T), start=1):
+        travelled += float(step)
+        if travelled >= delta:
+            ends.append(i)
+            travelled = 0.0
+    return ends
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _step_times(step_ms: FloatArray) -> StepTimes | None:
+    if step_ms.size == 0:
+        return None
+    median, p95, p99 = np.percentile(step_ms, [50, 95, 99]).tolist()
+    return StepTimes(median=median, p95=p95, p99=p99, max=float(step_ms.max()))
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "nothing"
+    first, last = trajectory.stamps_ns[[0, -1]].tolist()
+    return f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s"

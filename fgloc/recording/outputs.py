@@ -1,0 +1,232 @@
+"""Writing and reading results: TUM trajectories, covariances, decisions, JSON; a file appears whole or not at all.
+
+A result is written to a temporary file in the same folder, flushed to the disk and renamed over the old one: a full
+disk or a killed process leaves the old result as it was.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from fgloc.errors import OutputError, TrajectoryError
+from fgloc.frames import quaternion_yaw
+from fgloc.types import Decision, Trajectory
+
+_NS = 1_000_000_000
+_TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
+_COV_COLUMNS = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
+_UPPER = np.triu_indices(3)
+_STEP_COLUMNS = ("step", "stamp", "kind", "landmark_id", "residual", "nis", "dof", "weight", "reason")
+
+
+@contextmanager
+def atomic_file(path: Path, binary: bool = False) -> Iterator[IO[Any]]:
+    """Open a file that replaces `path` when the block ends without an error, and leaves it alone otherwise.
+
+    Raises:
+        OutputError: the folder or the file cannot be written, or the disk is full.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("wb") if binary else temporary.open("w", encoding="utf-8", newline="") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); the old file is kept") from error
+
+
+@contextmanager
+def atomic_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder inside `out` whose files all move into `out` when the block ends without an error.
+
+    So the files of one result belong together: an error in the last of them keeps the whole old result.
+
+    Raises:
+        OutputError: the folder cannot be made or the files cannot be moved.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out, prefix=".partial-", ignore_cleanup_errors=True) as name:
+            stage = Path(name)
+            yield stage
+            for file in sorted(stage.iterdir()):
+                file.replace(out / file.name)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error}); the old result is kept") from error
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a planar trajectory as TUM: ``t x y z qx qy qz qw``, t in seconds with all nine decimals.
+
+    Raises:
+        TrajectoryError: a pose is not finite.
+        OutputError: the file cannot be written.
+    """
+    bad = np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=1))
+    if bad.size:
+        pose = trajectory.poses[bad[0]].tolist()
+        raise TrajectoryError(f"{path}: pose {bad[0]} is {pose}, expected finite x, y, yaw; nothing was written")
+    with atomic_file(path) as file:
+        file.write(_TUM_HEADER)
+        for stamp, (x, y, yaw) in zip(trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True):
+            qz, qw = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+            numbers = (x, y, 0.0, 0.0, 0.0, qz, qw)
+            file.write(f"{_seconds(stamp)} " + " ".join(f"{number:.9f}" for number in numbers) + "\n")
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory, flattened to the plane. Stamps are exact to the nanosecond.
+
+    Raises:
+        TrajectoryError: the file is missing or empty, or a line has not eight finite numbers, a zero quaternion, or a
+            stamp that does not come after the one before. The message names file, line and value.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path}: cannot be read ({error}); give a TUM text file") from error
+    stamps: list[int] = []
+    poses: list[tuple[float, float, float]] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        stamp, pose = _parse_tum_line(line, where=f"{path}, line {number}")
+        if stamps and stamp <= stamps[-1]:
+            raise TrajectoryError(
+                f"{path}, line {number}: stamp {line.split()[0]} does not come after {_seconds(stamps[-1])}; "
+                "sort the file and drop duplicate stamps"
+            )
+        stamps.append(stamp)
+        poses.append(pose)
+    if not stamps:
+        raise TrajectoryError(f"{path}: no pose in it; expected lines of t x y z qx qy qz qw")
+    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=float))
+
+
+def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
+    """Write the upper triangle of each pose's covariance in the map frame: stamp, xx xy xθ yy yθ θθ [m, rad].
+
+    Raises:
+        TrajectoryError: the trajectory has no covariances.
+        OutputError: the file cannot be written.
+    """
+    if trajectory.covs is None:
+        raise TrajectoryError(f"{path}: the trajectory has no covariances to write")
+    with atomic_file(path) as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("stamp", *_COV_COLUMNS))
+        for stamp, cov in zip(trajectory.stamps_ns.tolist(), trajectory.covs, strict=True):
+            rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[_UPPER])))
+
+
+def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
+    """Write one row per decision: what was measured, how well it fitted, its weight, and why.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_file(path) as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(_STEP_COLUMNS)
+        for d in decisions:
+            fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
+            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write indented JSON. A number that is not finite is refused: JSON has none, and null says "unknown".
+
+    Raises:
+        OutputError: the file cannot be written, or the content holds what JSON cannot.
+    """
+    try:
+        text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise OutputError(f"{path}: not representable as JSON ({error}); the old file is kept") from error
+    with atomic_file(path) as file:
+        file.write(text + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_file(path) as file:
+        file.write(text)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a binary file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_file(path, binary=True) as file:
+        file.write(data)
+
+
+def sha256_of(path: Path) -> str:
+    """Hex SHA-256 of a file, or of a folder's file names and contents.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if path.is_file():
+        return _digest(path)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    listing = "".join(f"{_digest(file)}  {file.relative_to(path).as_posix()}\n" for file in files)
+    return hashlib.sha256(listing.encode()).hexdigest()
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def _seconds(stamp_ns: int) -> str:
+    """Seconds with nine decimals, exact."""
+    sign = "-" if stamp_ns < 0 else ""
+    whole, rest = divmod(abs(stamp_ns), _NS)
+    return f"{sign}{whole}.{rest:09d}"
+
+
+def _parse_tum_line(line: str, where: str) -> tuple[int, tuple[float, float, float]]:
+    words = line.split()
+    if len(words) != 8:
+        raise TrajectoryError(f"{where}: {len(words)} values, expected the 8 of t x y z qx qy qz qw: {line.strip()!r}")
+    for word in words:
+        try:
+            finite = Decimal(word).is_finite()
+        except InvalidOperation:
+            finite = False
+        if not finite:
+            raise TrajectoryError(f"{where}: {word!r} is not a finite number; remove the line or mend it")
+    stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+    if abs(stamp) >= 2**63:
+        raise TrajectoryError(f"{where}: stamp {words[0]} is out of range; expected seconds")
+    x, y = float(words[1]), float(words[2])
+    quaternion = np.array([float(word) for word in words[4:]])
+    norm = float(np.linalg.norm(quaternion))
+    if not 0.5 < norm < 2.0:
+        raise TrajectoryError(f"{where}: quaternion {' '.join(words[4:])} has length {norm:.3g}, expected 1 (x y z w)")
+    return stamp, (x, y, quaternion_yaw(quaternion / norm))
