@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from fgloc.recording.messages import default_typestore
 
@@ -24,13 +24,14 @@ class BagWriter:
         ...     bag.command("/cmd_vel", 1_000_000_000, v=0.2, omega=0.0)
     """
 
-    def __init__(self, path: Path, storage: str = "mcap", overwrite: bool = False) -> None:
+    def __init__(self, path: Path, storage: str = "mcap", overwrite: bool = False, compress: bool = False) -> None:
         """Open a new bag folder.
 
         Args:
             path: folder to be made.
             storage: "mcap" or "sqlite3".
             overwrite: replace an existing bag folder (one that holds a metadata.yaml).
+            compress: zstd chunks, which readers of MCAP undo by themselves; MCAP only.
 
         Raises:
             FileExistsError: the folder exists and is not to be replaced.
@@ -45,6 +46,8 @@ class BagWriter:
         self._store = default_typestore()
         plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
         self._writer = Writer(path, version=9, storage_plugin=plugin)
+        if compress:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
