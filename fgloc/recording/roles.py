@@ -27,11 +27,14 @@ CONVENTIONAL_NAMES: Mapping[Role, tuple[str, ...]] = {
 # Words (between / and _) by which a topic says what it is.
 TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "vrpn", "qualisys"})
 _NOT_TRUTH = re.compile(
-    r"goal|initial_?pose|target|setpoint|clicked|plan|waypoint|amcl|ekf|ukf|slam|filter|estimate|combined|"
-    r"aruco|marker|tag|detection|odom",
+    r"(?<![a-z])(goal|initial_?pose|target|setpoint|clicked|plan|waypoint|amcl|ekf|ukf|slam|filter(ed)?|estimated?|"
+    r"combined|aruco|markers?|(april)?tags?|detections?|odom)(?![a-z])",
     re.IGNORECASE,
 )
-_NOT_IMAGE = re.compile(r"depth|disparity|confidence|mask|debug|result|overlay|rect|costmap", re.IGNORECASE)
+_NOT_IMAGE = re.compile(
+    r"(?<![a-z])((compressed)?depth|disparity|confidence|mask|debug|result|overlay|rect(ified)?|costmap)(?![a-z])",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +86,19 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
             roles[role] = chosen
             if why:
                 notes.append(f"{chosen} is taken as {role}: {why}.")
-        elif not candidates:
-            passed_over = [
-                t.name for t in filled if t.message_type in CONVERTERS[role] and t.name not in roles.values()
-            ]
-            if passed_over and role in ("image", "truth"):
-                notes.append(
-                    f"No {role}: {', '.join(passed_over)} would fit by type but not by name "
-                    f"(to use it all the same: recording.topics.{role}: {passed_over[0]})."
-                )
-        else:
+        elif candidates:
             problems.append(
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
                 f"configuration (recording.topics.{role}: {candidates[0]}), or none (recording.topics.{role}: none)"
             )
+        elif role in ("image", "truth"):
+            fitting = CONVERTERS[role].keys() - CONVERTERS["odometry"].keys()
+            by_type = [topic.name for topic in filled if topic.message_type in fitting]
+            if by_type:
+                notes.append(
+                    f"No {role}: {', '.join(by_type)} would fit by type but not by name "
+                    f"(to use it all the same: recording.topics.{role}: {by_type[0]})."
+                )
     return Selection(roles, tuple(notes), tuple(problems))
 
 
