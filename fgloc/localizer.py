@@ -172,7 +172,7 @@ class Localizer:
         # 3. Fuse
         with self.stopwatch("fuse"):
             rebuilt = self.estimator.rebuilt
-            belief = self.estimator.update(step.stamp_ns, step.dt, motions, believed, refused)
+            belief = self.estimator.update(step.stamp_ns, step.dt, motions, believed, refused, predicted)
         if self.estimator.rebuilt > rebuilt:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []

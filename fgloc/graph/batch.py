@@ -51,17 +51,15 @@ def smooth(log: MeasurementLog, factors: LandmarkFactors, config: BatchConfig, g
         raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
     believed = {frame.k: (*frame.sightings, *frame.refused) for frame in frames}
     values = _initial(frames, believed, factors)
-    graph = _graph(frames, believed, factors)
+    graph = _graph(frames, believed)
     values = _optimize(graph, values, config.max_iterations)
     believed = {k: _gated(k, sightings, factors, values, gate_probability) for k, sightings in believed.items()}
-    graph = _graph(frames, believed, factors)
+    graph = _graph(frames, believed)
     values = _optimize(graph, _without_orphans(values, graph), config.max_iterations)
     return _result(frames, believed, factors, graph, values)
 
 
-def _graph(
-    frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]], factors: LandmarkFactors
-) -> gtsam.NonlinearFactorGraph:
+def _graph(frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for frame in frames:
         if frame.prior is not None:
@@ -69,7 +67,7 @@ def _graph(
         for motion in frame.motions:
             graph.add(motion_factor(frame.k, motion))
         for sighting in believed[frame.k]:
-            for factor in factors.make(frame.k, sighting.measurement, sighting.cauchy_k):
+            for factor in sighting.factors:
                 graph.add(factor)
     return graph
 

@@ -7,13 +7,14 @@ robust (Cauchy), as design.md §6 has it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
+from fgloc.graph.log import Sighting
 from fgloc.types import (
     Camera,
     CornerMeasurement,
@@ -45,14 +46,9 @@ def gaussian(cov: FloatArray) -> gtsam.noiseModel.Base:
     Raises:
         CovarianceError: not finite, not symmetric or not positive definite.
     """
-    if not np.isfinite(cov).all():
-        raise CovarianceError(f"covariance with NaN or Inf: {cov.tolist()}; reject the measurement before it gets here")
-    if abs(cov - cov.T).max() > 1e-9 * abs(cov).max():
-        raise CovarianceError(f"asymmetric covariance: {cov.tolist()}")
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError as error:
-        raise CovarianceError(f"covariance is not positive definite: {cov.tolist()}") from error
+    problem = _covariance_problem(cov)
+    if problem:
+        raise CovarianceError(f"{problem}: {cov.tolist()}; a measurement like this has to be rejected by the gate")
     return gtsam.noiseModel.Gaussian.Covariance(cov)
 
 
@@ -89,6 +85,10 @@ class LandmarkFactors:
     def known(self) -> bool:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None
+
+    def sighting(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> Sighting:
+        """The measurement with its factors at keyframe k; raises what `make` raises."""
+        return Sighting(m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
 
     def make(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> list[gtsam.NonlinearFactor]:
         """Factors of one sighting at keyframe k.
@@ -178,14 +178,45 @@ def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
     return np.array([r * c, r * s]), _symmetric(J @ m.cov @ J.T)
 
 
-def whitened(factors: list[gtsam.NonlinearFactor], values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
-    """Whitened residual ``(d,)`` and Jacobian ``(d, 3)`` of unary pose factors at the values in ``values``."""
+def whitened(
+    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, cauchy_k: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Whitened residual ``(d,)`` and Jacobian ``(d, 3)`` of unary pose factors, without their robust weights.
+
+    A robust factor linearises to its Gaussian one times √w, w = 1 / (1 + r²/k²), so that w = 1 - |√w r|²/k².
+    """
     residuals, jacobians = [], []
     for factor in factors:
         A, b = factor.linearize(values).jacobian()
-        jacobians.append(A)
-        residuals.append(-b)
+        scale = -1.0
+        if cauchy_k is not None:
+            scale /= math.sqrt(max(1.0 - float(b @ b) / cauchy_k**2, 1e-12))
+        jacobians.append(A * -scale)
+        residuals.append(b * scale)
     return np.concatenate(residuals), np.vstack(jacobians)
+
+
+def _covariance_problem(cov: FloatArray) -> str:
+    """What is wrong with a covariance; "" if nothing.
+
+    Sylvester's criterion in plain floats, because this runs for every factor of every step.
+    """
+    if cov.shape == (3, 3):
+        (a, b, c), (d, e, f), (g, h, i) = cov.tolist()
+        minors = a, a * e - b * d, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        skew = abs(b - d) + abs(c - g) + abs(f - h)
+        size = abs(a) + abs(e) + abs(i)
+    elif cov.shape == (2, 2):
+        (a, b), (d, e) = cov.tolist()
+        minors = (a, a * e - b * d)
+        skew, size = abs(b - d), abs(a) + abs(e)
+    else:
+        return f"covariance of shape {cov.shape}, expected (2, 2) or (3, 3)"
+    if not math.isfinite(size + skew):
+        return "covariance with NaN or Inf"
+    if skew > 1e-9 * size:
+        return "asymmetric covariance"
+    return "" if min(minors) > 0.0 else "covariance is not positive definite"
 
 
 def _symmetric(m: FloatArray) -> FloatArray:

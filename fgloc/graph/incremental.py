@@ -6,6 +6,7 @@ without the sightings of the step, and the caller is told.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -118,6 +119,7 @@ class IncrementalEstimator:
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[Sighting] = (),
         refused: Sequence[Sighting] = (),
+        predicted: Belief | None = None,
     ) -> Belief:
         """Add one keyframe with its measurements; return the filtered pose.
 
@@ -127,8 +129,9 @@ class IncrementalEstimator:
             motions: between-factors from the one before; at least one.
             sightings: landmark measurements carried to this keyframe.
             refused: sightings that are only logged, for the batch smoother to look at again.
+            predicted: what `predict` said of these motions, if the caller has asked already.
         """
-        predicted = self.predict(motions)
+        predicted = predicted or self.predict(motions)
         self._k += 1
         self._elapsed_s += max(dt, 1e-6)
         frame = Keyframe(
@@ -144,7 +147,7 @@ class IncrementalEstimator:
             graph, values = self._graph_of(frame, initial, frame.prior)
             backend.update(graph, values, frame.k, frame.elapsed_s)
             frame.belief = Belief(backend.pose(frame.k), backend.covariance(frame.k))
-            if not np.isfinite(frame.belief.pose).all() or not np.isfinite(frame.belief.cov).all():
+            if not (math.isfinite(frame.belief.pose[2]) and math.isfinite(frame.belief.cov[0, 0])):
                 raise ValueError("estimate is not finite")
         except _GTSAM_ERRORS:
             self._rebuild(frame, initial)
@@ -164,7 +167,7 @@ class IncrementalEstimator:
                 graph.add(motion_factor(frame.k, motion))
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial, values)
-            for factor in self._factors.make(frame.k, sighting.measurement, sighting.cauchy_k):
+            for factor in sighting.factors:
                 graph.add(factor)
         return graph, values
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import gtsam
+
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 
@@ -18,10 +20,14 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """A landmark measurement as the graph takes it: carried to its keyframe, with its kernel."""
+    """A landmark measurement as the graph takes it: carried to its keyframe, with its kernel and its factors.
+
+    Factors are immutable and may be held by any number of graphs.
+    """
 
     measurement: LandmarkMeasurement
     cauchy_k: float | None
+    factors: tuple[gtsam.NonlinearFactor, ...]
 
 
 @dataclass(slots=True, eq=False)

@@ -63,8 +63,8 @@ class Weights:
         values = _values(k, predicted.pose)
         for given in measurements:
             m, weight = self._share_information(given)
-            sighting = Sighting(m, self._cauchy(m))
-            nis, dof, reason = self._judge(k, m, predicted, values)
+            sighting = self._factors.sighting(k, m, self._cauchy(m))
+            nis, dof, reason = self._judge(k, sighting, predicted, values)
             if reason:
                 refused.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
@@ -90,23 +90,23 @@ class Weights:
             self.refused_in_a_row += len(refused)
         return believed, refused, decisions
 
-    def _judge(self, k: int, m: LandmarkMeasurement, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:
+    def _judge(self, k: int, sighting: Sighting, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:
         """NIS, its degrees of freedom, and why the sighting is refused ("" if it is believed)."""
+        m = sighting.measurement
         if not self._factors.known:
             self._seen[m.landmark_id] += 1
             few = self._seen[m.landmark_id] < self._config.landmarks.min_sightings
             return math.nan, 0, "seen_too_seldom" if few else ""
         if isinstance(m, CornerMeasurement) and self._factors.depth(m, predicted.pose) < MIN_DEPTH_M:
             return math.nan, 8, "behind_camera"
-        factors = self._factors.make(k, m, None)
-        residual, J = whitened(factors, values)
+        residual, J = whitened(sighting.factors, values, sighting.cauchy_k)
         dof = len(residual)
         bound = chi2_bound(self._config.estimator.gate_probability, dof)
         S = J @ predicted.cov @ J.T
         S[np.diag_indices(dof)] += 1.0
         nis = float(residual @ np.linalg.solve(S, residual))
         if nis > bound:
-            nis = min(nis, joint_nis(k, m, predicted, self._factors, residual, J))
+            nis = min(nis, joint_nis(k, sighting, predicted, self._factors, residual, J))
         return nis, dof, "gate" if nis > bound else ""
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
@@ -125,17 +125,17 @@ class Weights:
 
 
 def joint_nis(
-    k: int, m: LandmarkMeasurement, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
+    k: int, sighting: Sighting, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
 ) -> float:
     """Least ``|x ⊖ predicted|²_P + |h(x)|²_R`` over poses x: the NIS without the linearisation at the prediction."""
     information = np.linalg.inv(predicted.cov)
-    made = factors.make(k, m, None)
+    m = sighting.measurement
     pose, offset, best = predicted.pose, np.zeros(3), float(residual @ residual)
     for _ in range(_GAUSS_NEWTON_STEPS):
         pose = se2.compose(pose, _newton_step(information, offset, residual, J))
         if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
             break
-        residual, J = whitened(made, _values(k, pose))
+        residual, J = whitened(sighting.factors, _values(k, pose), sighting.cauchy_k)
         offset = se2.log(se2.between(predicted.pose, pose))
         best = min(best, float(offset @ information @ offset + residual @ residual))
     return best
@@ -143,7 +143,7 @@ def joint_nis(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A pose that sightings alone give: covariance of the right perturbation, robust cost and its degrees of freedom."""
+    """A pose that sightings alone give: covariance of the right perturbation, robust cost, degrees of freedom."""
 
     pose: FloatArray
     cov: FloatArray
@@ -164,7 +164,7 @@ def joint_fit(
         for m in sightings:
             if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
                 return None
-            r, J = whitened(factors.make(0, m, None), _values(0, pose))
+            r, J = whitened(factors.make(0, m, None), _values(0, pose), None)
             k2 = (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k ** 2
             square = float(r @ r) / len(r) * 2.0  # as if of one two-dimensional sighting
             weight = k2 / (k2 + square)
@@ -177,14 +177,18 @@ def joint_fit(
         if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
             break
         previous = cost
-        pose = se2.compose(pose, se2.exp(-np.linalg.solve(normal, pull)))
+        pose = se2.compose(pose, se2.exp(_solve(normal, -pull)))
     cov = np.linalg.inv(normal)
     return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
 
 
 def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:
     gradient = information @ offset + J.T @ residual
-    return se2.exp(np.asarray(np.linalg.solve(information + J.T @ J, -gradient), dtype=np.float64))
+    return se2.exp(_solve(information + J.T @ J, -gradient))
+
+
+def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
 
 
 def _values(k: int, pose: FloatArray) -> gtsam.Values:

@@ -1,0 +1,333 @@
+"""The graph: residuals at truth, agreement of batch and incremental, consistency, and what GTSAM must never see."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from fgloc import se2
+from fgloc.carry import carry
+from fgloc.config import BatchConfig, Config, EstimatorConfig
+from fgloc.errors import CovarianceError, EstimatorError
+from fgloc.graph.batch import smooth
+from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
+from fgloc.graph.incremental import IncrementalEstimator, fuse
+from fgloc.graph.log import Belief
+from fgloc.graph.weights import Weights
+from fgloc.types import (
+    Camera,
+    CornerMeasurement,
+    Landmark,
+    LandmarkMap,
+    MarkerPoseMeasurement,
+    MotionMeasurement,
+    RangeBearingMeasurement,
+)
+
+WALL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker on a wall, facing -x
+T_BASE_CAM = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]])
+
+
+def wall_map() -> LandmarkMap:
+    return LandmarkMap(
+        {
+            0: Landmark(0, np.array([4.0, 0.5, 0.4]), WALL, 0.2),
+            7: Landmark(7, np.array([4.0, -0.8, 0.3]), WALL, 0.2),
+            9: Landmark(9, np.array([3.0, 1.5, 0.0]), np.eye(3), 0.0),
+        }
+    )
+
+
+def camera(D: list[float]) -> Camera:
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
+    return Camera(640, 480, "plumb_bob", K, np.array(D), T_BASE_CAM)
+
+
+def project(pose: np.ndarray, landmark: Landmark, cam: Camera) -> np.ndarray:
+    """Independent of the package's factor: matrices and the Brown model written out."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    T_map_base = np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    T_cam_map = np.linalg.inv(T_map_base @ cam.T_base_cam)
+    points = landmark.corners() @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    k1, k2, p1, p2 = cam.D[:4]
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.column_stack([cam.K[0, 0] * xd + cam.K[0, 2], cam.K[1, 1] * yd + cam.K[1, 2]])
+
+
+def corner_sighting(pose: np.ndarray, landmark: Landmark, noise: np.ndarray | float = 0.0) -> CornerMeasurement:
+    cam = camera([0.05, -0.02, 0.001, -0.002])
+    return CornerMeasurement(0, landmark.landmark_id, project(pose, landmark, cam) + noise, 0.5, cam)
+
+
+def point_sighting(pose: np.ndarray, landmark: Landmark, cov: np.ndarray) -> RangeBearingMeasurement:
+    x, y, _ = se2.between(pose, np.array([*landmark.position[:2], 0.0]))
+    return RangeBearingMeasurement(0, landmark.landmark_id, float(np.hypot(x, y)), float(np.arctan2(y, x)), cov)
+
+
+POSES = [np.array([0.0, 0.0, 0.0]), np.array([1.0, -0.4, 0.25]), np.array([-0.5, 0.7, -0.2])]
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_every_landmark_factor_has_zero_residual_at_truth(pose):
+    landmarks = wall_map()
+    factors = LandmarkFactors(landmarks)
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*pose))
+    wall = landmarks.landmarks[0]
+    sightings = [
+        corner_sighting(pose, wall),
+        point_sighting(pose, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
+        MarkerPoseMeasurement(0, 0, se2.between(pose, wall.planar), np.diag([1e-2, 2e-2, 3e-2])),
+    ]
+    for m in sightings:
+        for factor in factors.make(0, m, 3.0):
+            assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_unknown_landmark_factors_have_zero_residual_at_truth(pose):
+    landmarks = wall_map()
+    factors = LandmarkFactors(None)
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*pose))
+    values.insert(landmark_key(9), landmarks.landmarks[9].position[:2])
+    values.insert(landmark_key(0), gtsam.Pose2(*landmarks.landmarks[0].planar))
+    point = point_sighting(pose, landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
+    marker = MarkerPoseMeasurement(0, 0, se2.between(pose, landmarks.landmarks[0].planar), np.eye(3))
+    for m in (point, marker):
+        (factor,) = factors.make(0, m, None)
+        assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_motion_factor_has_zero_residual_at_truth():
+    a, b = POSES[0], POSES[1]
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*a))
+    values.insert(pose_key(1), gtsam.Pose2(*b))
+    motion = MotionMeasurement("wheels", 0, 1, se2.between(a, b), np.eye(3) * 1e-4)
+    assert motion_factor(1, motion).error(values) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_marker_pose_prior_carries_the_lever_arm():
+    """Cov of the robot implied by a marker pose: a yaw error of the marker swings the robot around it (Monte Carlo)."""
+    rng = np.random.default_rng(3)
+    landmarks = wall_map()
+    truth, cov = POSES[1], np.diag([0.01, 0.02, 0.03]) ** 2
+    seen = se2.between(truth, landmarks.landmarks[0].planar)
+    factor = LandmarkFactors(landmarks).make(0, MarkerPoseMeasurement(0, 0, seen, cov), None)[0]
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*truth))
+    A, _ = factor.linearize(values).jacobian()
+    implied = np.linalg.inv(A.T @ A)
+    draws = []
+    for noise in rng.multivariate_normal(np.zeros(3), cov, 20000):
+        noisy = se2.compose(seen, se2.exp(noise))
+        draws.append(se2.log(se2.between(truth, se2.compose(landmarks.landmarks[0].planar, se2.inverse(noisy)))))
+    sampled = np.cov(np.array(draws).T)
+    assert np.abs(sampled - implied).max() < 0.04 * np.abs(implied).max()
+
+
+def test_cartesian_covariance_matches_samples():
+    rng = np.random.default_rng(1)
+    m = RangeBearingMeasurement(0, 9, 3.0, 0.7, np.diag([0.02, 0.1]) ** 2)
+    point, cov = cartesian(m)
+    bearing, r = 0.7 + rng.normal(0, 0.02, 50000), 3.0 + rng.normal(0, 0.1, 50000)
+    samples = np.column_stack([r * np.cos(bearing), r * np.sin(bearing)])
+    assert np.allclose(samples.mean(axis=0), point, atol=2e-3)
+    assert np.abs(np.cov(samples.T) - cov).max() < 0.03 * np.abs(cov).max()
+
+
+def test_carried_sightings_agree_with_those_made_at_the_keyframe():
+    landmarks = wall_map()
+    keyframe, motion = POSES[1], np.array([0.1, 0.02, 0.1])
+    then = se2.compose(keyframe, motion)
+    factors = LandmarkFactors(landmarks)
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*keyframe))
+    sightings = [
+        corner_sighting(then, landmarks.landmarks[0]),
+        point_sighting(then, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
+        MarkerPoseMeasurement(0, 0, se2.between(then, landmarks.landmarks[0].planar), np.eye(3) * 1e-2),
+    ]
+    for m in sightings:
+        carried = carry(m, motion, np.eye(3) * 1e-6)
+        assert sum(f.error(values) for f in factors.make(0, carried, None)) == pytest.approx(0.0, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    "cov",
+    [
+        np.diag([1.0, 1.0, np.nan]),
+        np.diag([1.0, 1.0, 0.0]),
+        np.diag([1.0, -1.0, 1.0]),
+        np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]]),
+        np.array([[1.0, 2.0, 0], [2.0, 1.0, 0], [0, 0, 1.0]]),
+    ],
+)
+def test_a_matrix_that_is_no_covariance_never_reaches_gtsam(cov):
+    with pytest.raises(CovarianceError):
+        gaussian(cov)
+
+
+def test_unknown_id_is_named():
+    with pytest.raises(EstimatorError, match="landmark 42 is not in the map"):
+        LandmarkFactors(wall_map()).make(0, RangeBearingMeasurement(0, 42, 1.0, 0.0, np.eye(2)), None)
+
+
+def test_fused_motion_equals_the_product_of_gaussians():
+    a = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.02]), np.diag([1e-4, 2e-4, 1e-4]))
+    b = MotionMeasurement("learned", 0, 1, np.array([0.12, 0.0, 0.02]), np.diag([1e-4, 2e-4, 3e-4]))
+    motion, cov = fuse([a, b])
+    assert motion[0] == pytest.approx(0.11, abs=1e-6)
+    assert np.allclose(np.diag(cov), [5e-5, 1e-4, 7.5e-5])
+
+
+# --- estimators on a simulated drive ----------------------------------------------------------------------------------
+
+
+def drive(seed: int, n: int = 150, blind: tuple[int, int] = (0, 0)):
+    """Noisy motions and sightings along a known path; yields per step (truth, motions, measurements)."""
+    rng = np.random.default_rng(seed)
+    landmarks = LandmarkMap({i: Landmark(i, np.array([*rng.uniform(-4, 4, 2), 0.0]), np.eye(3), 0.0) for i in range(8)})
+    Q, R = np.diag([0.01, 0.005, 0.01]) ** 2, np.diag([0.02, 0.08]) ** 2
+    truth = np.zeros(3)
+    rows = []
+    for k in range(n):
+        step = np.array([0.08, 0.0, 0.05 * np.sin(k / 15)])
+        measured = se2.compose(step, se2.exp(rng.multivariate_normal(np.zeros(3), Q)))
+        if k:
+            truth = se2.compose(truth, step)
+        sightings = []
+        if k % 3 == 0 and not blind[0] <= k < blind[1]:
+            for i in rng.choice(8, 2, replace=False):
+                m = point_sighting(truth, landmarks.landmarks[int(i)], R)
+                noise = rng.multivariate_normal(np.zeros(2), R)
+                if m.range_m + noise[1] > 0.3:
+                    sightings.append(
+                        RangeBearingMeasurement(k, int(i), m.range_m + noise[1], m.bearing_rad + noise[0], R)
+                    )
+        rows.append((truth, [MotionMeasurement("wheels", k - 1, k, measured, Q)], sightings))
+    return landmarks, rows
+
+
+def replay(seed: int, kind: str = "fixed_lag", lag_s: float = 10.0, **kwargs):
+    landmarks, rows = drive(seed, **kwargs)
+    factors = LandmarkFactors(landmarks)
+    estimator = IncrementalEstimator(EstimatorConfig(kind=kind, lag_s=lag_s), factors, keep_all=True)
+    beliefs = [estimator.start(0, Belief(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4])))]
+    for k, (_, motions, sightings) in enumerate(rows[1:], start=1):
+        held = [factors.sighting(k, m, None) for m in sightings]
+        beliefs.append(estimator.update(k * 10**8, 0.1, motions, held))
+    return estimator, factors, beliefs, [truth for truth, _, _ in rows]
+
+
+def nees(belief: Belief, truth: np.ndarray) -> float:
+    error = se2.log(se2.between(belief.pose, truth))
+    return float(error @ np.linalg.solve(belief.cov, error))
+
+
+def test_batch_agrees_with_full_incremental():
+    estimator, factors, beliefs, _ = replay(0, "isam2")
+    result = smooth(estimator.log, factors, BatchConfig(), 0.999999)
+    last = se2.log(se2.between(result.poses[-1], beliefs[-1].pose))
+    assert np.abs(last).max() < 2e-3
+    assert np.abs(result.covs[-1] - beliefs[-1].cov).max() < 0.03 * np.abs(beliefs[-1].cov).max()
+
+
+def test_fixed_lag_agrees_with_full_isam2_within_the_noise():
+    _, _, fixed, _ = replay(1, "fixed_lag", lag_s=3.0)
+    _, _, full, _ = replay(1, "isam2")
+    errors = np.array([se2.log(se2.between(a.pose, b.pose)) for a, b in zip(fixed, full, strict=True)])
+    sigma = np.sqrt(np.diag(full[-1].cov))
+    assert (np.abs(errors).max(axis=0) < sigma).all()
+
+
+def test_factors_held_equal_factors_added():
+    estimator, factors, _, _ = replay(2)
+    result = smooth(estimator.log, factors, BatchConfig(), 1 - 1e-12)
+    added = sum(1 if f.prior is not None else len(f.motions) for f in estimator.log.keyframes.values())
+    added += sum(len(f.sightings) for f in estimator.log.keyframes.values())
+    assert result.factors == added
+
+
+def test_nees_is_consistent_over_seeds():
+    values = {"online": [], "batch": []}
+    for seed in range(12):
+        estimator, factors, beliefs, truths = replay(seed)
+        result = smooth(estimator.log, factors, BatchConfig(), 0.999999)
+        values["online"].append(nees(beliefs[-1], truths[-1]))
+        values["batch"].append(nees(Belief(result.poses[75], result.covs[75]), truths[75]))
+    low, high = chi2.ppf([0.001, 0.999], 3 * 12)
+    for name, sample in values.items():
+        assert low < sum(sample) < high, name
+
+
+def test_fault_22_long_dead_reckoning_grows_and_recovers():
+    _, _, beliefs, truths = replay(5, n=700, blind=(20, 680))
+    sizes = [np.trace(b.cov) for b in beliefs]
+    assert sizes[675] > 50 * sizes[20]
+    assert sizes[-1] < 0.02 * sizes[675]
+    assert np.hypot(*(beliefs[-1].pose - truths[-1])[:2]) < 0.2
+
+
+def test_fault_67_an_exception_in_gtsam_rebuilds_the_window_without_the_offender():
+    """A marker behind the camera makes GTSAM throw in the middle of an update."""
+    walls = LandmarkFactors(wall_map())
+    seen = corner_sighting(np.zeros(3), wall_map().landmarks[0])
+    estimator = IncrementalEstimator(EstimatorConfig(), walls)
+    estimator.start(0, Belief(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
+    motion = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)
+    for k in range(1, 10):
+        estimator.update(k * 10**8, 0.1, [motion])
+    belief = estimator.update(10**9, 0.1, [motion], [walls.sighting(10, seen, 3.0)])
+    assert estimator.rebuilt == 1
+    assert belief.pose[0] == pytest.approx(7.0, abs=1e-6)
+    assert belief.cov[0, 0] == pytest.approx(11e-4, rel=1e-6)
+    after = estimator.update(11 * 10**8, 0.1, [motion])
+    assert after.pose[0] == pytest.approx(7.1, abs=1e-6)
+
+
+def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
+    landmarks = wall_map()
+    factors = LandmarkFactors(landmarks)
+    weights = Weights(Config(), factors)
+    truth = np.zeros(3)
+    m = corner_sighting(np.array([0.0, 0.6, 0.1]), landmarks.landmarks[0])
+    sure = Belief(truth, np.diag([1e-4, 1e-4, 1e-4]))
+    believed, refused, decisions = weights.weigh(0, 0, [m], sure)
+    assert not believed
+    assert [d.reason for d in decisions] == ["gate"]
+    assert weights.rejections["sightings.gate"] == 1
+    unsure = Belief(truth, np.diag([0.5, 0.5, 0.1]))
+    believed, refused, _ = weights.weigh(1, 0, [m], unsure)
+    assert len(believed) == 1
+    assert not refused
+
+
+def test_weights_refuse_markers_behind_the_camera():
+    landmarks = wall_map()
+    weights = Weights(Config(), LandmarkFactors(landmarks))
+    m = corner_sighting(np.zeros(3), landmarks.landmarks[0])
+    _, refused, decisions = weights.weigh(0, 0, [m], Belief(np.array([6.0, 0.0, 0.0]), np.eye(3)))
+    assert len(refused) == 1
+    assert decisions[0].reason == "behind_camera"
+
+
+def test_repeated_sightings_share_their_information():
+    config = Config.model_validate({"landmarks": {"repeat_s": 1.0}})
+    landmarks = wall_map()
+    weights = Weights(config, LandmarkFactors(landmarks))
+    belief = Belief(np.zeros(3), np.eye(3) * 1e-2)
+    first = point_sighting(np.zeros(3), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
+    later = RangeBearingMeasurement(250_000_000, 9, first.range_m, first.bearing_rad, first.cov)
+    a, _, _ = weights.weigh(0, 0, [first], belief)
+    b, _, decisions = weights.weigh(1, 250_000_000, [later], belief)
+    assert np.allclose(a[0].measurement.cov, first.cov)
+    assert np.allclose(b[0].measurement.cov, 4.0 * first.cov)
+    assert decisions[0].weight == pytest.approx(0.25)
