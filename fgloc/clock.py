@@ -1,0 +1,103 @@
+"""Which stamps to believe: jumps of the clock are told from single wrong stamps."""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum
+
+from fgloc.config import GateConfig
+from fgloc.types import CommandEvent, Event, ImuEvent, JointsEvent, OdometryEvent
+
+MOTION_EVENTS = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
+
+_LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation
+_CONFIRM_COUNT = 3  # events that agree on a new time ...
+_CONFIRM_NS = 250_000_000  # ... over this span confirm it
+_GIVE_UP_NS = 5_000_000_000  # sightings alone confirm after this span that motion sources have fallen silent
+_WINDOW_NS = 60_000_000_000  # events within it may agree with each other
+_MAX_SUSPECTS = 1024
+
+
+class Verdict(Enum):
+    """What an event is."""
+
+    FITS = "belongs to the running clock"
+    STARTS = "the first of a new segment: the clock has jumped"
+    STRAY = "its stamp is wrong, or it is very late"
+
+
+class ClockGuard:
+    """Sorts events by whether their stamps fit the running clock.
+
+    A stamp far ahead of the newest or far behind it is kept in a bounded queue until others agree with it (the clock
+    has jumped, or all sensors were silent) or until one arrives that fits the running clock (then it was a stray).
+    Depends on the order of events alone, so that a replay decides as the live run did.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self._newest_ns = 0  # of the stamps believed
+        self._started = False
+        self._back_ns = int(config.clock_back_s * 1e9)
+        self._jump_ns = int(config.clock_jump_s * 1e9)
+        self._usual_ns = 0.0  # running mean of the newest stamp's advances
+        self._motion = False  # a motion source has spoken on the running clock
+        self._suspects: deque[Event] = deque()
+
+    def judge(self, event: Event) -> list[tuple[Verdict, Event]]:
+        """Verdicts that this event allows: on itself, on earlier ones that waited, on none yet."""
+        ahead = event.stamp_ns - self._newest_ns
+        if not self._started or -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns):
+            strays = [(Verdict.STRAY, suspect) for suspect in self._suspects]
+            self._suspects.clear()
+            self._believe(event)
+            return [*strays, (Verdict.FITS, event)]
+        self._suspects.append(event)
+        group = [e for e in self._suspects if self._agree(e, event)]
+        span = max(e.stamp_ns for e in group) - min(e.stamp_ns for e in group)
+        moves = not self._motion or any(isinstance(e, MOTION_EVENTS) for e in group)
+        if len(group) >= _CONFIRM_COUNT and span >= (_CONFIRM_NS if moves else _GIVE_UP_NS):
+            return self._accept(group)
+        if len(self._suspects) > _MAX_SUSPECTS:
+            return [(Verdict.STRAY, self._suspects.popleft())]
+        return []
+
+    def flush(self) -> list[tuple[Verdict, Event]]:
+        """Verdicts on all that still waits: two that agree are believed, as nothing more will come."""
+        verdicts: list[tuple[Verdict, Event]] = []
+        while self._suspects:
+            last = self._suspects[-1]
+            group = [e for e in self._suspects if self._agree(e, last)]
+            if len(group) > 1:
+                verdicts += self._accept(group)
+            else:
+                verdicts.append((Verdict.STRAY, self._suspects.pop()))
+        return verdicts
+
+    def _agree(self, event: Event, latest: Event) -> bool:
+        """Whether both lie on the same side of the running clock and near each other."""
+        same_side = (event.stamp_ns > self._newest_ns) == (latest.stamp_ns > self._newest_ns)
+        return same_side and -_WINDOW_NS <= event.stamp_ns - latest.stamp_ns <= self._back_ns
+
+    def _accept(self, group: list[Event]) -> list[tuple[Verdict, Event]]:
+        """Move the clock to the first of the group, and judge again all that waited."""
+        first = min(group, key=lambda e: e.stamp_ns)
+        waiting = [e for e in self._suspects if e is not first]
+        self._suspects.clear()
+        jumped = not 0 <= first.stamp_ns - self._newest_ns <= self._jump_ns
+        if jumped:
+            self._motion = False
+        self._believe(first)
+        verdicts = [(Verdict.STARTS if jumped else Verdict.FITS, first)]
+        for event in waiting:
+            verdicts += self.judge(event)
+        return verdicts
+
+    def _believe(self, event: Event) -> None:
+        advance = event.stamp_ns - self._newest_ns if self._started else 0
+        if advance < -self._back_ns:
+            self._newest_ns = event.stamp_ns
+        elif advance > 0 or not self._started:
+            self._usual_ns += 0.1 * (min(advance, 2_000_000_000) - self._usual_ns)
+            self._newest_ns = event.stamp_ns
+        self._started = True
+        self._motion = self._motion or isinstance(event, MOTION_EVENTS)

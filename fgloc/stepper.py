@@ -1,0 +1,334 @@
+"""Cuts the stream of events into steps between keyframes, online and deterministically."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from fgloc.clock import MOTION_EVENTS, ClockGuard, Verdict
+from fgloc.config import GateConfig, KeyframesConfig
+from fgloc.types import (
+    CommandEvent,
+    CornersEvent,
+    Event,
+    ImuEvent,
+    JointsEvent,
+    MarkerPosesEvent,
+    OdometryEvent,
+    RangeBearingEvent,
+    SightingsEvent,
+    Step,
+)
+
+_MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
+_MAX_PATIENCE_NS = 1_000_000_000
+_ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
+_NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
+
+E = TypeVar("E", bound=Event)
+
+
+class _Buffer(Generic[E]):
+    """Events of one kind in order of stamp."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self._events: list[E] = []
+
+    def insert(self, event: E) -> bool:
+        """Put in order of stamp; False if the topic has said something at this stamp already."""
+        stamp = event.stamp_ns
+        if not self.stamps or stamp > self.stamps[-1]:
+            self.stamps.append(stamp)
+            self._events.append(event)
+            return True
+        at = bisect_right(self.stamps, stamp)
+        k = at
+        while k > 0 and self.stamps[k - 1] == stamp:
+            k -= 1
+            if self._events[k].topic == event.topic:
+                return False
+        self.stamps.insert(at, stamp)
+        self._events.insert(at, event)
+        return True
+
+    def window(self, start_ns: int, end_ns: int) -> tuple[E, ...]:
+        """Events inside, the last one at or before the start, and the first one at or after the end."""
+        first = max(bisect_right(self.stamps, start_ns) - 1, 0)
+        return tuple(self._events[first : bisect_left(self.stamps, end_ns) + 1])
+
+    def after(self, stamp_ns: int) -> int | None:
+        """The first stamp later than this."""
+        at = bisect_right(self.stamps, stamp_ns)
+        return self.stamps[at] if at < len(self.stamps) else None
+
+    def trim(self, start_ns: int) -> None:
+        """Forget what no window from this start on needs."""
+        first = bisect_right(self.stamps, start_ns) - 1
+        if first > 0:
+            del self.stamps[:first]
+            del self._events[:first]
+
+    def clear(self) -> None:
+        self.stamps.clear()
+        self._events.clear()
+
+
+@dataclass(slots=True)
+class _Source:
+    """One topic's punctuality."""
+
+    newest_ns: int
+    patience_ns: int  # how long, by the newest stamp of all, its word is waited for
+    disorder_ns: int = 0  # how far it has stepped back behind its own newest stamp
+
+
+class Stepper:
+    """Turns gated events, in order of receipt, into contiguous steps.
+
+    A keyframe is made at the stamp of each sightings event with a sighting, else every ``max_interval_s`` while a
+    motion source speaks (up to ``min_interval_s`` later, if a sighting is due then). Sightings closer than
+    ``min_interval_s`` to the last keyframe, and late ones inside the lag, go with the next step at their own stamps.
+    Where nothing was heard, the step reaches to the next event, in pieces of at most 1 s.
+
+    A keyframe is closed when every living source has spoken at or beyond it, or ``reorder_s`` later by the newest
+    stamp. Motion events older than the last keyframe are lost ("late"); their source is waited for longer from then on,
+    up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
+
+    The first step of a segment has ``start_ns == stamp_ns``. Depends on the events alone, never on the wall clock.
+    ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
+    """
+
+    def __init__(self, config: KeyframesConfig, gate: GateConfig, lag_s: float) -> None:
+        """Set up.
+
+        Args:
+            config: when keyframes are made.
+            gate: what counts as a jump of the clock.
+            lag_s: how late sightings may be and still be fused.
+        """
+        self.rejections: Counter[str] = Counter()
+        self._min_ns = max(int(config.min_interval_s * 1e9), 1)
+        self._max_ns = max(int(config.max_interval_s * 1e9), self._min_ns)
+        self._reorder_ns = int(config.reorder_s * 1e9)
+        self._history_ns = int(config.history_s * 1e9)
+        self._lag_ns = int(lag_s * 1e9)
+        self._clock = ClockGuard(gate)
+        self._jumps: list[str] = []
+        self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
+        self._index = 0
+        self._segment = 0
+        self._odometry: _Buffer[OdometryEvent] = _Buffer()
+        self._commands: _Buffer[CommandEvent] = _Buffer()
+        self._joints: _Buffer[JointsEvent] = _Buffer()
+        self._imu: _Buffer[ImuEvent] = _Buffer()
+        self._motion: dict[type, _Buffer[Event]] = {
+            OdometryEvent: self._odometry,  # type: ignore[dict-item]
+            CommandEvent: self._commands,  # type: ignore[dict-item]
+            JointsEvent: self._joints,  # type: ignore[dict-item]
+            ImuEvent: self._imu,  # type: ignore[dict-item]
+        }
+        self._reset()
+
+    def _reset(self) -> None:
+        """Begin a segment with nothing heard."""
+        for buffer in self._motion.values():
+            buffer.clear()
+        self._last_ns: int | None = None  # the last keyframe
+        self._first_ns = 0  # the segment's first keyframe
+        self._newest_ns = 0  # newest stamp
+        self._sources: dict[str, _Source] = {}
+        self._pending: list[SightingsEvent] = []  # by stamp
+        self._seen: set[tuple[int, str]] = set()  # sightings of the lag
+        self._seen_order: deque[tuple[int, str]] = deque()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        notes = self._jumps[:10]
+        if len(self._jumps) > 10:
+            notes.append(f"the clock jumped {len(self._jumps)} times in all")
+        for topic, (count, ahead_ns) in self._offsets.items():
+            if count >= 10:
+                notes.append(
+                    f"{topic}: {count} messages were dropped, their stamps lie ahead of the other sensors' "
+                    f"(the last by {ahead_ns * 1e-9:.2f} s): correct them with recording.stamp_offset_s"
+                )
+        for topic, source in self._sources.items():
+            if source.patience_ns > self._reorder_ns:
+                notes.append(
+                    f"{topic}: comes later than keyframes.reorder_s after other sensors; waited for up to "
+                    f"{source.patience_ns * 1e-9:.2f} s"
+                )
+        return tuple(notes)
+
+    def push(self, event: Event) -> list[Step]:
+        """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
+        if not isinstance(event, (*MOTION_EVENTS, CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+            return []
+        return self._take(self._clock.judge(event))
+
+    def flush(self) -> list[Step]:
+        """The last steps of a recording: nothing more will come."""
+        return self._take(self._clock.flush()) + self._finish()
+
+    def _take(self, verdicts: list[tuple[Verdict, Event]]) -> list[Step]:
+        steps: list[Step] = []
+        for verdict, event in verdicts:
+            if verdict is Verdict.STRAY:
+                self._stray(event)
+                continue
+            if verdict is Verdict.STARTS:
+                steps += self._jump(event)
+            self._insert(event)
+            while (stamp_ns := self._candidate()) is not None and self._closed(stamp_ns):
+                steps.append(self._step(stamp_ns))
+        return steps
+
+    # --- events in ---
+
+    def _insert(self, event: Event) -> None:
+        stamp = event.stamp_ns
+        self._newest_ns = max(self._newest_ns, stamp)
+        source = self._sources.get(event.topic)
+        if source is None:
+            source = self._sources[event.topic] = _Source(stamp, self._reorder_ns)
+        elif stamp > source.newest_ns:
+            source.newest_ns = stamp
+        else:
+            source.disorder_ns = max(source.disorder_ns, min(source.newest_ns - stamp, self._reorder_ns))
+        if isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+            self._insert_sightings(event)
+            return
+        name = _NAMES[type(event)]
+        if self._last_ns is not None and stamp < self._last_ns:
+            behind = self._newest_ns - stamp
+            source.patience_ns = max(source.patience_ns, min(5 * behind // 4, _MAX_PATIENCE_NS))
+            self.rejections[f"{name}.late"] += 1
+        elif not self._motion[type(event)].insert(event):
+            self.rejections[f"{name}.duplicate"] += 1
+
+    def _insert_sightings(self, event: SightingsEvent) -> None:
+        if not event.sightings:
+            return
+        stamp, key = event.stamp_ns, (event.stamp_ns, event.topic)
+        oldest = self._newest_ns - self._lag_ns
+        while self._seen_order and self._seen_order[0][0] < oldest:
+            self._seen.discard(self._seen_order.popleft())
+        if stamp < oldest or (self._last_ns is not None and stamp < self._first_ns):
+            self.rejections["sightings.late"] += 1
+        elif key in self._seen:
+            self.rejections["sightings.duplicate"] += 1
+        else:
+            self._seen.add(key)
+            self._seen_order.append(key)
+            insort(self._pending, event, key=lambda e: e.stamp_ns)
+
+    def _stray(self, event: Event) -> None:
+        """An event far off the clock: a sighting may just be very late, the rest is lost."""
+        ahead = event.stamp_ns - self._newest_ns
+        if ahead > 0:
+            self.rejections[f"{_NAMES.get(type(event), 'sightings')}.future"] += 1
+            count, _ = self._offsets.get(event.topic, (0, 0))
+            self._offsets[event.topic] = [count + 1, ahead]
+        elif isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+            self._insert_sightings(event)
+        else:
+            self.rejections[f"{_NAMES[type(event)]}.late"] += 1
+
+    def _jump(self, event: Event) -> list[Step]:
+        """End the segment; one that has not begun (its first stamps were wrong) is forgotten."""
+        steps: list[Step] = []
+        if self._last_ns is None:
+            lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending)
+            self._jumps.append(
+                f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped"
+            )
+        else:
+            jump_s = (event.stamp_ns - self._last_ns) * 1e-9
+            self._segment += 1
+            self._jumps.append(
+                f"the clock jumped {'ahead' if jump_s > 0 else 'back'} by {abs(jump_s):.1f} s at "
+                f"{event.stamp_ns * 1e-9:.3f} s: segment {self._segment} begins"
+            )
+            steps = self._finish()
+        self._reset()
+        return steps
+
+    # --- steps out ---
+
+    def _candidate(self) -> int | None:
+        """When the next keyframe is due; None if nothing calls for one."""
+        last = self._last_ns
+        if last is None:
+            stamps = [buffer.stamps[0] for buffer in self._motion.values() if buffer.stamps]
+            stamps += [event.stamp_ns for event in self._pending[:1]]
+            return min(stamps, default=None)
+        if self._newest_ns < last + self._min_ns:
+            return None
+        at = bisect_left(self._pending, last + self._min_ns, key=lambda e: e.stamp_ns)
+        sighting = self._pending[at].stamp_ns if at < len(self._pending) else None
+        heard = [stamp for buffer in self._motion.values() if (stamp := buffer.after(last)) is not None]
+        due = max(min(heard), last + self._max_ns) if heard else None
+        if sighting is not None and (due is None or sighting < due + self._min_ns):
+            due = sighting
+        if due is None:
+            return None
+        pieces = -((last - due) // _MAX_STEP_NS)
+        return last + (due - last) // pieces
+
+    def _closed(self, stamp_ns: int) -> bool:
+        """Whether nothing before this time is still expected."""
+        newest = self._newest_ns
+        if newest < stamp_ns + (self._reorder_ns if self._last_ns is None else 0):
+            return False
+        return all(
+            source.newest_ns >= stamp_ns + source.disorder_ns
+            or newest >= stamp_ns + source.patience_ns
+            or newest > source.newest_ns + _ALIVE_NS
+            for source in self._sources.values()
+        )
+
+    def _step(self, stamp_ns: int) -> Step:
+        """Close the keyframe at this time."""
+        start = stamp_ns if self._last_ns is None else self._last_ns
+        handed = bisect_right(self._pending, stamp_ns, key=lambda e: e.stamp_ns)
+        step = Step(
+            index=self._index,
+            segment=self._segment,
+            start_ns=start,
+            stamp_ns=stamp_ns,
+            odometry=self._odometry.window(start, stamp_ns),
+            commands=self._commands.window(start - self._history_ns, stamp_ns),
+            joints=self._joints.window(start, stamp_ns),
+            imu=self._imu.window(start, stamp_ns),
+            sightings=tuple(self._pending[:handed]),
+        )
+        del self._pending[:handed]
+        if self._last_ns is None:
+            self._first_ns = stamp_ns
+        self._last_ns = stamp_ns
+        self._index += 1
+        self._odometry.trim(stamp_ns)
+        self._commands.trim(stamp_ns - self._history_ns)
+        self._joints.trim(stamp_ns)
+        self._imu.trim(stamp_ns)
+        return step
+
+    def _finish(self) -> list[Step]:
+        """Steps up to the newest event, without waiting for anything."""
+        steps: list[Step] = []
+        while (stamp_ns := self._candidate()) is not None:
+            stamp_ns = min(stamp_ns, self._newest_kept())
+            if self._last_ns is not None and stamp_ns < self._last_ns + self._min_ns:
+                break
+            steps.append(self._step(stamp_ns))
+        if self._pending and self._last_ns is not None:  # too near to the last keyframe for one of their own
+            steps.append(self._step(self._last_ns + self._min_ns))
+        return steps
+
+    def _newest_kept(self) -> int:
+        stamps = [buffer.stamps[-1] for buffer in self._motion.values() if buffer.stamps]
+        return max(stamps + [event.stamp_ns for event in self._pending[-1:]])
