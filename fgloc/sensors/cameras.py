@@ -189,10 +189,8 @@ def _checked(
         )
     if not np.isfinite(T_base_cam).all():
         raise CameraError(f"{source}: the mounting T_base_cam is not finite: {np.asarray(T_base_cam).tolist()}")
-    if model not in _MODELS:
-        raise CameraError(
-            f"{source}: distortion model '{model}' is not known; known are {', '.join(filter(None, _MODELS))}"
-        )
+    if model and model not in _MODELS:
+        raise CameraError(f"{source}: distortion model '{model}' is not known; known are {', '.join(_MODELS)}")
     notes = []
     fisheye = model in _FISHEYE
     if len(coefficients) == 0:

@@ -1,0 +1,286 @@
+"""Marker maps: our YAML, TagSLAM's YAML, WPILib's field JSON and plain lists of points.
+
+Our format, all in metres and radians::
+
+    dictionary: DICT_4X4_50   # OpenCV's name
+    size: 0.2                 # side of the black square, for markers that give none
+    landmarks:
+      - {id: 0, position: [4.0, 1.5, 0.5], facing: 3.1416}             # upright, its face looks along this yaw
+      - {id: 3, position: [1.0, 2.0, 0.0], rpy: [0, 0, 1], size: 0.1}  # turned by fixed-axis roll, pitch, yaw
+      - {id: 4, position: [1.0, 3.0, 2.4], quaternion: [1, 0, 0, 0]}   # turned by a quaternion x, y, z, w
+      - {id: 7, position: [2.0, 2.5], cov: [[0.01, 0], [0, 0.01]]}     # a point, perhaps with covariance of x, y
+
+``rpy`` and ``quaternion`` turn the marker frame into the map's: x to the marker's right as seen, y to its top, z out of
+its face. Without any turn a marker lies on the floor, face up, its right along the map's x.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fgloc.errors import ConfigError, MapError
+from fgloc.frames import quaternion_matrix, rpy_matrix
+from fgloc.recording.outputs import atomic_file
+from fgloc.sensors.dictionaries import load_dictionary
+from fgloc.sensors.documents import Item, read_document
+from fgloc.types import FloatArray, Landmark, LandmarkMap
+
+_MAX_SIZE_M = 5.0
+_MAX_POSITION_M = 1e6
+_QUATERNION_TOLERANCE = 0.05
+_ORIENTATIONS = ("facing", "rpy", "quaternion")
+_WPILIB_SIZE_M = 0.1651  # 6.5 inches, FRC since 2024
+_WPILIB_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # our axes in WPILib's: x out of the face
+
+
+class _Builder:
+    """Collects landmarks; refuses an id given twice, naming both lines."""
+
+    def __init__(self, default_size_m: float | None) -> None:
+        self.default_size_m = default_size_m
+        self.landmarks: dict[int, Landmark] = {}
+        self._lines: dict[int, int] = {}
+
+    def add(
+        self,
+        item: Item,
+        landmark_id: Item,
+        position: FloatArray,
+        rotation: FloatArray | None = None,
+        size: Item | None = None,
+        cov: FloatArray | None = None,
+    ) -> None:
+        """Add a marker, or a point if it has no rotation."""
+        number = landmark_id.integer()
+        if number < 0:
+            raise landmark_id.fail(f"landmark id {number} is negative; ids count from 0")
+        if number in self._lines:
+            raise item.fail(f"landmark id {number} is already in line {self._lines[number]}; every id may stand once")
+        if (np.abs(position) > _MAX_POSITION_M).any():
+            raise item.fail(f"position {position.tolist()} is out of bounds; expected metres")
+        if rotation is None and size is not None:
+            raise size.fail(f"landmark {number} has a size but no orientation; give one of {', '.join(_ORIENTATIONS)}")
+        side = 0.0 if rotation is None else _size(size) if size is not None else self.default_size_m or 0.0
+        self._lines[number] = item.line
+        self.landmarks[number] = Landmark(number, position, np.eye(3) if rotation is None else rotation, side, cov)
+
+    def finish(self, path: Path, root: Item, dictionary: str, notes: list[str]) -> LandmarkMap:
+        """The checked map."""
+        if not self.landmarks:
+            raise root.fail("no landmarks in the map")
+        if dictionary:
+            capacity = len(load_dictionary(dictionary).bytesList)
+            beyond = [i for i in self.landmarks if i >= capacity]
+            if beyond:
+                notes.append(f"{path}: {dictionary} has ids below {capacity}; {beyond} will never be seen.")
+        sizeless = [
+            i for i, m in self.landmarks.items() if m.size_m == 0.0 and not np.array_equal(m.rotation, np.eye(3))
+        ]
+        if sizeless:
+            notes.append(f"{path}: markers {sizeless} have no size; their corners cannot be used.")
+        return LandmarkMap(self.landmarks, dictionary, str(path), tuple(notes))
+
+
+def load_map(path: Path, default_size_m: float | None = None) -> LandmarkMap:
+    """Read a map in any of the known formats.
+
+    Args:
+        path: the file.
+        default_size_m: side of markers for which the file gives none.
+
+    Raises:
+        MapError: the file cannot be read or is in no known format; or an id is given twice (both lines are named) or is
+            negative, a number is not finite, a size is not in metres, or a rotation is not one.
+    """
+    root = read_document(path, MapError)
+    builder = _Builder(default_size_m)
+    if not root.is_mapping:
+        raise root.fail("expected keys such as 'landmarks' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib)")
+    landmarks, bodies, tags = (root.get(key) for key in ("landmarks", "bodies", "tags"))
+    if bodies is not None:
+        return _tagslam(path, root, bodies, builder)
+    if tags is not None:
+        return _wpilib(path, root, tags, builder)
+    if landmarks is None:
+        raise root.fail(
+            "no map in it: expected 'landmarks' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib), "
+            f"got the keys {', '.join(k for k, _ in root.pairs())}"
+        )
+    return _columns(path, root, landmarks, builder) if landmarks.is_mapping else _ours(path, root, landmarks, builder)
+
+
+def write_map(landmark_map: LandmarkMap, path: Path) -> None:
+    """Write our format, whole or not at all. Reading it gives the same map to the last bit but for rotations (1e-15).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = [f"dictionary: {landmark_map.dictionary}"] if landmark_map.dictionary else []
+    lines.append("landmarks:")
+    for number in sorted(landmark_map.landmarks):
+        landmark = landmark_map.landmarks[number]
+        fields = [f"id: {number}", f"position: {_row(landmark.position)}"]
+        if landmark.size_m > 0.0:
+            quaternion = Rotation.from_matrix(landmark.rotation).as_quat()
+            fields += [f"quaternion: {_row(quaternion)}", f"size: {landmark.size_m!r}"]
+        if landmark.cov is not None:
+            fields.append(f"cov: [{', '.join(_row(row) for row in landmark.cov)}]")
+        lines.append(f"  - {{{', '.join(fields)}}}")
+    with atomic_file(path) as file:
+        file.write("\n".join(lines) + "\n")
+
+
+def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> LandmarkMap:
+    root.only("dictionary", "size", "landmarks")
+    named, size = root.get("dictionary"), root.get("size")
+    dictionary = "" if named is None else named.text()
+    if named is not None:
+        try:
+            load_dictionary(dictionary)
+        except ConfigError as error:
+            raise named.fail(str(error)) from error
+    if size is not None:
+        builder.default_size_m = _size(size)
+    for item in landmarks.entries():
+        item.only("id", "position", "size", "cov", *_ORIENTATIONS)
+        position = item.need("position").numbers(2, 3)
+        given = [(key, value) for key in _ORIENTATIONS if (value := item.get(key)) is not None]
+        if len(given) > 1:
+            raise item.fail(f"orientation given {len(given)} times, as {', '.join(k for k, _ in given)}; give one")
+        if given and len(position) == 2:
+            raise item.fail("a marker with an orientation needs a position of x, y, z")
+        rotation = _orientation(*given[0]) if given else None
+        cov = item.get("cov")
+        builder.add(
+            item,
+            item.need("id"),
+            np.append(position, 0.0)[:3],
+            rotation,
+            item.get("size"),
+            None if cov is None else _cov(cov),
+        )
+    return builder.finish(path, root, dictionary, [])
+
+
+def _columns(path: Path, root: Item, landmarks: Item, builder: _Builder) -> LandmarkMap:
+    """Lists of ids and coordinates. Where they differ in length, the ids that have coordinates are used."""
+    columns = {key: landmarks.need(key).entries() for key in ("id", "x", "y")}
+    heights = landmarks.get("z")
+    if heights is not None:
+        columns["z"] = heights.entries()
+    count = min(len(c) for c in columns.values())
+    notes = []
+    if any(len(c) != count for c in columns.values()):
+        lengths = ", ".join(f"{len(c)} {key}" for key, c in columns.items())
+        notes.append(f"{path}: lists of unequal length ({lengths}); the first {count} landmarks are used.")
+    for k in range(count):
+        xyz = [columns[key][k].number() if key in columns else 0.0 for key in ("x", "y", "z")]
+        builder.add(columns["id"][k], columns["id"][k], np.array(xyz))
+    return builder.finish(path, root, "", notes)
+
+
+def _tagslam(path: Path, root: Item, bodies: Item, builder: _Builder) -> LandmarkMap:
+    """Tags of the static bodies whose pose is known.
+
+    Source: TagSLAM's documentation, "Input Files and Parameters"; its tag frame has x right, y up, z out of the face.
+    """
+    notes = []
+    for body in (pair for entry in bodies.entries() for pair in entry.pairs()):
+        name, item = body
+        tags, static, pose = item.get("tags"), item.get("is_static"), item.get("pose")
+        if tags is None:
+            continue
+        if static is None or static.text().lower() != "true":
+            notes.append(f"{path}: the tags of body '{name}' are left out: it is not static.")
+            continue
+        T_map_body = np.eye(4) if pose is None else _tagslam_pose(pose)
+        size = item.get("default_tag_size")
+        for tag in tags.entries():
+            placed = tag.get("pose")
+            if placed is None:
+                notes.append(f"{path}: tag {tag.need('id').text()} of body '{name}' has no pose and is left out.")
+                continue
+            T = T_map_body @ _tagslam_pose(placed)
+            builder.add(tag, tag.need("id"), T[:3, 3], T[:3, :3], tag.get("size") or size)
+    return builder.finish(path, root, "DICT_APRILTAG_36h11", notes)
+
+
+def _tagslam_pose(pose: Item) -> FloatArray:
+    T = np.eye(4)
+    T[:3, 3] = _xyz(pose.need("position"))
+    T[:3, :3] = Rotation.from_rotvec(_xyz(pose.need("rotation"))).as_matrix()
+    return T
+
+
+def _wpilib(path: Path, root: Item, tags: Item, builder: _Builder) -> LandmarkMap:
+    """Tags of an FRC field, in its own coordinates (origin in a corner of the field).
+
+    Source: WPILib's documentation of AprilTagFieldLayout: a tag's x looks out of its face, z up.
+    """
+    notes = []
+    if builder.default_size_m is None:
+        builder.default_size_m = _WPILIB_SIZE_M
+        notes.append(f"{path}: WPILib's files give no size; {_WPILIB_SIZE_M} m is taken.")
+    for tag in tags.entries():
+        pose = tag.need("pose")
+        quaternion = pose.need("rotation").need("quaternion")
+        xyzw = np.array([quaternion.need(key).number() for key in ("X", "Y", "Z", "W")])
+        rotation = quaternion_matrix(_unit(quaternion, xyzw)) @ _WPILIB_AXES
+        builder.add(tag, tag.need("ID"), _xyz(pose.need("translation")), rotation)
+    return builder.finish(path, root, "DICT_APRILTAG_36h11", notes)
+
+
+def _orientation(key: str, item: Item) -> FloatArray:
+    if key == "facing":
+        yaw = item.number()
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]])
+    if key == "rpy":
+        roll, pitch, yaw = item.numbers(3)
+        if max(abs(roll), abs(pitch), abs(yaw)) > 2.0 * np.pi:
+            raise item.fail(f"rpy {[roll, pitch, yaw]} is more than a turn; expected radians, not degrees")
+        return rpy_matrix(roll, pitch, yaw)
+    return quaternion_matrix(_unit(item, item.numbers(4)))
+
+
+def _unit(item: Item, quaternion: FloatArray) -> FloatArray:
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > _QUATERNION_TOLERANCE:
+        raise item.fail(f"quaternion {quaternion.tolist()} has length {length:.3g}, expected 1: it is not a rotation")
+    return quaternion / length
+
+
+def _xyz(item: Item) -> FloatArray:
+    return np.array([item.need(key).number() for key in ("x", "y", "z")])
+
+
+def _size(item: Item) -> float:
+    size = item.number()
+    if size <= 0.0:
+        raise item.fail(f"marker size {size:g} m, expected more than 0")
+    if size > _MAX_SIZE_M:
+        unit, metres = ("cm", size / 100.0) if size < 100.0 else ("mm", size / 1000.0)
+        raise item.fail(
+            f"marker size {size:g} m is too large; sizes are in metres: if it is {size:g} {unit}, write {metres:g}"
+        )
+    return size
+
+
+def _cov(item: Item) -> FloatArray:
+    cov = np.array([row.numbers(2) for row in item.entries()])
+    if (
+        cov.shape != (2, 2)
+        or abs(cov[0, 1] - cov[1, 0]) > 1e-9 * np.abs(cov).max()
+        or np.linalg.eigvalsh(cov)[0] <= 0.0
+    ):
+        raise item.fail(
+            f"cov {cov.tolist()} is not a covariance of x, y: expected 2 by 2, symmetric, positive definite"
+        )
+    return cov
+
+
+def _row(values: FloatArray) -> str:
+    return f"[{', '.join(repr(float(v)) for v in values)}]"
