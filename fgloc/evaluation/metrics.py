@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
-from fgloc.config import Config, TruthConfig
+from fgloc.config import Config
 from fgloc.errors import TrajectoryError
 from fgloc.evaluation.consistency import coverage, nees
 from fgloc.types import RunResult, Trajectory
@@ -83,28 +83,29 @@ class Matched:
         return np.asarray(np.hypot(*(self.estimate - self.truth)[:, :2].T))
 
 
-def match(estimate: Trajectory, truth: Trajectory, config: TruthConfig) -> Matched:
-    """Bring the truth to the estimate's stamps and into its frame.
+def match(
+    estimate: Trajectory, truth: Trajectory, align: Literal["none", "se2"] = "none", max_gap_s: float = 0.2
+) -> Matched:
+    """Bring the truth to the estimate's stamps and, if asked, into its frame.
 
-    Equal stamps match exactly; between two stamps of the truth no further apart than ``config.max_gap_s`` the truth is
+    Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
     interpolated; elsewhere the estimate has no partner and is left out.
 
     Raises:
-        TrajectoryError: no pose has a partner, or too few to align.
+        TrajectoryError: fewer than two poses have a partner.
     """
-    indices = _matchable(estimate, truth, config.max_gap_s)
+    indices = _matchable(estimate, truth, max_gap_s)
     if len(indices) < _FEWEST:
         raise TrajectoryError(
             f"{len(indices)} of {len(estimate)} poses have a truth at their time, expected {_FEWEST} or more: the "
-            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {config.max_gap_s} s are not bridged; "
+            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {max_gap_s} s are not bridged; "
             "check the clocks, or raise the largest gap"
         )
     stamps = estimate.stamps_ns[indices]
     poses = estimate.poses[indices]
     reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
-    reference[:, 2] = se2.wrap_array(reference[:, 2] - config.yaw_offset_rad)
     T_map_truth = np.zeros(3)
-    if config.align == "se2":
+    if align == "se2":
         T_map_truth = align_se2(reference[:, :2], poses[:, :2])
         reference = transform(T_map_truth, reference)
     covs = None if estimate.covs is None else estimate.covs[indices]
@@ -241,7 +242,7 @@ def match_result(result: RunResult, config: Config) -> Matched | None:
     truth = result.truth
     if truth is None or len(truth) == 0 or len(_matchable(result.trajectory, truth, config.truth.max_gap_s)) < _FEWEST:
         return None
-    return match(result.trajectory, truth, config.truth)
+    return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s)
 
 
 def _matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:

@@ -1,0 +1,256 @@
+"""Everything a run leaves behind: the files of one folder, and a report that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+import platform
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fgloc.config import Config
+from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
+from fgloc.evaluation.plots import plot_error, plot_timeline, plot_trajectory, png
+from fgloc.recording.outputs import (
+    atomic_folder,
+    write_bytes,
+    write_covariance_csv,
+    write_json,
+    write_steps_csv,
+    write_text,
+    write_tum,
+)
+from fgloc.types import Mode, RunResult
+
+_PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
+
+_CSS = """
+:root { --ink: #1c2330; --soft: #5b6472; --line: #e3e6ea; --tint: #f5f7f9; --accent: #0072b2; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 66rem; color: var(--ink); background: #fff;
+       font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: 1.6rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); padding-bottom: .25rem; }
+p.sub, figcaption, td.why { color: var(--soft); }
+code, pre { font: 13px/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
+pre { background: var(--tint); padding: .8rem 1rem; overflow-x: auto; border-radius: 6px; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .7rem; margin: 1.2rem 0; }
+.tile { background: var(--tint); border-radius: 8px; padding: .7rem .9rem; }
+.tile b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
+.tile span { color: var(--soft); font-size: .85rem; }
+figure { margin: 1rem 0 1.6rem; } figure img { width: 100%; height: auto; display: block; }
+figcaption { font-size: .9rem; margin-top: .3rem; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { font-weight: 600; } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.warn { border-left: 4px solid #d55e00; background: #fdf3ec; padding: .6rem 1rem; }
+.columns { display: grid; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); gap: 0 2.5rem; }
+"""
+
+
+def write_results(result: RunResult, config: Config, out: Path, command: str, input_hash: str | None = None) -> Metrics:
+    """Write all files of a run into a folder; an error leaves what was there as it was.
+
+    Args:
+        result: the run.
+        config: as it was used.
+        out: the folder, made if missing.
+        command: what the user typed, for the report and ``config.json``.
+        input_hash: of the recording.
+
+    Returns:
+        What ``metrics.json`` holds.
+
+    Raises:
+        OutputError: the folder cannot be written.
+        TrajectoryError: a pose is not finite.
+        CovarianceError: a covariance is not positive definite.
+    """
+    metrics, matched = compute_metrics(result, config), match_result(result, config)
+    source = None if result.source is None else str(result.source)
+    provenance = {
+        "command": command,
+        "input": {"path": source, "sha256": input_hash},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "config": config.model_dump(mode="json"),
+    }
+    pictures = {
+        "trajectory": png(plot_trajectory(result, matched)),
+        "error": png(plot_error(result, matched)),
+        "timeline": png(plot_timeline(result)),
+    }
+    with atomic_folder(out) as stage:
+        write_tum(stage / "trajectory.tum", result.trajectory)
+        write_covariance_csv(stage / "covariance.csv", result.trajectory)
+        write_steps_csv(stage / "steps.csv", result.decisions)
+        write_json(stage / "metrics.json", metrics.model_dump())
+        write_json(stage / "config.json", provenance)
+        write_bytes(stage / "trajectory.png", pictures["trajectory"])
+        write_bytes(stage / "timeline.png", pictures["timeline"])
+        write_text(stage / "report.html", render(result, metrics, matched, pictures, provenance))
+    return metrics
+
+
+def render(
+    result: RunResult,
+    metrics: Metrics,
+    matched: Matched | None,
+    pictures: Mapping[str, bytes],
+    provenance: Mapping[str, Any],
+) -> str:
+    """The report as one HTML page that needs no other file and no network."""
+    name = escape("recording" if result.source is None else result.source.name)
+    body = [
+        f"<h1>{name}</h1>",
+        f'<p class="sub"><code>{escape(str(provenance["command"]))}</code></p>',
+        _tiles(metrics),
+        _truth_line(result, matched),
+        _modes(result.modes),
+        _list("Notes", result.notes),
+        "<h2>Trajectory</h2>",
+        _picture(pictures["trajectory"], "Trajectory", "The estimate with 3σ ellipses over the truth and the map."),
+        "<h2>Error and its 3σ band</h2>",
+        _picture(pictures["error"], "Error", "In the map frame. An honest band holds 99.7 % of the errors."),
+        "<h2>Timeline</h2>",
+        _picture(pictures["timeline"], "Timeline", "What was heard, fused and rejected, with the number of items."),
+        "<h2>Figures</h2>",
+        _figures(metrics),
+        '<div class="columns">',
+        _section("Sensors", _sensors(result)),
+        _section("Factors", _table(("kind", "count"), metrics.factors.items(), numbers=1)),
+        _section("Rejected", _table(("reason", "count"), _most(metrics.rejections), numbers=1)),
+        _section("Landmarks", _landmarks(result)),
+        "</div>",
+        "<h2>Provenance</h2>",
+        f"<pre>{escape(yaml.safe_dump(dict(provenance), sort_keys=False, allow_unicode=True))}</pre>",
+    ]
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>fgloc: {name}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body>\n</html>\n"
+    )
+
+
+def _tiles(metrics: Metrics) -> str:
+    shown = [
+        ("mean distance from truth", _number(metrics.ate_mean_m, 1000.0, "{:.1f} mm")),
+        ("mean yaw error", _number(metrics.yaw_mae_deg, 1.0, "{:.2f}°")),
+        ("drift", _number(metrics.drift_percent, 1.0, "{:.2f} %")),
+        ("NEES / 3 (honest: 1)", _number(metrics.nees_over_3, 1.0, "{:.2f}")),
+        ("recording", _number(metrics.duration_s, 1.0, "{:.1f} s")),
+        ("keyframes", str(metrics.keyframes)),
+        ("times real time", _number(metrics.real_time_factor, 1.0, "{:.1f}×")),
+    ]
+    tiles = (f'<div class="tile"><b>{text}</b><span>{label}</span></div>' for label, text in shown if text != "–")
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _truth_line(result: RunResult, matched: Matched | None) -> str:
+    if matched is not None:
+        return f"<p>The truth was matched at {len(matched.stamps_ns)} of {len(result.trajectory)} keyframes.</p>"
+    if result.truth is not None:
+        return '<p class="warn">The truth has no poses at the run\'s time: there is nothing to compare with.</p>'
+    return "<p>The recording holds no truth: errors are unknown, the 3σ bands are the estimate's own.</p>"
+
+
+def _modes(modes: Sequence[Mode]) -> str:
+    counts = Counter(modes)
+    shares = ", ".join(f"{mode} {100.0 * counts[mode] / len(modes):.1f} %" for mode in Mode if counts[mode])
+    lost = " The robot was LOST for part of the run: do not trust these stretches." if counts[Mode.LOST] else ""
+    return f"<p{' class=warn' if lost else ''}>Modes: {shares}.{lost}</p>"
+
+
+def _figures(metrics: Metrics) -> str:
+    share = metrics.coverage or {}
+    times = metrics.step_ms
+    steps = "–" if times is None else f"{times.median:.2f} / {times.p95:.2f} / {times.p99:.2f} / {times.max:.2f} ms"
+    rows = [
+        ("ATE, mean", _number(metrics.ate_mean_m, 1.0, "{:.4f} m"), "mean distance from the truth"),
+        ("ATE, rmse", _number(metrics.ate_rmse_m, 1.0, "{:.4f} m"), "root mean square distance from the truth"),
+        ("yaw MAE", _number(metrics.yaw_mae_deg, 1.0, "{:.3f}°"), "mean absolute yaw error"),
+        ("end error", _number(metrics.end_error_m, 1.0, "{:.4f} m"), "distance from the truth at the end"),
+        ("drift", _number(metrics.drift_percent, 1.0, "{:.3f} %"), "end error over distance travelled"),
+        ("NEES / 3", _number(metrics.nees_over_3, 1.0, "{:.3f}"), "1 is honest, more is over-confident"),
+        (
+            "coverage 1σ / 2σ / 3σ",
+            " / ".join(_number(share.get(k), 100.0, "{:.1f} %") for k in ("1", "2", "3")),
+            "share of x, y and yaw errors inside their band; honest: 68.3 / 95.4 / 99.7 %",
+        ),
+        ("update", steps, "wall time of one step: median / p95 / p99 / worst"),
+        (
+            "real-time factor",
+            _number(metrics.real_time_factor, 1.0, "{:.1f}"),
+            "seconds of recording per second of work",
+        ),
+    ]
+    cells = (
+        f'<tr><td>{label}</td><td class="n">{text}</td><td class="why">{why}</td></tr>' for label, text, why in rows
+    )
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _sensors(result: RunResult) -> str:
+    rows = []
+    for name, times in result.spans.items():
+        steps = np.diff(np.sort(times))
+        rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
+        rows.append((name, len(times), rate, f"{steps.max():.2f}" if len(steps) else "–"))
+    return _table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
+
+
+def _landmarks(result: RunResult) -> str:
+    if result.landmarks is None:
+        return ""
+    used, refused = Counter[int](), Counter[int]()
+    for decision in result.decisions:
+        (refused if decision.weight == 0 else used)[decision.landmark_id] += 1
+    rows = [
+        (i, f"{lm.position[0]:.3f}", f"{lm.position[1]:.3f}", used[i], refused[i])
+        for i, lm in sorted(result.landmarks.landmarks.items())
+    ]
+    return _table(("id", "x [m]", "y [m]", "fused", "rejected"), rows, numbers=4)
+
+
+def _most(counts: Mapping[str, int]) -> list[tuple[str, int]]:
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int) -> str:
+    """A table whose last `numbers` columns are aligned right; empty without rows."""
+    first = len(head) - numbers
+
+    def line(cells: Sequence[object], tag: str) -> str:
+        looks = ("" if i < first else ' class="n"' for i in range(len(cells)))
+        inside = (f"<{tag}{look}>{escape(str(cell))}</{tag}>" for look, cell in zip(looks, cells, strict=True))
+        return f"<tr>{''.join(inside)}</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f"<table>{line(head, 'th')}{body}</table>" if body else ""
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{title}</h2>{content or '<p>None.</p>'}</section>"
+
+
+def _list(title: str, items: Sequence[str]) -> str:
+    if not items:
+        return ""
+    return f"<h2>{title}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
+
+
+def _picture(data: bytes, alt: str, caption: str) -> str:
+    code = base64.b64encode(data).decode("ascii")
+    image = f'<img alt="{alt}" src="data:image/png;base64,{code}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+
+
+def _number(value: float | None, factor: float, form: str) -> str:
+    return "–" if value is None else form.format(value * factor)
