@@ -1,0 +1,134 @@
+"""Known kinematics before the network, and honest covariances after it, from recordings the weights have not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from fgloc.config import NoiseDensity
+from fgloc.motion.card import JointErrors, Kinematics
+from fgloc.types import FloatArray
+from training.config import CalibrationConfig
+from training.data import Run
+from training.rollouts import Rollout
+
+Bases = Callable[[Rollout], list[FloatArray]]
+_FIELDS = tuple(NoiseDensity.model_fields)
+_MIN_STEP_VARIANCE = 1e-12  # keeps a covariance definite where the robot rests
+_MIN_DENSITY = 1e-4
+
+
+def fit_kinematics(runs: list[Run]) -> Kinematics:
+    """Scale and delay that make the commands fit the true velocities best, in the least-squares sense."""
+
+    def residuals(parameters: FloatArray) -> FloatArray:
+        scale_v, scale_omega, delay = parameters
+        parts = []
+        for run in runs:
+            limits = np.append(run.times, run.times[-1] + run.dt_s) - 0.5 * run.dt_s - delay
+            told = run.track.means(limits)
+            v, omega = scale_v * told[:, 0] - run.velocities[:, 0], scale_omega * told[:, 1] - run.velocities[:, 2]
+            parts += [(v / v_unit)[run.valid], (omega / omega_unit)[run.valid]]
+        return np.concatenate(parts)
+
+    v_unit = max(1e-3, float(np.concatenate([r.velocities[r.valid, 0] for r in runs]).std()))
+    omega_unit = max(1e-3, float(np.concatenate([r.velocities[r.valid, 2] for r in runs]).std()))
+    fit = least_squares(residuals, [1.0, 1.0, 0.2], bounds=([0.3, 0.3, 0.0], [2.0, 2.0, 1.0]), diff_step=1e-2)
+    return Kinematics(scale_v=float(fit.x[0]), scale_omega=float(fit.x[1]), delay_s=float(fit.x[2]))
+
+
+def fit_noise(rollouts: list[Rollout], config: CalibrationConfig) -> NoiseDensity:
+    """Noise densities under which the errors over the calibration's horizons are most likely."""
+    variances = _most_likely(rollouts, _noise_bases, np.full(len(_FIELDS), 1e-4), config)
+    return NoiseDensity(**{n: max(_MIN_DENSITY, float(np.sqrt(v))) for n, v in zip(_FIELDS, variances, strict=True)})
+
+
+def fit_variance_scale(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[float, float, float]:
+    """Factors on the predicted variances of x, y and yaw under which the errors are most likely.
+
+    The rollouts' steps must be single sub-steps, whose covariance is diagonal.
+    """
+
+    def bases(rollout: Rollout) -> list[FloatArray]:
+        return [_diagonal(rollout.covs[:, i, i], [i]) for i in range(3)]
+
+    x, y, yaw = _most_likely(rollouts, bases, np.ones(3), config)
+    return float(x), float(y), float(yaw)
+
+
+def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: CalibrationConfig) -> JointErrors:
+    """W, N, C of the errors over windows, each in units of its predicted covariance (its Cholesky factor).
+
+    Args:
+        learned: rollouts with the calibrated covariance.
+        wheels: rollouts of the same runs with the wheels' covariance.
+        config: length of the windows.
+    """
+    whitened = []
+    for parts in (learned, wheels):
+        white = []
+        for rollout in parts:
+            root = np.linalg.cholesky(rollout.composed(rollout.covs, config.window_s))
+            white.append(np.linalg.solve(root, rollout.errors(config.window_s)[..., None])[..., 0])
+        whitened.append(np.concatenate(white))
+    n, w = whitened
+    return JointErrors(
+        window_s=config.window_s, W=_rows(w.T @ w / len(w)), N=_rows(n.T @ n / len(n)), C=_rows(n.T @ w / len(n))
+    )
+
+
+def noise_covs(rollout: Rollout, noise: NoiseDensity) -> FloatArray:
+    """Covariances ``(n, 3, 3)`` of the steps under noise densities."""
+    parts = zip(_FIELDS, _noise_bases(rollout), strict=True)
+    return np.asarray(sum(getattr(noise, name) ** 2 * basis for name, basis in parts))
+
+
+def nis(errors: FloatArray, covs: FloatArray) -> FloatArray:
+    """Normalized innovations squared ``(m,)``: eᵀP⁻¹e, 3 on average if the covariance is right."""
+    return np.asarray(np.einsum("mi,mi->m", errors, np.linalg.solve(covs, errors[..., None])[..., 0]))
+
+
+def _most_likely(rollouts: list[Rollout], bases: Bases, start: FloatArray, config: CalibrationConfig) -> FloatArray:
+    """Non-negative coefficients of the bases' covariances that maximize the likelihood of the windows' errors."""
+    errors, parts = [], []
+    for rollout in rollouts:
+        step_bases = bases(rollout)
+        for horizon in config.horizons_s:
+            errors.append(rollout.errors(horizon))
+            parts.append(np.stack([rollout.composed(b, horizon) for b in step_bases], axis=1))
+    e, basis = np.concatenate(errors), np.concatenate(parts)
+
+    def loss(log_parameters: FloatArray) -> tuple[float, FloatArray]:
+        parameters = np.exp(log_parameters)
+        cov = np.einsum("p,mpij->mij", parameters, basis) + _MIN_STEP_VARIANCE * np.eye(3)
+        inverse = np.linalg.inv(cov)
+        white = np.einsum("mij,mj->mi", inverse, e)
+        value = 0.5 * (np.einsum("mi,mi->m", e, white) + np.linalg.slogdet(cov)[1]).mean()
+        outer = inverse - white[:, :, None] * white[:, None, :]
+        gradient = 0.5 * np.einsum("mij,mpij->p", outer, basis) / len(e) * parameters
+        return float(value), gradient
+
+    result = minimize(loss, np.log(start), jac=True, method="L-BFGS-B", bounds=[(-30.0, 10.0)] * len(start))
+    return np.asarray(np.exp(result.x))
+
+
+def _noise_bases(rollout: Rollout) -> list[FloatArray]:
+    """What one unit of each squared density, in the order of `NoiseDensity`, adds to the covariances of the steps."""
+    distance, yaw = np.hypot(rollout.motions[:, 0], rollout.motions[:, 1]), np.abs(rollout.motions[:, 2])
+    amounts = {"m": distance, "rad": yaw, "s": np.full(len(yaw), rollout.step_s)}
+    axes = {"x": [0], "y": [1], "xy": [0, 1], "yaw": [2]}
+    named = [(name.split("_", 1)[0], name.rsplit("_", 1)[1]) for name in _FIELDS]
+    return [_diagonal(amounts[per], axes[axis]) for axis, per in named]
+
+
+def _diagonal(values: FloatArray, axes: list[int]) -> FloatArray:
+    out = np.zeros((len(values), 3, 3))
+    for axis in axes:
+        out[:, axis, axis] = values
+    return out
+
+
+def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(v) for v in row) for row in matrix)

@@ -1,0 +1,105 @@
+"""What a training run is told: strict, from YAML, stored in every model it makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from fgloc.config import Section
+from fgloc.errors import ConfigError
+from fgloc.motion.card import Split
+
+
+class DataConfig(Section):
+    """How recordings become samples at a fixed time step."""
+
+    smoothing_s: float = Field(0.5, gt=0, description="window of the local cubic fit that smooths the truth")
+    max_truth_gap_s: float = Field(0.15, gt=0, description="the samples are cut where the truth is silent for longer")
+    margin_s: float = Field(0.5, ge=0, description="left out at both ends")
+
+
+class NetworkConfig(Section):
+    """Form and size of the model."""
+
+    kind: Literal["velocity", "displacement"] = "displacement"
+    hidden: tuple[int, ...] = (128, 128)
+    dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
+    edges_s: tuple[float, ...] = Field(
+        (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5),
+        description="displacement: limits of the ages over which commands are averaged",
+    )
+    use_velocity: bool = Field(False, description="displacement: also read the velocity at the start")
+    velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of that velocity [m/s, rad/s]")
+    velocity_decay_s: float = Field(0.3, gt=0)
+    hold_s: float = Field(1.5, gt=0)
+
+
+class OptimizationConfig(Section):
+    """Multi-step loss, Adam, early stopping."""
+
+    seed: int = 0
+    horizon_s: float = Field(3.0, gt=0, description="length of the rollouts in the loss")
+    batch: int = Field(128, gt=0)
+    iterations: int = Field(1500, gt=0)
+    validate_every: int = Field(125, gt=0)
+    patience: int = Field(6, gt=0, description="validations without improvement after which to stop")
+    learning_rate: float = Field(2e-3, gt=0)
+    position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")
+    yaw_sigma_rad: float = Field(0.05, gt=0, description="yaw errors weigh in this unit")
+    variance_horizon_s: float = Field(
+        5.0, gt=0, description="length of the rollouts whose likelihood sets the variance"
+    )
+    variance_iterations: int = Field(300, ge=0)
+
+
+class CalibrationConfig(Section):
+    """Scaling of the covariances on the held-out recording."""
+
+    horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
+    window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
+
+
+class TrainConfig(Section):
+    """One training run, or one per recording left out."""
+
+    robot: str
+    recordings: dict[str, Path] = Field(description="bags by name, relative to --data")
+    leave_one_out: bool = Field(False, description="a model per recording left out, and one from all")
+    split: Split | None = None
+    data: DataConfig = DataConfig()
+    network: NetworkConfig = NetworkConfig()
+    optimization: OptimizationConfig = OptimizationConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+    @model_validator(mode="after")
+    def _one_split(self) -> TrainConfig:
+        if self.leave_one_out == (self.split is not None):
+            raise ValueError("give either leave_one_out: true or a split")
+        if self.leave_one_out and len(self.recordings) < 3:
+            raise ValueError(f"leave_one_out needs at least 3 recordings, got {sorted(self.recordings)}")
+        if self.split is not None:
+            used = {*self.split.train, *self.split.validation, *self.split.test}
+            if unknown := used - set(self.recordings):
+                raise ValueError(f"the split names {sorted(unknown)}, recordings are {sorted(self.recordings)}")
+            if set(self.split.train) & {*self.split.validation, *self.split.test}:
+                raise ValueError("a recording that trains can neither validate nor test")
+            if not (self.split.train and self.split.validation):
+                raise ValueError("the split needs recordings to train and to validate on")
+        return self
+
+
+def load_train_config(path: Path) -> TrainConfig:
+    """Read a training configuration.
+
+    Raises:
+        ConfigError: it cannot be read, or a key or value is wrong.
+    """
+    try:
+        return TrainConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except (yaml.YAMLError, ValidationError) as error:
+        raise ConfigError(f"{path}: not a training configuration: {error}") from error

@@ -1,0 +1,148 @@
+"""Recordings to samples at a fixed time step: smoothed truth, body velocities, commands as a function of time.
+
+Source: paper eq. 1, 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from fgloc.config import Config, load_config
+from fgloc.errors import RecordingError
+from fgloc.frames import quaternion_yaw
+from fgloc.motion.commands import CommandTrack
+from fgloc.recording.reader import open_recording
+from fgloc.types import CommandEvent, FloatArray, TruthEvent
+from training.config import DataConfig
+
+_FINE_S = 0.02  # the truth is resampled to this before it is smoothed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One recording at times ``k·dt_s``."""
+
+    name: str
+    origin_ns: int
+    dt_s: float
+    poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
+    velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
+    valid: NDArray[np.bool_]  # (n,) the truth was heard around this time
+    commands: tuple[CommandEvent, ...]
+    track: CommandTrack  # time zero is origin_ns
+
+    @property
+    def times(self) -> FloatArray:
+        """``(n,)`` s since the origin."""
+        return np.arange(len(self.poses)) * self.dt_s
+
+    def starts(self, steps: int, stride: int = 1) -> NDArray[np.int64]:
+        """Indices from which ``steps`` steps are valid throughout."""
+        broken = np.concatenate([[0], np.cumsum(~self.valid)])
+        k = np.arange(0, len(self.poses) - steps, stride)
+        return k[broken[k + steps + 1] == broken[k]]
+
+
+def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataConfig) -> Run:
+    """Read a bag. A ``robot.yaml`` beside it says how.
+
+    Args:
+        path: the bag.
+        name: what the split calls it.
+        dt_s: time step of the samples.
+        history_s: commands wanted before the first sample.
+        config: smoothing and cutting.
+
+    Raises:
+        RecordingError: it cannot be read, or has no commands, no truth or too little of both.
+    """
+    settings = _settings(path)
+    commands: list[CommandEvent] = []
+    truth: list[TruthEvent] = []
+    for event in open_recording(path, settings.recording).events():
+        if isinstance(event, CommandEvent):
+            commands.append(event)
+        elif isinstance(event, TruthEvent):
+            truth.append(event)
+    for kind, events in (("commands", commands), ("truth", truth)):
+        if len(events) < 2:
+            raise RecordingError(f"{path}: {len(events)} messages of {kind}; identification needs commands and truth")
+    rows = np.array([(e.position[0], e.position[1], quaternion_yaw(e.orientation)) for e in truth])
+    rows[:, 2] -= settings.truth.yaw_offset_rad
+    return make_run(name, commands, np.array([e.stamp_ns for e in truth]), rows, dt_s, history_s, config)
+
+
+def make_run(
+    name: str,
+    commands: list[CommandEvent],
+    truth_ns: NDArray[np.int64],
+    truth: FloatArray,
+    dt_s: float,
+    history_s: float,
+    config: DataConfig,
+) -> Run:
+    """A run from commands and truth poses ``(m, 3)`` at ``truth_ns``; arguments else as in `load_run`.
+
+    Raises:
+        RecordingError: commands and truth overlap too little.
+    """
+    commands = sorted(commands, key=lambda c: c.stamp_ns)
+    order = np.unique(truth_ns, return_index=True)[1]
+    truth_ns, truth = truth_ns[order], truth[order]
+    first = max(int(truth_ns[0]) + round(config.margin_s * 1e9), commands[0].stamp_ns + round(history_s * 1e9))
+    last = min(int(truth_ns[-1]), commands[-1].stamp_ns) - round(config.margin_s * 1e9)
+    n = int((last - first) * 1e-9 / dt_s) + 1
+    if n < 100:
+        raise RecordingError(
+            f"{name}: commands and truth overlap for {max(0.0, (last - first) * 1e-9):.1f} s; expected at least "
+            f"{100 * dt_s:.0f} s; check the stamps with `fgloc info`"
+        )
+    t_truth = (truth_ns - first) * 1e-9
+    times = np.arange(n) * dt_s
+    poses, velocities = _smooth(t_truth, truth, times, config.smoothing_s)
+    return Run(
+        name=name,
+        origin_ns=first,
+        dt_s=dt_s,
+        poses=poses,
+        velocities=velocities,
+        valid=_heard(t_truth, times, config),
+        commands=tuple(commands),
+        track=CommandTrack(tuple(commands), first),
+    )
+
+
+def _smooth(
+    t_truth: FloatArray, truth: FloatArray, times: FloatArray, window_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Poses ``(n, 3)`` and body velocities ``(n, 3)`` at the times, from local cubic fits."""
+    window = max(5, 2 * round(window_s / _FINE_S / 2) + 1)
+    fine = np.arange(times[0] - window * _FINE_S, times[-1] + window * _FINE_S, _FINE_S)
+    yaw = np.unwrap(truth[:, 2])
+    raw = np.column_stack([np.interp(fine, t_truth, c) for c in (truth[:, 0], truth[:, 1], yaw)])
+    smooth = savgol_filter(raw, window, 3, axis=0)
+    rates = savgol_filter(raw, window, 3, deriv=1, delta=_FINE_S, axis=0)
+    poses, rates = (np.column_stack([np.interp(times, fine, c) for c in part.T]) for part in (smooth, rates))
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    body = np.column_stack([c * rates[:, 0] + s * rates[:, 1], c * rates[:, 1] - s * rates[:, 0], rates[:, 2]])
+    return poses, body
+
+
+def _heard(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArray[np.bool_]:
+    """Whether the smoothing window around each time is free of gaps."""
+    reach = 0.5 * config.smoothing_s
+    gaps = np.flatnonzero(np.diff(t_truth) > config.max_truth_gap_s)
+    heard = np.ones(len(times), dtype=bool)
+    for k in gaps:
+        heard[(times > t_truth[k] - reach) & (times < t_truth[k + 1] + reach)] = False
+    return heard
+
+
+def _settings(path: Path) -> Config:
+    beside = path.parent / "robot.yaml"
+    return load_config(beside) if beside.is_file() else Config()

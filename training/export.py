@@ -1,0 +1,55 @@
+"""From torch to the file that fgloc reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgloc.motion.card import ModelCard, Split
+from fgloc.motion.load import Tensors, save_model
+from training.config import TrainConfig
+from training.models import DisplacementNet, MotionNet
+
+_WARM_UP_S = 2.0  # a velocity model that is told no velocity starts from rest this long ago
+
+
+def tensors_of(net: MotionNet) -> Tensors:
+    """Weights by the names that `fgloc.motion.load_model` expects."""
+    out: Tensors = {}
+    for i, (weight, bias) in enumerate(net.layers()):
+        out[f"layer{i}.weight"] = np.ascontiguousarray(weight.detach().numpy())
+        out[f"layer{i}.bias"] = np.ascontiguousarray(bias.detach().numpy())
+    return out
+
+
+def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> ModelCard:
+    """The card of a network that is trained and not yet calibrated."""
+    network = config.network
+    displacement = isinstance(net, DisplacementNet)
+    return ModelCard.model_validate(
+        dict(
+            kind=network.kind,
+            robot=config.robot,
+            inputs=("commands", "velocity") if network.use_velocity or not displacement else ("commands",),
+            dt_s=network.dt_s,
+            hidden=network.hidden,
+            hold_s=network.hold_s,
+            history_s=(network.edges_s[-1] if displacement else _WARM_UP_S) + net.kinematics.delay_s,
+            kinematics=net.kinematics,
+            edges_s=network.edges_s if displacement else (),
+            velocity_decay_s=network.velocity_decay_s,
+            input_mean=net.mean.tolist(),
+            input_std=net.std.tolist(),
+            output_scale=net.scale.tolist(),
+            noise=None if displacement else {},
+            split=split,
+            made_by=made_by,
+        )
+    )
+
+
+def export(net: MotionNet, card: ModelCard, path: Path) -> None:
+    """Write the model file, its weights from torch, its calibration from the card."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_model(path, tensors_of(net), card)

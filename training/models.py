@@ -1,0 +1,194 @@
+"""The networks in torch. Each rolls out trajectories that a loss can compare; export hands the weights to fgloc."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fgloc.motion.card import Kinematics
+from fgloc.motion.models import calibrated
+from fgloc.types import FloatArray
+from training.config import NetworkConfig
+from training.data import Run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Several runs, one after the other; a window of steps must not cross from one to the next."""
+
+    features: Tensor  # (n, ·) what the commands say at each step
+    base: Tensor  # (n, 3) twist of the calibrated kinematics over each step
+    poses: Tensor  # (n, 3) truth at the start of each step, float64
+    velocities: Tensor  # (n, 2) v, ω at the start of each step
+    dt_s: float
+
+
+def mlp(widths: list[int]) -> nn.Sequential:
+    """Linear layers with ReLU between them; the last starts small, so that training starts from the known part."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(widths):
+        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
+    last = layers[-2]
+    with torch.no_grad():
+        last.weight.mul_(0.1)
+        last.bias.zero_()
+    return nn.Sequential(*layers[:-1])
+
+
+class DisplacementNet(nn.Module):
+    """Residual twist on calibrated kinematics from binned commands; log-variances from the last hidden layer."""
+
+    def __init__(self, config: NetworkConfig, kinematics: Kinematics, runs: list[Run]) -> None:
+        """Take the normalization from the training runs."""
+        super().__init__()
+        self.config, self.kinematics = config, kinematics
+        features = np.concatenate([self._features(run) for run in runs])
+        base = np.concatenate([_base(kinematics, run) for run in runs])
+        actual = np.concatenate([run.velocities for run in runs])
+        mean, std = features.mean(axis=0), features.std(axis=0)
+        if config.use_velocity:
+            mean = np.append(mean, [0.0, 0.0])
+            std = np.append(std, (actual - base)[:, [0, 2]].std(axis=0))
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
+        self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
+        self.register_buffer("scale", torch.tensor((actual - base).std(axis=0), dtype=torch.float32))
+        net = mlp([len(mean), *config.hidden, 3])
+        self.trunk, self.mean_head = net[:-1], net[-1]
+        self.variance_head = nn.Linear(config.hidden[-1], 3)
+        with torch.no_grad():
+            self.variance_head.weight.zero_()
+            self.variance_head.bias.copy_(torch.log(torch.tensor([1e-2, 1e-2, 3e-2]) ** 2))
+
+    def _features(self, run: Run) -> FloatArray:
+        middles = run.times + 0.5 * run.dt_s
+        return run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
+
+    def samples(self, runs: list[Run]) -> Samples:
+        """Samples of runs, in order."""
+        return _samples(runs, [self._features(run) for run in runs], self.kinematics)
+
+    def hidden(
+        self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Base twists ``(b, steps, 3)`` and last hidden layer ``(b, steps, ·)``.
+
+        With ``rng``, half of the windows are told the velocity at their start, with noise (if the model reads it).
+        """
+        rows = starts[:, None] + torch.arange(steps)
+        x, base = samples.features[rows], samples.base[rows]
+        if self.config.use_velocity:
+            innovation = torch.zeros(len(starts), steps, 2)
+            if rng is not None:
+                known = samples.velocities[starts] - samples.base[starts][:, [0, 2]]
+                known = known + torch.randn(known.shape, generator=rng) * torch.tensor(self.config.velocity_sigma)
+                known = known * (torch.rand(len(starts), 1, generator=rng) < 0.5)
+                middles = (torch.arange(steps) + 0.5) * samples.dt_s
+                innovation = known[:, None] * torch.exp(-middles / self.config.velocity_decay_s)[:, None]
+            x = torch.cat([x, innovation], dim=-1)
+        return base, self.trunk((x - self.mean) / self.std)
+
+    def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
+        """Poses ``(b, steps, 3)`` after each step, seen from the start."""
+        base, hidden = self.hidden(samples, starts, steps, rng)
+        return integrate((base + self.scale * self.mean_head(hidden)) * samples.dt_s)
+
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and biases; the last layer has the mean's rows, then the variance's."""
+        linear = [m for m in self.trunk if isinstance(m, nn.Linear)]
+        heads = (self.mean_head, self.variance_head)
+        last = (torch.cat([h.weight for h in heads]), torch.cat([h.bias for h in heads]))
+        return [*((m.weight, m.bias) for m in linear), last]
+
+
+class VelocityNet(nn.Module):
+    """[v, ω] a step later from (v, ω, u_v, u_ω, Δt), in the rate form. Source: paper eq. 6, 10."""
+
+    def __init__(self, config: NetworkConfig, kinematics: Kinematics, runs: list[Run]) -> None:
+        """Take the normalization from the training runs."""
+        super().__init__()
+        self.config, self.kinematics = config, kinematics
+        told = np.concatenate([self._features(run) for run in runs])
+        actual = np.concatenate([run.velocities[:, [0, 2]] for run in runs])
+        dts = np.array([0.5, 1.0]) * config.dt_s  # the range that sub-steps will have
+        mean = [*actual.mean(axis=0), *told.mean(axis=0), dts.mean()]
+        std = [*actual.std(axis=0), *told.std(axis=0), dts.std()]
+        rate = np.concatenate([np.diff(run.velocities[:, [0, 2]], axis=0) / run.dt_s for run in runs])
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
+        self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
+        self.register_buffer("scale", torch.tensor(3.0 * rate.std(axis=0), dtype=torch.float32))
+        self.net = mlp([5, *config.hidden, 2])
+
+    def _features(self, run: Run) -> FloatArray:
+        limits = np.append(run.times, len(run.poses) * run.dt_s)
+        return run.track.means(limits - self.kinematics.delay_s)
+
+    def samples(self, runs: list[Run]) -> Samples:
+        """Samples of runs, in order."""
+        return _samples(runs, [self._features(run) for run in runs], self.kinematics)
+
+    def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
+        """Poses ``(b, steps, 3)`` after each step, seen from the start.
+
+        With ``rng``, half of the batches take two samples at a time (then only every second pose moves freely), so that
+        the model learns the meaning of Δt.
+        """
+        pair = 2 if rng is not None and steps % 2 == 0 and torch.rand(1, generator=rng).item() < 0.5 else 1
+        dt = samples.dt_s * pair
+        told = samples.features[starts[:, None] + torch.arange(steps)]
+        told = told.reshape(len(starts), steps // pair, pair, 2).mean(dim=2)
+        state = samples.velocities[starts]
+        dts = torch.full((len(starts), 1), dt)
+        states = [state]
+        for k in range(steps // pair):
+            x = torch.cat([state, told[:, k], dts], dim=1)
+            state = state + dt * self.scale * self.net((x - self.mean) / self.std)
+            states.append(state)
+        velocity = torch.stack(states, dim=1)
+        between = 0.5 * (velocity[:, :-1] + velocity[:, 1:]).repeat_interleave(pair, dim=1) * samples.dt_s
+        return integrate(torch.stack([between[..., 0], torch.zeros_like(between[..., 0]), between[..., 1]], dim=-1))
+
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and biases."""
+        return [(m.weight, m.bias) for m in self.net if isinstance(m, nn.Linear)]
+
+
+MotionNet = DisplacementNet | VelocityNet
+
+
+def integrate(twists: Tensor) -> Tensor:
+    """Compose exponentials of twists ``(b, n, 3)`` into poses ``(b, n, 3)``; the yaw is not wrapped."""
+    yaw = torch.cumsum(twists[..., 2], dim=-1)
+    middle = yaw - 0.5 * twists[..., 2]
+    chord = torch.sinc(twists[..., 2] / (2 * torch.pi))  # sin(θ/2) / (θ/2): arc to chord
+    c, s = torch.cos(middle) * chord, torch.sin(middle) * chord
+    x = torch.cumsum(c * twists[..., 0] - s * twists[..., 1], dim=-1)
+    y = torch.cumsum(s * twists[..., 0] + c * twists[..., 1], dim=-1)
+    return torch.stack([x, y, yaw], dim=-1)
+
+
+def relative(a: Tensor, b: Tensor) -> Tensor:
+    """``T_a⁻¹ ∘ T_b`` of poses ``(..., 3)``; the yaw is not wrapped."""
+    c, s = torch.cos(a[..., 2]), torch.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return torch.stack([c * dx + s * dy, c * dy - s * dx, b[..., 2] - a[..., 2]], dim=-1)
+
+
+def _base(kinematics: Kinematics, run: Run) -> FloatArray:
+    return calibrated(kinematics, run.track, np.append(run.times, len(run.poses) * run.dt_s))
+
+
+def _samples(runs: list[Run], features: list[FloatArray], kinematics: Kinematics) -> Samples:
+    def tensor(parts: list[FloatArray]) -> Tensor:
+        return torch.tensor(np.concatenate(parts), dtype=torch.float32)
+
+    return Samples(
+        features=tensor(features),
+        base=tensor([_base(kinematics, run) for run in runs]),
+        poses=torch.tensor(np.concatenate([run.poses for run in runs])),
+        velocities=tensor([run.velocities[:, [0, 2]] for run in runs]),
+        dt_s=runs[0].dt_s,
+    )
