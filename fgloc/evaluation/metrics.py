@@ -183,18 +183,15 @@ class RelativeError:
     pairs: int
 
 
-def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"]) -> RelativeError:
+def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"]) -> RelativeError | None:
     """Error of the motion between poses that are `delta` frames, or metres of the estimate's path, apart.
 
-    Equals evo's RPE with consecutive pairs. Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-    systems", 2012, section V.
-
-    Raises:
-        TrajectoryError: the trajectory is too short for one pair.
+    Equals evo's RPE with consecutive pairs; None if no two poses are that far apart. Source: Sturm et al., "A benchmark
+    for the evaluation of RGB-D SLAM systems", 2012, section V.
     """
     ends = _frame_ends(len(matched.estimate), delta) if unit == "frames" else _path_ends(matched.estimate, delta)
     if len(ends) < 2:
-        raise TrajectoryError(f"no two of {len(matched.estimate)} poses are {delta} {unit} apart; give a smaller delta")
+        return None
     errors = []
     for i, j in pairwise(ends):
         moved = se2.between(matched.estimate[i], matched.estimate[j])
