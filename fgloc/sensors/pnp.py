@@ -1,0 +1,210 @@
+"""Poses from single sightings: where a marker is in the camera, and where that puts the robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fgloc import se2
+from fgloc.sensors.cameras import without_distortion
+from fgloc.types import Camera, FloatArray, Landmark
+
+_MIN_DEPTH_M = 0.01
+_ITERATIONS = 20
+_SAME = 1e-3  # metres and radians: two refined poses nearer than this are one
+_LEAVE_OUT_UP_TO = 8  # landmarks; among more, a mistaken one does not matter
+_TILT_SIGMA = 1.0  # rad; what is known of a marker's orientation beforehand, so that a frontal view has a covariance
+
+
+def marker_pose_candidates(
+    camera: Camera, corners_px: FloatArray, size_m: float
+) -> tuple[tuple[FloatArray, float], ...]:
+    """Poses of one square marker that explain its corners, the better one first.
+
+    A flat square seen with little perspective has two, mirrored about the line of sight.
+
+    Args:
+        camera: intrinsics; any lens model.
+        corners_px: ``(4, 2)`` in the order of MarkerCorners.
+        size_m: side.
+
+    Returns:
+        ``T_cam_marker (4, 4)`` and root mean square reprojection error [px], without distortion; up to two, none for
+        degenerate corners.
+
+    Source: Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE_SQUARE).
+    """
+    ideal, corners = without_distortion(camera, corners_px)
+    if not np.isfinite(corners).all():
+        return ()
+    square = _square(size_m)
+    try:
+        _, rotations, translations, _ = cv2.solvePnPGeneric(
+            square, corners, ideal.K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+    except cv2.error:  # collinear corners
+        return ()
+    found = []
+    for r, t in zip(rotations, translations, strict=True):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0], np.asarray(t).ravel()
+        points = square @ T[:3, :3].T + T[:3, 3]
+        if np.isfinite(T).all() and points[:, 2].min() > _MIN_DEPTH_M:
+            found.append((T, _rms(_project(ideal.K, points) - corners)))
+    return tuple(sorted(found, key=lambda f: f[1]))
+
+
+def marker_pose_cov(camera: Camera, T_cam_marker: FloatArray, size_m: float, sigma_px: float) -> FloatArray:
+    """Covariance ``(6, 6)`` of a pose from four corners with this noise: first order, about one solution.
+
+    Order: translation, then rotation, both as left perturbations in the camera's axes.
+    """
+    rotated = _square(size_m) @ T_cam_marker[:3, :3].T
+    points = rotated + T_cam_marker[:3, 3]
+    information = np.diag([0.0] * 3 + [_TILT_SIGMA**-2] * 3)
+    for arm, point in zip(rotated, points, strict=True):
+        J = _pixel_jacobian(camera.K, point) @ np.hstack([np.eye(3), -_cross(arm)])
+        information += J.T @ J / sigma_px**2
+    cov = np.linalg.inv(information)
+    return np.asarray(0.5 * (cov + cov.T))
+
+
+def planar_base_candidates(camera: Camera, corners: FloatArray, landmark: Landmark) -> list[tuple[FloatArray, float]]:
+    """Poses of the base on the floor that explain one known marker's corners, the better one first.
+
+    Both solutions for the marker are flattened, then refined with the base kept upright and on the floor: this uses
+    what a single-marker pose does not know, and mostly tells the two apart.
+
+    Args:
+        camera: intrinsics and mounting; any lens model.
+        corners: ``(4, 2)`` pixels in the order of MarkerCorners.
+        landmark: the marker, with its size.
+
+    Returns:
+        ``T_map_base (3,)`` and root mean square reprojection error [px]; none if the marker is a point, or is nowhere
+        before the camera.
+    """
+    if landmark.size_m <= 0.0:
+        return []
+    ideal, pixels = without_distortion(camera, corners)
+    T_map_marker = np.eye(4)
+    T_map_marker[:3, :3], T_map_marker[:3, 3] = landmark.rotation, landmark.position
+    T_cam_base = np.linalg.inv(camera.T_base_cam)
+    found: list[tuple[FloatArray, float]] = []
+    for T_cam_marker, _ in marker_pose_candidates(camera, corners, landmark.size_m):
+        T = T_map_marker @ np.linalg.inv(T_cam_marker) @ T_cam_base
+        start = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
+        refined = _refine(ideal, pixels, landmark.corners(), start)
+        if refined is not None and not any(np.abs(se2.log(se2.between(p, refined[0]))).max() < _SAME for p, _ in found):
+            found.append(refined)
+    return sorted(found, key=lambda f: f[1])
+
+
+def candidates_from_points(sightings: Sequence[tuple[FloatArray, float, float]]) -> list[FloatArray]:
+    """Poses of the base that explain ranges and bearings to known points, all from (nearly) one place.
+
+    Two points give a pose; a single one leaves a circle, and nothing is returned. With a few more, the poses that leave
+    out each of the landmarks follow the pose of all, for the case that one is mistaken.
+
+    Args:
+        sightings: position ``(2,)`` of the landmark in the map [m], range [m], bearing [rad].
+
+    Source: least-squares alignment of two point sets, Umeyama, IEEE PAMI 13(4), 1991, in the plane and without scale.
+    """
+    world = np.array([np.asarray(point, dtype=float)[:2] for point, _, _ in sightings]).reshape(-1, 2)
+    body = np.array([[r * math.cos(b), r * math.sin(b)] for _, r, b in sightings]).reshape(-1, 2)
+    poses = []
+    for chosen in _choices(world):
+        pose = _align(world[chosen], body[chosen])
+        if pose is not None:
+            poses.append(pose)
+    return poses
+
+
+def _choices(world: FloatArray) -> Iterator[NDArray[np.bool_]]:
+    """Masks ``(n,)``: all sightings, then all but those of each landmark, while these are few."""
+    yield np.ones(len(world), dtype=bool)
+    places = np.unique(world, axis=0)
+    if 3 <= len(places) <= _LEAVE_OUT_UP_TO:
+        yield from ((world != place).any(axis=1) for place in places)
+
+
+def _align(world: FloatArray, body: FloatArray) -> FloatArray | None:
+    """Pose ``(3,)`` that takes body points to world points; None if either set is nearly one point."""
+    if len(world) < 2:
+        return None
+    w, b = world - world.mean(axis=0), body - body.mean(axis=0)
+    if min(np.abs(w).max(), np.abs(b).max()) < 0.01:
+        return None
+    yaw = math.atan2(float((b[:, 0] * w[:, 1] - b[:, 1] * w[:, 0]).sum()), float((b * w).sum()))
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y = world.mean(axis=0) - np.array([[c, -s], [s, c]]) @ body.mean(axis=0)
+    return np.array([x, y, yaw])
+
+
+def _refine(
+    camera: Camera, pixels: FloatArray, corners_map: FloatArray, pose: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """Levenberg–Marquardt over x, y, yaw on the reprojection of known points; None if they fall behind the camera."""
+    T_cam_base = np.linalg.inv(camera.T_base_cam)
+    R, t = T_cam_base[:3, :3], T_cam_base[:3, 3]
+
+    def linearise(at: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        c, s = math.cos(at[2]), math.sin(at[2])
+        base = (corners_map - [at[0], at[1], 0.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        points = base @ R.T + t
+        if points[:, 2].min() < _MIN_DEPTH_M:
+            return None
+        rows = []
+        for (bx, by, _), point in zip(base, points, strict=True):
+            moved = np.array([[-1.0, 0.0, by], [0.0, -1.0, -bx], [0.0, 0.0, 0.0]])  # of the point in the base
+            rows.append(_pixel_jacobian(camera.K, point) @ R @ moved)
+        return (_project(camera.K, points) - pixels).ravel(), np.vstack(rows)
+
+    state = linearise(pose)
+    damping = 1e-3
+    for _ in range(_ITERATIONS):
+        if state is None:
+            return None
+        residual, J = state
+        normal = J.T @ J
+        step = np.asarray(-np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), J.T @ residual))
+        moved = se2.compose(pose, step)
+        trial = linearise(moved)
+        if trial is not None and trial[0] @ trial[0] < residual @ residual:
+            pose, state, damping = moved, trial, 0.1 * damping
+        else:
+            damping *= 10.0
+        if np.abs(step).max() < 1e-9 or damping > 1e12:
+            break
+    return None if state is None else (pose, _rms(state[0]))
+
+
+def _square(size_m: float) -> FloatArray:
+    h = 0.5 * size_m
+    return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+
+
+def _project(K: FloatArray, points: FloatArray) -> FloatArray:
+    pixels = points @ K.T
+    return np.asarray(pixels[:, :2] / pixels[:, 2:])
+
+
+def _pixel_jacobian(K: FloatArray, point: FloatArray) -> FloatArray:
+    """Of the pixel by the point in the camera ``(2, 3)``."""
+    x, y, z = point
+    return np.asarray(K[:2, :2] @ np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]]))
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _rms(residuals: FloatArray) -> float:
+    """Root mean square distance [px] of residuals ``(n, 2)`` or ``(2 n,)``."""
+    return math.sqrt(float((np.asarray(residuals).reshape(-1, 2) ** 2).sum(axis=1).mean()))
