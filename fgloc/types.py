@@ -240,7 +240,7 @@ class LandmarkMap:
 # --- Steps ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)  # sensors remember what they made of it
 class Step:
     """All that was heard between two keyframes, gated and in order of stamp.
 
