@@ -246,18 +246,58 @@ class BagWriter:
         content = dict(landmarks=landmarks)
         self._write(topic, "landmark_msgs/msg/LandmarkArray", stamp_ns, received_ns, frame_id, content)
 
+    def marker_poses(
+        self,
+        topic: str,
+        stamp_ns: int,
+        sightings: Iterable[tuple[int, Sequence[float], Sequence[float], ArrayLike | None]],
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``aruco_msgs/MarkerArray`` of (id, position, quaternion x, y, z, w, covariance (6, 6) in ROS order or None)."""
+        markers = [
+            self._make(
+                "aruco_msgs/msg/Marker",
+                header=self._header(stamp_ns, frame_id),
+                id=number,
+                pose=self._make(
+                    "geometry_msgs/msg/PoseWithCovariance",
+                    pose=self._make(
+                        "geometry_msgs/msg/Pose",
+                        position=self._make("geometry_msgs/msg/Point", **_xyz(position)),
+                        orientation=self._quaternion(quaternion),
+                    ),
+                    covariance=_cov36(cov),
+                ),
+                confidence=1.0,
+            )
+            for number, position, quaternion, cov in sightings
+        ]
+        self._write(topic, "aruco_msgs/msg/MarkerArray", stamp_ns, received_ns, frame_id, dict(markers=markers))
+
+    def copy(self, topic: str, message_type: str, raw: bytes | memoryview, received_ns: int) -> None:
+        """Write a message that is already serialized (CDR); its type must be in the typestore."""
+        self._writer.write(self._connection(topic, message_type), received_ns, raw)
+
+    def knows(self, message_type: str) -> bool:
+        """Whether the typestore defines a type, so that a message of it can be written."""
+        return message_type in self._store.types
+
     def write(self, topic: str, message_type: str, message: Any, received_ns: int) -> None:
         """Write any message of the typestore."""
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, message_type, typestore=self._store)
         raw = self._store.serialize_cdr(message, message_type)
-        self._writer.write(self._connections[topic], received_ns, raw)
+        self._writer.write(self._connection(topic, message_type), received_ns, raw)
 
     def make(self, message_type: str, **fields: Any) -> Any:
         """A message of the typestore, for `write`."""
         return self._make(message_type, **fields)
 
     # --- parts of messages ---
+
+    def _connection(self, topic: str, message_type: str) -> Connection:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, message_type, typestore=self._store)
+        return self._connections[topic]
 
     def _make(self, message_type: str, **fields: Any) -> Any:
         return self._store.types[message_type](**fields)
