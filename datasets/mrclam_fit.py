@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize, nnls
 
 from datasets.mrclam import Calibration, Run
@@ -84,7 +85,7 @@ def _all_errors(run: Run, sensor: FloatArray) -> FloatArray:
     return np.column_stack([range_error, se2.wrap_array(bearing - np.arctan2(y, x)), np.hypot(x, y)])
 
 
-def _usable(errors: FloatArray) -> FloatArray:
+def _usable(errors: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((abs(errors[:, 0]) < _GROSS_RANGE_M) & (abs(errors[:, 1]) < _GROSS_BEARING_RAD))
 
 
@@ -209,7 +210,7 @@ def _held_integral(stamps_ns: IntArray, values: FloatArray) -> Callable[[IntArra
     return integral
 
 
-def _has_truth(truth_ns: IntArray, at_ns: IntArray) -> FloatArray:
+def _has_truth(truth_ns: IntArray, at_ns: IntArray) -> NDArray[np.bool_]:
     after = np.clip(np.searchsorted(truth_ns, at_ns), 1, len(truth_ns) - 1)
     gap = (truth_ns[after] - truth_ns[after - 1]) * 1e-9
     return np.asarray((at_ns >= truth_ns[0]) & (at_ns <= truth_ns[-1]) & (gap < _TRUTH_GAP_S))
