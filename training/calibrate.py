@@ -18,23 +18,34 @@ Bases = Callable[[Rollout], list[FloatArray]]
 _FIELDS = tuple(NoiseDensity.model_fields)
 _MIN_STEP_VARIANCE = 1e-12  # keeps a covariance definite where the robot rests
 _MIN_DENSITY = 1e-4
+_FIT_WINDOW_S = 2.0
 
 
 def fit_kinematics(runs: list[Run]) -> Kinematics:
-    """Scale and delay that make the commands fit the true velocities best, in the least-squares sense."""
+    """Scale and delay that make the commands fit the true motion over two seconds best, in the least-squares sense.
+
+    Over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
+    """
 
     def residuals(parameters: FloatArray) -> FloatArray:
         scale_v, scale_omega, delay = parameters
         parts = []
-        for run in runs:
-            limits = np.append(run.times, run.times[-1] + run.dt_s) - 0.5 * run.dt_s - delay
-            told = run.track.means(limits)
-            v, omega = scale_v * told[:, 0] - run.velocities[:, 0], scale_omega * told[:, 1] - run.velocities[:, 2]
-            parts += [(v / v_unit)[run.valid], (omega / omega_unit)[run.valid]]
+        for run, k, actual in windows:
+            told = run.track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
+            parts += [
+                (scale_v * told[:, 0] - actual[:, 0]) / v_unit,
+                (scale_omega * told[:, 1] - actual[:, 1]) / omega_unit,
+            ]
         return np.concatenate(parts)
 
-    v_unit = max(1e-3, float(np.concatenate([r.velocities[r.valid, 0] for r in runs]).std()))
-    omega_unit = max(1e-3, float(np.concatenate([r.velocities[r.valid, 2] for r in runs]).std()))
+    steps = round(_FIT_WINDOW_S / runs[0].dt_s)
+    windows = []
+    for run in runs:
+        k = run.starts(steps)
+        travelled = np.concatenate([[0.0], np.cumsum(run.velocities[:, 0] * run.dt_s)])
+        change = np.column_stack([travelled[k + steps] - travelled[k], run.poses[k + steps, 2] - run.poses[k, 2]])
+        windows.append((run, k, change / (steps * run.dt_s)))
+    v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, actual in windows]).std(axis=0))
     fit = least_squares(residuals, [1.0, 1.0, 0.2], bounds=([0.3, 0.3, 0.0], [2.0, 2.0, 1.0]), diff_step=1e-2)
     return Kinematics(scale_v=float(fit.x[0]), scale_omega=float(fit.x[1]), delay_s=float(fit.x[2]))
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from fgloc.motion.card import Kinematics
-from fgloc.motion.models import calibrated
+from fgloc.motion.forms import calibrated
 from fgloc.types import FloatArray
 from training.config import NetworkConfig
 from training.data import Run

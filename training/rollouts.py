@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.errors import ModelError
 from fgloc.motion.card import Kinematics
-from fgloc.motion.models import MotionModel, calibrated
+from fgloc.motion.forms import MotionModel, calibrated
 from fgloc.types import FloatArray
 from training.data import Run
 

@@ -3,7 +3,7 @@
 from fgloc.motion.card import ModelCard
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.load import load_model, save_model
-from fgloc.motion.models import DisplacementModel, MotionModel, MotionPrediction, VelocityModel
+from fgloc.motion.forms import DisplacementModel, MotionModel, MotionPrediction, VelocityModel
 from fgloc.motion.source import LearnedMotion
 
 __all__ = [

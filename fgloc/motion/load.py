@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.motion.card import FORMAT, VERSION, ModelCard
-from fgloc.motion.models import DisplacementModel, MotionModel, VelocityModel
+from fgloc.motion.forms import DisplacementModel, MotionModel, VelocityModel
 from fgloc.motion.network import Network
 
 _MAX_BYTES = 64 << 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from fgloc.config import MotionConfig
-from fgloc.motion.models import MotionModel
+from fgloc.motion.forms import MotionModel
 from fgloc.types import FloatArray, MotionMeasurement, Step
 
 
