@@ -254,7 +254,7 @@ class BagWriter:
         received_ns: int | None = None,
         frame_id: str = "camera_optical",
     ) -> None:
-        """``aruco_msgs/MarkerArray`` of (id, position, quaternion x, y, z, w, covariance (6, 6) in ROS order or None)."""
+        """``aruco_msgs/MarkerArray`` of (id, position, quaternion x, y, z, w, covariance (6, 6) or None)."""
         markers = [
             self._make(
                 "aruco_msgs/msg/Marker",
