@@ -132,7 +132,7 @@ def plot_timeline(result: RunResult) -> Figure:
         :, 0
     ].tolist()
     for axes, (title, color, rows) in zip(panels, groups, strict=True):
-        _draw_activity(axes, rows, color)
+        _draw_activity(axes, rows, color, bridge=title != "rejected")
         axes.set_ylabel(title, fontsize=9)
         _shade_modes(axes, result)
     panels[-1].set_xlabel("time [s]")
@@ -197,12 +197,12 @@ def _label_offset(landmark: Landmark, extent: float) -> tuple[float, float]:
     return 8.0, 8.0
 
 
-def _draw_activity(axes: Axes, rows: Mapping[str, FloatArray], color: str) -> None:
-    """One row a name: bars where something was heard, with the number of items."""
+def _draw_activity(axes: Axes, rows: Mapping[str, FloatArray], color: str, bridge: bool) -> None:
+    """One row a name, with the number of items: bars where items came at a steady rate (`bridge`), else a tick each."""
     everything = np.concatenate(list(rows.values()))
     span = max(float(np.ptp(everything)), 1.0)
     for row, times in enumerate(rows.values()):
-        axes.broken_barh(_bars(np.sort(times), span), (row - 0.3, 0.6), facecolors=color, linewidth=0)
+        axes.broken_barh(_bars(np.sort(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
     axes.set_yticks(range(len(rows)), [f"{name} ({len(times)})" for name, times in rows.items()], **_TEXT)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -211,14 +211,13 @@ def _draw_activity(axes: Axes, rows: Mapping[str, FloatArray], color: str) -> No
     axes.set_axisbelow(True)
 
 
-def _bars(times: FloatArray, span: float) -> list[tuple[float, float]]:
+def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, float]]:
     """Start and width of the stretches without a silence; a lone item is wide enough to be seen."""
     if len(times) == 0:
         return []
     steps = np.diff(times)
-    silence = max(3.0 * float(np.median(steps)) if len(steps) else 0.0, span / 500.0)
-    silence = min(silence, max(_GAP_S, span / 500.0))
-    cuts = np.flatnonzero(steps > silence) + 1
+    silence = min(3.0 * float(np.median(steps)), _GAP_S) if bridge and len(steps) else 0.0
+    cuts = np.flatnonzero(steps > max(silence, span / 600.0)) + 1
     return [(float(part[0]), float(np.ptp(part)) + span / 600.0) for part in np.split(times, cuts)]
 
 

@@ -1,0 +1,195 @@
+"""Metrics agree with evo's, and with the figures' definitions."""
+
+import numpy as np
+import pytest
+from evo.core import metrics as evo_metrics
+from evo.core.trajectory import PoseTrajectory3D
+from scipy.stats import chi2
+
+from fgloc import se2
+from fgloc.errors import CovarianceError, TrajectoryError
+from fgloc.evaluation import consistency, metrics
+from fgloc.evaluation.metrics import Matched, align_se2, match, relative_error, transform
+from fgloc.frames import yaw_quaternion
+from fgloc.types import Trajectory
+
+START_NS = 1_700_000_000_123_456_789
+
+
+def random_walk(rng, n=200, period_ns=100_000_000):
+    """A robot's path: smooth yaw that wraps, several metres long."""
+    yaw = np.cumsum(rng.normal(0.02, 0.15, n))
+    steps = rng.uniform(0.0, 0.12, n)
+    poses = np.column_stack([np.cumsum(steps * np.cos(yaw)), np.cumsum(steps * np.sin(yaw)), se2.wrap_array(yaw)])
+    return Trajectory(START_NS + period_ns * np.arange(n), poses)
+
+
+def disturbed(rng, truth, T=(0.0, 0.0, 0.0)):
+    """The truth seen from another frame, with noise."""
+    noise = rng.normal(0.0, [0.05, 0.05, 0.04], (len(truth), 3))
+    poses = transform(np.asarray(T), truth.poses) + noise
+    poses[:, 2] = se2.wrap_array(poses[:, 2])
+    return Trajectory(truth.stamps_ns, poses)
+
+
+def to_evo(stamps_ns, poses):
+    quaternions = np.array([np.roll(yaw_quaternion(yaw), 1) for yaw in poses[:, 2]])
+    return PoseTrajectory3D(
+        positions_xyz=np.column_stack([poses[:, :2], np.zeros(len(poses))]),
+        orientations_quat_wxyz=quaternions,
+        timestamps=(stamps_ns - stamps_ns[0]) * 1e-9,
+    )
+
+
+def evo_pair(estimate, truth, align):
+    reference, other = to_evo(truth.stamps_ns, truth.poses), to_evo(estimate.stamps_ns, estimate.poses)
+    if align:
+        other.align(reference, correct_scale=False)
+    return reference, other
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("align", ["none", "se2"])
+def test_ate_equals_evo(seed, align):
+    rng = np.random.default_rng(seed)
+    truth = random_walk(rng)
+    estimate = disturbed(rng, truth, T=(3.0, -2.0, 2.2) if align == "se2" else (0.0, 0.0, 0.0))
+    ours = match(estimate, truth, align)
+    ape = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
+    ape.process_data(evo_pair(estimate, truth, align == "se2"))
+    assert metrics.ate_rmse_m(ours) == pytest.approx(ape.get_statistic(evo_metrics.StatisticsType.rmse), abs=1e-9)
+    assert metrics.ate_mean_m(ours) == pytest.approx(ape.get_statistic(evo_metrics.StatisticsType.mean), abs=1e-9)
+    assert 0.03 < metrics.ate_rmse_m(ours) < 0.15  # of the noise, not of the frames
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("align", ["none", "se2"])
+def test_yaw_error_equals_evo(seed, align):
+    rng = np.random.default_rng(seed)
+    truth = random_walk(rng)
+    estimate = disturbed(rng, truth, T=(3.0, -2.0, 2.2) if align == "se2" else (0.0, 0.0, 0.0))
+    ape = evo_metrics.APE(evo_metrics.PoseRelation.rotation_angle_deg)
+    ape.process_data(evo_pair(estimate, truth, align == "se2"))
+    assert metrics.yaw_mae_deg(match(estimate, truth, align)) == pytest.approx(
+        ape.get_statistic(evo_metrics.StatisticsType.mean), abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("delta", "unit"), [(1, "frames"), (7, "frames"), (1.0, "m"), (2.5, "m")])
+def test_relative_error_equals_evo(seed, delta, unit):
+    rng = np.random.default_rng(seed)
+    truth = random_walk(rng)
+    estimate = disturbed(rng, truth)
+    ours = relative_error(match(estimate, truth), delta, unit)
+    evo_unit = evo_metrics.Unit.frames if unit == "frames" else evo_metrics.Unit.meters
+    for relation, value in (
+        (evo_metrics.PoseRelation.translation_part, ours.translation_m),
+        (evo_metrics.PoseRelation.rotation_angle_deg, ours.rotation_deg),
+    ):
+        rpe = evo_metrics.RPE(relation, delta=delta, delta_unit=evo_unit)
+        rpe.process_data(evo_pair(estimate, truth, False))
+        assert value == pytest.approx(rpe.get_statistic(evo_metrics.StatisticsType.rmse), abs=1e-6)
+        assert ours.pairs == len(rpe.error)
+
+
+def test_relative_error_of_a_short_path_is_unknown(rng):
+    truth = random_walk(rng, n=5)
+    assert relative_error(match(truth, truth), 100.0, "m") is None
+
+
+def test_rigid_motion_is_found_exactly(rng):
+    points = rng.normal(size=(50, 3))
+    for yaw in (-3.1, -1.0, 0.0, 0.4, 3.0):
+        T = np.array([1.5, -7.0, yaw])
+        np.testing.assert_allclose(align_se2(points[:, :2], transform(T, points)[:, :2]), T, atol=1e-12)
+
+
+def test_truth_is_interpolated_at_the_estimates_stamps():
+    truth = Trajectory(START_NS + 100_000_000 * np.arange(3), np.array([[0, 0, 3.0], [1, 2, -3.0], [2, 4, -2.8]]))
+    estimate = Trajectory(np.array([START_NS + 50_000_000]), np.array([[0.5, 1.0, np.pi]]))
+    two = Trajectory(np.append(estimate.stamps_ns, truth.stamps_ns[2]), np.vstack([estimate.poses, truth.poses[2]]))
+    matched = match(two, truth)
+    np.testing.assert_allclose(matched.truth[0, :2], [0.5, 1.0])
+    assert abs(matched.errors[0, 2]) < 1e-9  # the shorter way round
+    assert matched.distances[1] == 0.0
+
+
+def test_truth_is_not_interpolated_across_its_gaps():
+    truth = Trajectory(START_NS + np.array([0, 100, 200, 1200, 1300]) * 1_000_000, np.zeros((5, 3)))
+    estimate = Trajectory(START_NS + np.array([-50, 0, 150, 200, 700, 1200, 1250, 1301]) * 1_000_000, np.zeros((8, 3)))
+    matched = match(estimate, truth, max_gap_s=0.2)
+    assert ((matched.stamps_ns - START_NS) // 1_000_000).tolist() == [0, 150, 200, 1200, 1250]
+
+
+def test_trajectories_of_different_times_are_refused(rng):
+    truth = random_walk(rng)
+    later = Trajectory(truth.stamps_ns + 3_600_000_000_000, truth.poses)
+    with pytest.raises(TrajectoryError, match=r"0 of 200 poses have a truth.*check the clocks"):
+        match(later, truth)
+
+
+def test_yaw_errors_are_wrapped():
+    stamps = START_NS + np.arange(2)
+    matched = Matched(
+        stamps, np.array([[0, 0, 3.1], [0, 0, -3.1]]), np.array([[0, 0, -3.1], [0, 0, 3.1]]), None, np.zeros(3)
+    )
+    assert metrics.yaw_mae_deg(matched) == pytest.approx(np.degrees(2 * np.pi - 6.2))
+
+
+def test_drift_is_end_error_over_distance():
+    truth = Trajectory(
+        START_NS + 100_000_000 * np.arange(101), np.column_stack([np.linspace(0, 10, 101), np.zeros((101, 2))])
+    )
+    estimate = Trajectory(truth.stamps_ns, truth.poses + np.array([0.0, 0.5, 0.0]))
+    matched = match(estimate, truth)
+    assert metrics.end_error_m(matched) == pytest.approx(0.5)
+    assert metrics.drift_percent(matched) == pytest.approx(5.0)
+
+
+def test_noise_of_a_resting_truth_is_no_distance(rng):
+    assert metrics.path_length_m(rng.normal(0.0, 0.002, (5000, 2))) == 0.0
+    stamps = START_NS + 100_000_000 * np.arange(50)
+    resting = match(Trajectory(stamps, np.zeros((50, 3))), Trajectory(stamps, np.zeros((50, 3))))
+    assert metrics.drift_percent(resting) is None
+
+
+def random_covs(rng, n):
+    roots = rng.normal(size=(n, 3, 3)) * [0.1, 0.2, 0.05]
+    return roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+
+
+def test_honest_covariance_is_called_honest(rng):
+    covs = random_covs(rng, 4000)
+    errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.normal(size=(4000, 3)))
+    low, high = consistency.mean_bounds(3, 4000, 0.9999)
+    assert low < consistency.nees(errors, covs).mean() < high
+    for k, share in ((1, 0.683), (2, 0.954), (3, 0.997)):
+        assert consistency.coverage(errors, covs, k) == pytest.approx(share, abs=0.015)
+
+
+def test_overconfident_covariance_is_called_so(rng):
+    covs = random_covs(rng, 500)
+    errors = 2.0 * np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.normal(size=(500, 3)))
+    assert consistency.nees(errors, covs).mean() > consistency.mean_bounds(3, 500, 0.9999)[1]
+
+
+def test_nees_does_not_depend_on_the_frame(rng):
+    covs, errors = random_covs(rng, 20), rng.normal(size=(20, 3))
+    R = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    turned = consistency.nees(errors @ R.T, R @ covs @ R.T)
+    np.testing.assert_allclose(turned, consistency.nees(errors, covs))
+
+
+def test_bounds_of_one_sample_are_those_of_chi_square():
+    assert consistency.mean_bounds(3, 1, 0.95) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 3)))
+
+
+def test_singular_covariance_is_refused():
+    with pytest.raises(CovarianceError, match="covariance 1 is not positive definite"):
+        consistency.nees(np.ones((2, 3)), np.array([np.eye(3), np.diag([1.0, 1.0, 0.0])]))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
