@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -66,8 +67,9 @@ class Decoder:
             definitions: message type and embedded definition (format NONE if there is none) of each topic in use.
         """
         embedded: Typesdict = {}
-        missing, damaged = set(), set()
+        used, missing, damaged = set(), set(), set()
         for message_type, definition in definitions:
+            used.add(message_type)
             if definition.format == MessageDefinitionFormat.NONE:
                 missing.add(message_type)
                 continue
@@ -75,13 +77,14 @@ class Decoder:
                 embedded.update(_parse(message_type, definition))
             except Exception:  # the parser leaks what damaged text makes it meet
                 damaged.add(message_type)
-        default = default_typestore(ros1).fielddefs
+        default = _default_definitions(ros1)
         self._store = get_typestore(Stores.EMPTY)
         try:
-            self._store.register({**default, **embedded})
+            self._store.register(_needed(used, {**default, **embedded}))
         except Exception:  # a definition that parses may still be nonsense
-            self._store = default_typestore(ros1)
-            damaged |= embedded.keys()
+            self._store = get_typestore(Stores.EMPTY)
+            self._store.register(_needed(used, default))
+            damaged |= embedded.keys() & used
         self._deserialize = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
         self.notes: list[str] = []
         name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
@@ -95,6 +98,32 @@ class Decoder:
     def message(self, message_type: str, raw: bytes) -> Any:
         """Deserialize. Raises whatever rosbags leaks on damaged bytes."""
         return self._deserialize(raw, message_type)
+
+
+@cache
+def _default_definitions(ros1: bool) -> Typesdict:
+    return default_typestore(ros1).fielddefs
+
+
+def _needed(used: Iterable[str], definitions: Typesdict) -> Typesdict:
+    """The definitions of some types and of all the types inside them: registering hundreds more takes a while."""
+    needed: Typesdict = {}
+    queue = list(used)
+    while queue:
+        name = queue.pop()
+        if name in definitions and name not in needed:
+            needed[name] = definitions[name]
+            queue += [inner for _, field in definitions[name][1] for inner in _names(field)]
+    return needed
+
+
+def _names(field: Any) -> Iterator[str]:
+    """Message types that a field's description holds."""
+    kind, value = field
+    if kind == Nodetype.NAME:
+        yield value
+    elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        yield from _names(value[0])
 
 
 def _parse(message_type: str, definition: MessageDefinition) -> Typesdict:

@@ -29,7 +29,8 @@ class McapSink:
 
     def channel(self, topic: str, message_type: str, encoding: str, definition: bytes, serialization: str) -> int:
         """Add a channel; returns its id."""
-        schema_id = self._writer.register_schema(message_type, encoding, definition)
+        text = definition.decode(errors="replace").encode()  # damaged text must not stop the reader
+        schema_id = self._writer.register_schema(message_type, encoding, text)
         return int(self._writer.register_channel(topic, serialization, schema_id))
 
     def write(self, channel_id: int, received_ns: int, data: bytes) -> None:

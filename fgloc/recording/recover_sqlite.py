@@ -42,16 +42,19 @@ def recover_sqlite(path: Path, target: Path) -> tuple[int, float]:
 
 
 def _copy_rows(database: sqlite3.Connection, sink: McapSink) -> None:
+    database.execute("PRAGMA writable_schema=ON")  # or SQLite refuses a file that is shorter than its header says
     database.text_factory = lambda raw: raw.decode(errors="replace")
     definitions: dict[str, tuple[str, str]] = {}
     try:
-        rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+        rows = database.execute(
+            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT 10000"
+        )
         definitions = {str(name): (str(encoding), str(text)) for name, encoding, text in rows}
     except sqlite3.Error:
         pass  # older bags have none
     ids: dict[int, int] = {}
     for topic_id, name, kind, serialization in database.execute(
-        "SELECT id, name, type, serialization_format FROM topics"
+        "SELECT id, name, type, serialization_format FROM topics LIMIT 10000"
     ):
         encoding, text = definitions.get(str(kind), ("", ""))
         ids[topic_id] = sink.channel(str(name), str(kind), encoding, text.encode(), str(serialization))
@@ -62,6 +65,8 @@ def _copy_rows(database: sqlite3.Connection, sink: McapSink) -> None:
                 "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id", (last + step,)
             )
             for row_id, topic_id, received_ns, data in rows:
+                if row_id <= last:
+                    return  # a damaged tree that leads in circles
                 last, step = row_id, 1
                 if topic_id in ids and isinstance(received_ns, int) and isinstance(data, bytes):
                     sink.write(ids[topic_id], received_ns, data)

@@ -1,0 +1,333 @@
+"""Recordings of every kind become the same events."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from real_data import real_data
+from recording_bags import START_NS, TICK_NS, storage_file, write_drive, write_ros1
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from datasets.bag import BagWriter
+from fgloc.config import RecordingConfig, TopicsConfig
+from fgloc.errors import RecordingError
+from fgloc.recording.messages import default_typestore
+from fgloc.recording.reader import open_recording
+from fgloc.types import (
+    CommandEvent,
+    CornersEvent,
+    Event,
+    MarkerPosesEvent,
+    OdometryEvent,
+    RangeBearingEvent,
+    TransformEvent,
+    TruthEvent,
+)
+
+DEFAULT = RecordingConfig()
+
+
+def read(path: Path, config: RecordingConfig = DEFAULT) -> list[Event]:
+    with open_recording(path, config) as recording:
+        return list(recording.events())
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("single_file", [False, True])
+def test_rosbag2_folder_and_file(tmp_path, storage, single_file):
+    folder = write_drive(tmp_path / "run", storage)
+    path = storage_file(folder) if single_file else folder
+    with open_recording(path, DEFAULT) as recording:
+        assert recording.kind == storage
+        assert recording.roles == {
+            "odometry": "/odom",
+            "command": "/cmd_vel",
+            "joints": "/joint_states",
+            "camera_info": "/camera/camera_info",
+            "sightings": "/landmarks",
+            "truth": "/ground_truth/pose",
+        }
+        events = list(recording.events())
+        assert recording.duration_s == pytest.approx(199 * TICK_NS * 1e-9 + 0.002)
+        assert recording.content_hash() == hashlib.sha256(storage_file(folder).read_bytes()).hexdigest()
+        assert recording.notes == ()
+        assert recording.undecodable == {}
+        assert [t.count for t in recording.topics if t.role == "sightings"] == [40]
+    assert Counter(type(e).__name__ for e in events) == {
+        "OdometryEvent": 200,
+        "CommandEvent": 200,
+        "JointsEvent": 200,
+        "TruthEvent": 200,
+        "RangeBearingEvent": 40,
+        "CameraInfoEvent": 1,
+        "TransformEvent": 1,
+    }
+    received = [e.received_ns for e in events]
+    assert received == sorted(received)
+    odometry = [e for e in events if isinstance(e, OdometryEvent)][50]
+    assert (odometry.stamp_ns, odometry.received_ns) == (START_NS + 50 * TICK_NS, START_NS + 50 * TICK_NS + 2_000_000)
+    assert (odometry.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    np.testing.assert_allclose(odometry.position, [math.sin(1.0), 1 - math.cos(1.0), 0.0])
+    np.testing.assert_allclose(odometry.orientation, [0, 0, math.sin(0.5), math.cos(0.5)])
+    np.testing.assert_allclose(odometry.pose_cov, np.eye(6) * 1e-3)
+    assert (odometry.linear[0], odometry.angular[2]) == (0.4, 0.4)
+    sightings = next(e for e in events if isinstance(e, RangeBearingEvent)).sightings
+    assert [(s.landmark_id, s.range_m, round(s.bearing_rad, 6)) for s in sightings] == [(1, 2.0, 0.1), (0, 3.0, -0.2)]
+
+
+def test_ros1_bag_headerless_messages_take_receive_times(tmp_path):
+    with open_recording(write_ros1(tmp_path / "run.bag"), DEFAULT) as recording:
+        assert recording.kind == "ros1"
+        assert recording.roles == {"odometry": "/odom", "command": "/cmd_vel", "truth": "/mocap/pose"}
+        events = list(recording.events())
+    assert Counter(type(e).__name__ for e in events) == {"OdometryEvent": 100, "CommandEvent": 100, "TruthEvent": 100}
+    for event in events:
+        delay = event.received_ns - event.stamp_ns
+        assert delay == (1_000_000 if isinstance(event, OdometryEvent) else 0)
+    truth = next(e for e in events if isinstance(e, TruthEvent))
+    np.testing.assert_allclose(truth.orientation, [0, 0, math.sin(0.25), math.cos(0.25)])
+
+
+def test_events_can_be_read_again(tmp_path):
+    with open_recording(write_drive(tmp_path / "run", n=20), DEFAULT) as recording:
+        first = [(e.received_ns, e.topic) for e in recording.events()]
+        assert first == [(e.received_ns, e.topic) for e in recording.events()]
+
+
+def test_received_stamps_and_offsets(tmp_path):
+    folder = write_drive(tmp_path / "run", n=10)
+    config = RecordingConfig(received_stamps=("odometry",), stamp_offset_s={"truth": -0.25, "odometry": 0.5})
+    for event in read(folder, config):
+        delay = event.stamp_ns - event.received_ns
+        if isinstance(event, OdometryEvent):
+            assert delay == 500_000_000
+        elif isinstance(event, TruthEvent):
+            assert delay == -252_000_000
+        elif isinstance(event, CommandEvent):
+            assert delay == -2_000_000
+
+
+def test_transforms_are_events_and_a_tree(tmp_path):
+    with open_recording(write_drive(tmp_path / "run", n=5), DEFAULT) as recording:
+        (event,) = [e for e in recording.events() if isinstance(e, TransformEvent)]
+        assert (event.parent, event.child, event.static) == ("base_link", "camera_optical", True)
+        T = recording.frames.lookup("base_link", "camera_optical")
+    np.testing.assert_allclose(T[:3, 3], [0.1, 0.0, 0.3])
+    np.testing.assert_allclose(T[:3, 2], [1, 0, 0], atol=1e-12)  # the optical axis looks forward
+
+
+def write_sightings(folder: Path, message_type: str, make) -> Path:
+    with BagWriter(folder) as bag:
+        stamp = bag.make("builtin_interfaces/msg/Time", sec=5, nanosec=7)
+        header = bag.make("std_msgs/msg/Header", stamp=stamp, frame_id="cam")
+        bag.write("/seen", message_type, make(bag, header), START_NS)
+    return folder
+
+
+def make_pose(bag: BagWriter, x: float):
+    m = bag.make
+    pose = m(
+        "geometry_msgs/msg/Pose",
+        position=m("geometry_msgs/msg/Point", x=x, y=0.0, z=0.0),
+        orientation=m("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    return m("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+
+
+def test_apriltag_corners_are_put_in_opencv_order(tmp_path):
+    def make(bag, header):
+        m = bag.make
+        # As the AprilTag library reports an upright tag that covers pixels 100 to 199
+        corners = [m("apriltag_msgs/msg/Point", x=x, y=y) for x, y in ((100, 200), (200, 200), (200, 100), (100, 100))]
+        tag = m(
+            "apriltag_msgs/msg/AprilTagDetection",
+            family="tag36h11",
+            id=0,
+            hamming=0,
+            goodness=0.0,
+            decision_margin=50.0,
+            centre=m("apriltag_msgs/msg/Point", x=150.0, y=150.0),
+            corners=corners,
+            homography=np.zeros(9),
+        )
+        return m("apriltag_msgs/msg/AprilTagDetectionArray", header=header, detections=[tag])
+
+    (event,) = read(write_sightings(tmp_path / "run", "apriltag_msgs/msg/AprilTagDetectionArray", make))
+    assert isinstance(event, CornersEvent)
+    assert (event.stamp_ns, event.frame_id) == (5_000_000_007, "cam")
+    (tag,) = event.sightings
+    assert tag.marker_id == 0
+    expected = [[199.5, 199.5], [99.5, 199.5], [99.5, 99.5], [199.5, 99.5]]  # half a turn, pixel centres whole
+    np.testing.assert_array_equal(tag.corners_px, expected)
+
+
+def test_aruco_poses(tmp_path):
+    def make(bag, header):
+        markers = [
+            bag.make("aruco_msgs/msg/Marker", header=header, id=i, pose=make_pose(bag, float(i)), confidence=1.0)
+            for i in (0, 7)
+        ]
+        return bag.make("aruco_msgs/msg/MarkerArray", header=header, markers=markers)
+
+    (event,) = read(write_sightings(tmp_path / "run", "aruco_msgs/msg/MarkerArray", make))
+    assert isinstance(event, MarkerPosesEvent)
+    assert [(s.marker_id, s.position[0]) for s in event.sightings] == [(0, 0.0), (7, 7.0)]
+
+
+@pytest.mark.parametrize(
+    ("class_id", "own_id", "expected"),
+    [("7", "", 7), ("tag36h11:7", "", 7), ("marker_7", "3", 7), ("tag36h11", "12", 12), ("0", "", 0)],
+)
+def test_detection3d_ids(tmp_path, class_id, own_id, expected):
+    (event,) = read(write_detections(tmp_path / "run", [(class_id, own_id), ("person", "")]))
+    assert [s.marker_id for s in event.sightings] == [expected]
+
+
+def write_detections(folder: Path, ids: list[tuple[str, str]]) -> Path:
+    def make(bag, header):
+        m = bag.make
+        detections = []
+        for class_id, own_id in ids:
+            hypothesis = m("vision_msgs/msg/ObjectHypothesis", class_id=class_id, score=1.0)
+            result = m("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=make_pose(bag, 1.0))
+            size = m("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+            box = m("vision_msgs/msg/BoundingBox3D", center=make_pose(bag, 0.0).pose, size=size)
+            detections.append(m("vision_msgs/msg/Detection3D", header=header, results=[result], bbox=box, id=own_id))
+        return m("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+
+    return write_sightings(folder, "vision_msgs/msg/Detection3DArray", make)
+
+
+def test_detections_without_numbers_are_counted_as_undecodable(tmp_path):
+    with open_recording(write_detections(tmp_path / "run", [("person", "")]), DEFAULT) as recording:
+        assert list(recording.events()) == []
+        assert recording.undecodable == {"/seen": 1}
+
+
+def test_embedded_definitions_win(tmp_path):
+    """The older vision_msgs: results hold id, score and pose themselves."""
+    store = get_typestore(Stores.ROS2_FOXY)
+    old = {
+        "vision_msgs/msg/ObjectHypothesisWithPose": (
+            "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n"
+        ),
+        "vision_msgs/msg/Detection3D": (
+            "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nstring tracking_id\n"
+        ),
+        "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n",
+    }
+    for name, text in old.items():
+        store.register(get_types_from_msg(text, name))
+    t = store.types
+    header = t["std_msgs/msg/Header"](stamp=t["builtin_interfaces/msg/Time"](sec=1, nanosec=0), frame_id="cam")
+    pose = t["geometry_msgs/msg/Pose"](
+        position=t["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=3.0),
+        orientation=t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    result = t["vision_msgs/msg/ObjectHypothesisWithPose"](
+        id="42", score=1.0, pose=t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))
+    )
+    detection = t["vision_msgs/msg/Detection3D"](header=header, results=[result], tracking_id="")
+    message = t["vision_msgs/msg/Detection3DArray"](header=header, detections=[detection])
+    with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/seen", "vision_msgs/msg/Detection3DArray", typestore=store)
+        assert connection.msgdef.format == MessageDefinitionFormat.MSG
+        writer.write(connection, START_NS, store.serialize_cdr(message, connection.msgtype))
+    (event,) = read(tmp_path / "run")
+    assert isinstance(event, MarkerPosesEvent)
+    assert [s.marker_id for s in event.sightings] == [42]
+    np.testing.assert_array_equal(event.sightings[0].position, [1, 2, 3])
+
+
+def test_undecodable_messages_are_skipped_and_counted(tmp_path):
+    store = default_typestore()
+    with Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=store)
+        zero = store.types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+        good = store.serialize_cdr(store.types["geometry_msgs/msg/Twist"](zero, zero), "geometry_msgs/msg/Twist")
+        for k, raw in enumerate((good, b"", b"\x00\x01\x00\x00" + b"x" * 11, good)):
+            writer.write(connection, START_NS + k, raw)
+    with open_recording(tmp_path / "run", DEFAULT) as recording:
+        for _ in range(2):
+            assert len(list(recording.events())) == 2
+            assert recording.undecodable == {"/cmd_vel": 2}
+
+
+def test_split_recording_without_metadata_is_merged_in_order(tmp_path):
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    for k in (0, 1, 2):
+        part = storage_file(write_drive(tmp_path / f"part{k}", n=20, start_ns=START_NS + k * 20 * TICK_NS))
+        part.rename(whole / f"run_{(2, 10, 11)[k]}.mcap")
+    with open_recording(whole, DEFAULT) as recording:
+        received = [e.received_ns for e in recording.events() if isinstance(e, OdometryEvent)]
+        assert received == [START_NS + k * TICK_NS + 2_000_000 for k in range(60)]
+        assert recording.duration_s == pytest.approx(59 * 0.05 + 0.002)
+
+
+@pytest.mark.parametrize("name", ["absent.bag", "notes.txt", "empty"])
+def test_what_is_no_recording_is_refused_with_the_remedy(tmp_path, name):
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordingError, match=r"ROS 1 \.bag, a rosbag2 folder, an \.mcap or a \.db3"):
+        open_recording(tmp_path / name, DEFAULT)
+
+
+def test_reading_is_fast(tmp_path):
+    """60 000 odometry messages in a few seconds, decoding included."""
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(20_000):
+            bag.odometry("/odom", START_NS + k * 1000, (0, 0, 0), (0, 0))
+    start = time.perf_counter()
+    assert len(read(tmp_path / "run")) == 20_000
+    assert time.perf_counter() - start < 3.0
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("parts", "roles", "count"),
+    [
+        (
+            ("pioneer_aruco", "duarte.bag"),
+            {"odometry": "/pioneer/pose", "truth": "/mocap_node/Robot_1/ground_pose"},
+            6022,
+        ),
+        (
+            ("pioneer_aruco", "pinto1.bag"),
+            {"odometry": "/pioneer/pose", "truth": "/mocap_node/Robot_1/ground_pose"},
+            4759,
+        ),
+        (("turtlebot3", "rosbag2_2025_11_25-15_11_34"), {"odometry": "/odom", "sightings": "/camera/landmarks"}, 4208),
+        (("turtlebot3", "rosbag2_2025_11_25-14_27_38"), {"odometry": "/odom", "command": "/cmd_vel"}, 3674),
+        (("marker_images", "ubiquity", "aruco_images.bag"), {"image": "/raspicam_node/image/compressed"}, 16),
+    ],
+)
+def test_real_recordings(parts, roles, count):
+    with open_recording(real_data(*parts), DEFAULT) as recording:
+        assert roles.items() <= recording.roles.items()
+        assert sum(1 for _ in recording.events()) == count
+        assert recording.undecodable == {}
+
+
+@pytest.mark.real_data
+def test_real_tf_tree():
+    with open_recording(real_data("turtlebot3", "rosbag2_2025_11_06-17_25_46"), DEFAULT) as recording:
+        T = recording.frames.lookup("base_footprint", "base_scan")
+        assert T[2, 3] > 0.1  # the scanner stands on top
+        with pytest.raises(RecordingError, match="moves"):
+            recording.frames.lookup("odom", "base_scan")
+
+
+def test_a_role_can_be_switched_off(tmp_path):
+    config = RecordingConfig(topics=TopicsConfig(truth="none", sightings="none"))
+    kinds = {type(e) for e in read(write_drive(tmp_path / "run", n=10), config)}
+    assert not kinds & {TruthEvent, RangeBearingEvent}
+    assert OdometryEvent in kinds
