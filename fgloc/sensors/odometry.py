@@ -1,0 +1,139 @@
+"""Wheel motion from odometry messages: twists and pose differences, each a check on the other."""
+
+from __future__ import annotations
+
+import math
+
+from fgloc import se2
+from fgloc.config import WheelsConfig
+from fgloc.errors import ConfigError
+from fgloc.frames import quaternion_yaw
+from fgloc.sensors.timeline import Twist
+from fgloc.sensors.tracks import MAX_SPEED, MAX_TURN, Track, mean_twist
+from fgloc.types import OdometryEvent
+
+Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
+
+_CHECK_TURN, _CHECK_PATH = 0.2, 5.0  # rad or m of motion after which twist and pose are compared
+_STILL = 0.05  # a path shorter than this share of the other's did not move
+_DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
+
+
+class OdometryTrack(Track):
+    """Between two messages, the mean of their twists or the exact motion between their poses.
+
+    Either stands in where the other cannot be used (the gate marks that with NaN). With source "auto" pose differences
+    are used until the robot has moved enough to compare the two; then twists, unless they are zero while the pose
+    moves, or in degrees. A pose that jumps (odometry set to zero) is re-based: only differences count.
+    """
+
+    kind = "odometry"
+    events = "odometry"
+
+    def __init__(self, config: WheelsConfig) -> None:
+        """Start with nothing heard."""
+        super().__init__(config)
+        self._mode: str = config.source if config.source in ("twist", "pose") else "auto"
+        self._compared = self._mode == "pose"
+        self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
+
+    def _forget(self) -> None:
+        self._pose: Pose | None = None
+        self._twist: Twist | None = None
+        self._moving: Twist | None = None  # the last piece of the timeline
+
+    def _take(self, event: OdometryEvent) -> None:
+        vx, vy, _ = event.linear.tolist()
+        w = float(event.angular[2])
+        x, y, _ = event.position.tolist()
+        twist = None if math.isnan(vx + vy + w) else (vx, vy, w)
+        pose = None if math.isnan(x + y) else (x, y, quaternion_yaw(event.orientation))
+        piece = None
+        if self._last_ns is not None:
+            piece = self._connect((event.stamp_ns - self._last_ns) * 1e-9, pose, twist)
+        self._extend(event.stamp_ns, piece, self._twist or self._moving)
+        self._pose, self._twist, self._moving = pose, twist, piece or self._moving
+        self._reach(event.stamp_ns, (self._mode == "twist" and twist) or self._moving or twist)
+
+    def _connect(self, seconds: float, pose: Pose | None, twist: Twist | None) -> Twist | None:
+        """The twist between the last message and this one; None if neither twists nor poses tell."""
+        both = self._twist is not None and twist is not None
+        mean = mean_twist(self._twist, twist) if seconds <= self._config.hold_s else None
+        moved = self._between_poses(pose, mean, seconds)
+        if both and mean is not None and moved is not None and not self._compared:
+            self._compare(moved, mean, seconds)
+        if moved is None or mean is None:
+            return moved or mean
+        if self._mode == "pose":
+            return moved
+        if self._mode == "twist":
+            return mean if both else moved
+        return moved if any(moved) else mean
+
+    def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
+        """The constant twist from the last pose to this one; None if one is unknown, or if the pose jumped."""
+        if pose is None or self._pose is None:
+            return None
+        dx, dy, dyaw = se2.log(se2.between(self._pose, pose)).tolist()
+        speed, turn = math.hypot(dx, dy) / seconds, abs(dyaw) / seconds
+        # Judged by what the twist says or, if that is silent, by the motion just before.
+        slack = 1.0
+        reference = mean if mean is not None and any(mean) else None
+        if reference is None:
+            reference, slack = self._moving or (MAX_SPEED, 0.0, MAX_TURN), 1.0 + 10.0 * seconds
+        may = min(slack + 1.5 * math.hypot(reference[0], reference[1]), MAX_SPEED)
+        may_turn = min(3.0 * slack + 1.5 * abs(reference[2]), MAX_TURN)
+        if speed > may or turn > may_turn:
+            self.rejections["wheels.pose_reset"] += 1
+            self.notes["reset"] = (
+                f"the odometry's pose jumped {self.rejections['wheels.pose_reset']} time(s), the last by "
+                f"{math.hypot(dx, dy):.3g} m and {dyaw:.3g} rad: taken as a reset, motion goes on from the new value"
+            )
+            return None
+        return dx / seconds, dy / seconds, dyaw / seconds
+
+    def _compare(self, moved: Twist, mean: Twist, seconds: float) -> None:
+        """Cross-check twist and pose once enough was driven, and settle which is used.
+
+        Raises:
+            ConfigError: the configuration insists on a twist that is in degrees per second.
+        """
+        for k, value in enumerate((math.hypot(*moved[:2]), moved[2], math.hypot(*mean[:2]), mean[2])):
+            self._paths[k] += abs(value) * seconds
+        pose_path, pose_turn, twist_path, twist_turn = self._paths
+        pose_still = pose_path <= _STILL * twist_path and pose_turn <= _STILL * twist_turn
+        twist_still = twist_path <= _STILL * pose_path and twist_turn <= _STILL * pose_turn
+        moved_enough = pose_turn > _CHECK_TURN or pose_path > _CHECK_PATH
+        if not moved_enough and not (pose_still and (twist_turn > _CHECK_TURN or twist_path > _CHECK_PATH)):
+            return
+        self._compared = True
+        insists = self._config.source == "twist"
+        ratio = twist_turn / max(pose_turn, 1e-9)
+        mode = "twist"
+        if pose_still:
+            text = "the odometry's pose does not move: its twist is used"
+        elif twist_still:
+            mode = "pose"
+            text = "the odometry's twist is zero while its pose moves: " + (
+                "set wheels.source to pose" if insists else "pose differences are used"
+            )
+        elif pose_turn > _CHECK_TURN and _DEGREES[0] < ratio < _DEGREES[1]:
+            mode = "pose"
+            text = f"the odometry's yaw rate is {ratio:.1f} times the rotation of its pose: degrees, not radians"
+            if insists:
+                raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
+            text += ": pose differences are used"
+        elif _differ(twist_path, pose_path) or _differ(twist_turn, pose_turn):
+            text = (
+                f"the odometry's twist is used, though it disagrees with its pose: {twist_path:.2f} m and "
+                f"{twist_turn:.2f} rad against {pose_path:.2f} m and {pose_turn:.2f} rad; see wheels.source"
+            )
+        else:
+            text = "the odometry's twist is used; it agrees with its pose"
+        self._mode = "twist" if insists else mode
+        self.notes["source"] = text
+
+
+def _differ(a: float, b: float) -> bool:
+    """Whether two lengths that should be equal differ by more than a third."""
+    return max(a, b) > _CHECK_TURN and not 0.75 * b < a < 1.34 * b

@@ -1,0 +1,151 @@
+"""Wheel motion: what the wheels, or what stands in for them, say about a step."""
+
+from __future__ import annotations
+
+from collections import Counter
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import WheelsConfig
+from fgloc.sensors.encoders import TicksTrack
+from fgloc.sensors.odometry import OdometryTrack
+from fgloc.sensors.timeline import TwistTimeline
+from fgloc.sensors.tracks import CommandTrack, Track
+from fgloc.types import FloatArray, MotionMeasurement, Step
+
+_TRACKS: dict[str, type[Track]] = {
+    "twist": OdometryTrack,
+    "pose": OdometryTrack,
+    "ticks": TicksTrack,
+    "command": CommandTrack,
+}
+
+
+class WheelMotion:
+    """Integrates the wheels' motion over a step, with covariance.
+
+    Between two odometry messages the twist is the mean of theirs; a command holds until the next. A piece whose twist
+    the gate refused is taken from pose differences, else the last twist is held, at most for ``hold_s``. The covariance
+    is made of the configured noise densities alone: robots' own are rarely right. It does not depend on how time is cut
+    into steps. Where nothing was heard for longer than ``hold_s`` the robot is taken to stand still with the spread of
+    its largest speed so far, so that every step has a measurement; such steps are counted as "wheels.silence".
+
+    Sources: with "auto" wheel angles if the geometry is given, else the odometry (see `OdometryTrack`), else commands:
+    the best that has been heard since before the step.
+
+    ``rejections`` counts wheels.silence, wheels.pose_reset (an odometry that jumped) and wheels.encoder_reset.
+    """
+
+    def __init__(self, config: WheelsConfig) -> None:
+        """Set up.
+
+        Raises:
+            ConfigError: wheel angles are asked for without the wheels' geometry.
+        """
+        self._config = config
+        self._chosen = ""
+        self._silent_steps = 0
+        self._delay_ns = int(config.delay_s * 1e9)
+        self._silent_s = 0.0
+        self._segment: int | None = None
+        if config.source == "auto":
+            geometry = (config.left_radius, config.right_radius, config.track)
+            kinds = ["ticks"] if None not in geometry else []
+            kinds += ["twist", "command"]
+        else:
+            kinds = [] if config.source == "none" else [config.source]
+        self._tracks = [_TRACKS[kind](config) for kind in kinds]  # best first
+        self._all = tuple(self._tracks)
+        self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What could not be used so far, by reason."""
+        counts = Counter({"wheels.silence": self._silent_steps} if self._silent_steps else {})
+        for track in self._all:
+            counts.update(track.rejections)
+        return counts
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        notes = [f"wheel motion from {_SAYS[self._chosen]}"] if self._chosen else []
+        for track in self._all:
+            notes += track.notes.values()
+        if self._silent_steps:
+            notes.append(f"no wheel motion was known for {self._silent_s:.1f} s in {self._silent_steps} steps")
+        return tuple(notes)
+
+    def measure(self, step: Step) -> MotionMeasurement | None:
+        """Motion over the step. Measured again, the same step gives the same.
+
+        Returns:
+            None for a step of no length or if the configured source is "none".
+
+        Raises:
+            ConfigError: wheel joints are ambiguous or missing, or the twist chosen by configuration is in degrees.
+        """
+        if step in self._taken:
+            return self._taken[step]
+        self._ingest(step)
+        measured = None
+        if self._tracks and step.dt > 0.0:
+            motion, cov, unknown_s = self._integrate(self._active(step), step.start_ns, step.stamp_ns)
+            if unknown_s > 0.0:
+                self._silent_steps += 1
+                self._silent_s += unknown_s
+            measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov)
+        self._taken[step] = measured
+        return measured
+
+    def carry(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Motion between two times near the step, forwards or backwards.
+
+        Args:
+            step: the newest step.
+            from_ns: up to 30 s before the step's end; earlier, nothing is known.
+            to_ns: likewise.
+
+        Returns:
+            ``T_from_to`` ``(3,)`` and its right-perturbation covariance ``(3, 3)``.
+        """
+        if step not in self._taken:
+            self._ingest(step)
+        timeline = self._active(step) if self._tracks else TwistTimeline()
+        motion, cov, _ = self._integrate(timeline, min(from_ns, to_ns), max(from_ns, to_ns))
+        if from_ns <= to_ns:
+            return motion, cov
+        ad = se2.adjoint(motion)
+        return se2.inverse(motion), np.asarray(ad @ cov @ ad.T)
+
+    def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
+        return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)
+
+    def _ingest(self, step: Step) -> None:
+        if step.segment != self._segment:
+            for track in self._tracks:
+                track.reset()
+            self._segment = step.segment
+        for track in self._tracks:
+            track.ingest(step)
+
+    def _active(self, step: Step) -> TwistTimeline:
+        """The best source that has spoken since before the step, else the best that has spoken at all."""
+        heard = [track for track in self._tracks if track.timeline.start_ns is not None]
+        for track in heard:
+            start = track.timeline.start_ns
+            if start is not None and start <= step.start_ns - self._delay_ns:
+                if track is not self._tracks[-1]:  # worse ones are not needed any more
+                    self._tracks = self._tracks[: self._tracks.index(track) + 1]
+                self._chosen = track.kind
+                return track.timeline
+        return (heard or self._tracks)[0].timeline
+
+
+_SAYS = {
+    "ticks": "wheel angles",
+    "odometry": "the odometry",
+    "command": "commands, which stand in for wheels",
+}
