@@ -41,18 +41,25 @@ def marker_pose_candidates(
     ideal, corners = without_distortion(camera, corners_px)
     if not np.isfinite(corners).all():
         return ()
-    square = _square(size_m)
+    # 1. Solve in a frame whose axes lie along the camera's: OpenCV turns the rotation into a vector and loses it where
+    #    its angle is near 180 degrees, as that of an upright marker in an upright camera is.
+    across = corners[1] - corners[0]
+    quarter_turns = -round(math.atan2(across[1], across[0]) / (0.5 * math.pi))
+    turned = np.roll(corners, -quarter_turns, axis=0)[::-1]  # from the bottom left, counter-clockwise in the image
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
-            square, corners, ideal.K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+            _square(size_m), turned, ideal.K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
     except cv2.error:  # collinear corners
         return ()
+    # 2. Turn back: half a turn about x, then as many quarter turns about z.
+    c, s = round(math.cos(0.5 * math.pi * quarter_turns)), round(math.sin(0.5 * math.pi * quarter_turns))
+    back = np.diag([1.0, -1.0, -1.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     found = []
     for r, t in zip(rotations, translations, strict=True):
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0], np.asarray(t).ravel()
-        points = square @ T[:3, :3].T + T[:3, 3]
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0] @ back, np.asarray(t).ravel()
+        points = _square(size_m) @ T[:3, :3].T + T[:3, 3]
         if np.isfinite(T).all() and points[:, 2].min() > _MIN_DEPTH_M:
             found.append((T, _rms(_project(ideal.K, points) - corners)))
     return tuple(sorted(found, key=lambda f: f[1]))
