@@ -1,0 +1,111 @@
+"""Photographs of markers whose ids others have published: which of them do we miss?"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+
+from benchmarks.common import Row, main, not_run
+from fgloc.config import MarkersConfig
+from fgloc.sensors.markers import MarkerDetector
+from fgloc.types import ImageEvent
+
+_ID = "stills.missed_ids"
+_DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+_TUTORIAL_DICTIONARY = "opencv_aruco/tutorial_dict.yml"
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """One photograph: file (below marker_images), dictionary (a file if it has a suffix), ids with repetitions."""
+
+    file: str
+    dictionary: str
+    ids: tuple[int, ...]
+
+
+# Where the ids come from. OpenCV: modules/objdetect/test/test_arucodetection.cpp, tests CV_ArucoTutorial. Ubiquity
+# Robotics' fiducials: file names and prints ("403 D7": dictionary 7 is DICT_5X5_1000), aruco_detect/test and, for the
+# bag, fiducial_slam/test/create_map_aruco.xml. dt_apriltags publishes no ids: these were read with the AprilTag
+# project's own detector (pupil-apriltags 1.0.4, not decimated; all with hamming distance 0); the tags at the rim of
+# test_image.png, dark or cut, it does not read.
+STILLS = (
+    Still("opencv_aruco/singlemarkersoriginal.jpg", "DICT_6X6_250", (23, 40, 62, 98, 124, 203)),
+    Still("opencv_aruco/singlemarkerssource.jpg", "DICT_6X6_250", (23, 40, 62, 98, 124, 203)),
+    Still("opencv_aruco/choriginal.jpg", "DICT_6X6_250", tuple(range(17))),
+    Still("opencv_aruco/chocclusion_original.jpg", "DICT_6X6_250", (*range(11), 12, 15)),
+    Still("opencv_aruco/gboriginal.jpg", _TUTORIAL_DICTIONARY, tuple(range(35))),
+    Still("opencv_aruco/diamondmarkers.jpg", _TUTORIAL_DICTIONARY, (2, 3, 4, 10, 10, 10, 11, 11, 11, 12, 12, 12)),
+    Still("ubiquity/403.jpg", "DICT_5X5_1000", (403,)),
+    Still("ubiquity/tag_01_d7_14cm.png", "DICT_5X5_1000", (1,)),
+    Still("ubiquity/aruco_images.bag", "DICT_5X5_1000", (100, 103, 106, 107, 110, 111, 112)),
+    Still("dt_apriltags/test_image.png", "DICT_APRILTAG_36h11", (60, 82, 318, 328, 387)),
+    Still("dt_apriltags/test_image_multiple_01.png", "DICT_APRILTAG_36h11", (22, 24, 58, 85, 144, 198)),
+    Still("dt_apriltags/test_image_rotation_-30.png", "DICT_APRILTAG_36h11", (76,)),
+    Still("dt_apriltags/test_image_rotation_0.png", "DICT_APRILTAG_36h11", (76,)),
+    Still("dt_apriltags/test_image_rotation_30.png", "DICT_APRILTAG_36h11", (76,)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of one photograph."""
+
+    still: Still
+    missed: tuple[int, ...]
+    false: tuple[int, ...]  # found, but not listed
+
+
+def outcomes(folder: Path) -> Iterator[Outcome]:
+    """Detect in each photograph below the folder marker_images."""
+    for still in STILLS:
+        own_file = Path(still.dictionary).suffix != ""
+        detector = MarkerDetector(str(folder / still.dictionary) if own_file else still.dictionary, MarkersConfig())
+        found = Counter(s.marker_id for s in detector.detect(_image(folder / still.file)).sightings)
+        listed = Counter(still.ids)
+        yield Outcome(still, tuple((listed - found).elements()), tuple((found - listed).elements()))
+
+
+def missed_ids(folder: Path | None = None) -> list[tuple[str, int]]:
+    """File and id of every listed marker that is not found. The folder defaults to the real data's marker_images."""
+    return [(o.still.file, i) for o in outcomes(folder or _folder()) for i in o.missed]
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """The row, after the table of photographs."""
+    folder = _folder()
+    if not folder.is_dir():
+        yield from not_run([_ID], f"{folder} is absent; set FGLOC_REAL_DATA")
+        return
+    missed = 0
+    for outcome in outcomes(folder):
+        missed += len(outcome.missed)
+        said = f"{len(outcome.still.ids):3d} listed, missed {list(outcome.missed)}, not listed {list(outcome.false)}"
+        print(f"{outcome.still.file:45s} {said}")
+    yield Row(_ID, float(missed), n=sum(len(s.ids) for s in STILLS), unit="ids")
+
+
+def _folder() -> Path:
+    return Path(os.environ.get("FGLOC_REAL_DATA", _DEFAULT_DATA)) / "marker_images"
+
+
+def _image(path: Path) -> ImageEvent:
+    """The photograph as the message of a camera."""
+    data, encoding = path.read_bytes(), path.suffix[1:]
+    if path.suffix == ".bag":
+        with AnyReader([path]) as bag:
+            wanted = [c for c in bag.connections if c.msgtype == "sensor_msgs/msg/CompressedImage"]
+            connection, _, raw = next(bag.messages(wanted))
+            message = bag.deserialize(raw, connection.msgtype)
+        data, encoding = message.data.tobytes(), message.format
+    return ImageEvent(1, 1, path.name, "", encoding, True, 0, 0, 0, False, np.frombuffer(data, dtype=np.uint8))
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")
