@@ -22,20 +22,19 @@ _FIT_WINDOW_S = 2.0
 
 
 def fit_kinematics(runs: list[Run]) -> Kinematics:
-    """Scale and delay that make the commands fit the true motion over two seconds best, in the least-squares sense.
+    """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
     Over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
     """
 
     def residuals(parameters: FloatArray) -> FloatArray:
-        scale_v, scale_omega, delay = parameters
+        scale_v, scale_omega, yaw_per_m, delay = parameters
         parts = []
         for run, k, actual in windows:
             told = run.track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
-            parts += [
-                (scale_v * told[:, 0] - actual[:, 0]) / v_unit,
-                (scale_omega * told[:, 1] - actual[:, 1]) / omega_unit,
-            ]
+            v = scale_v * told[:, 0]
+            omega = scale_omega * told[:, 1] + yaw_per_m * v
+            parts += [(v - actual[:, 0]) / v_unit, (omega - actual[:, 1]) / omega_unit]
         return np.concatenate(parts)
 
     steps = round(_FIT_WINDOW_S / runs[0].dt_s)
@@ -46,8 +45,10 @@ def fit_kinematics(runs: list[Run]) -> Kinematics:
         change = np.column_stack([travelled[k + steps] - travelled[k], run.poses[k + steps, 2] - run.poses[k, 2]])
         windows.append((run, k, change / (steps * run.dt_s)))
     v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, actual in windows]).std(axis=0))
-    fit = least_squares(residuals, [1.0, 1.0, 0.2], bounds=([0.3, 0.3, 0.0], [2.0, 2.0, 1.0]), diff_step=1e-2)
-    return Kinematics(scale_v=float(fit.x[0]), scale_omega=float(fit.x[1]), delay_s=float(fit.x[2]))
+    bounds = ([0.3, 0.3, -1.0, 0.0], [2.0, 2.0, 1.0, 1.0])
+    fit = least_squares(residuals, [1.0, 1.0, 0.0, 0.2], bounds=bounds, diff_step=1e-2, x_scale=[1.0, 1.0, 0.1, 0.2])
+    scale_v, scale_omega, yaw_per_m, delay_s = (float(value) for value in fit.x)
+    return Kinematics(scale_v=scale_v, scale_omega=scale_omega, yaw_per_m=yaw_per_m, delay_s=delay_s)
 
 
 def fit_noise(rollouts: list[Rollout], config: CalibrationConfig) -> NoiseDensity:

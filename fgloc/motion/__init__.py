@@ -1,9 +1,9 @@
 """Learned motion, inference only: numpy and safetensors, no torch."""
 
 from fgloc.motion.card import ModelCard
+from fgloc.motion.forms import DisplacementModel, MotionModel, MotionPrediction, VelocityModel
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.load import load_model, save_model
-from fgloc.motion.forms import DisplacementModel, MotionModel, MotionPrediction, VelocityModel
 from fgloc.motion.source import LearnedMotion
 
 __all__ = [

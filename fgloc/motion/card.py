@@ -24,10 +24,14 @@ def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class Kinematics(Section):
-    """Calibrated kinematics: the robot does what it was told, scaled and later. Fitted on the training recordings."""
+    """Calibrated kinematics: the robot does what it was told, scaled, later, and drawn to one side by unequal wheels.
+
+    The names are those of `fgloc.config.WheelsConfig`; the values were fitted on the training recordings.
+    """
 
     scale_v: Positive = 1.0
     scale_omega: Positive = 1.0
+    yaw_per_m: FiniteFloat = 0.0
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)] = 0.0
 
 

@@ -168,11 +168,11 @@ class DisplacementModel:
 
 
 def calibrated(kinematics: Kinematics, track: CommandTrack, limits: FloatArray) -> FloatArray:
-    """Mean body twists ``(n, 3)`` between limits [s] if the robot did as told, scaled and delayed."""
+    """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
     told = track.means(limits - kinematics.delay_s)
     twists = np.zeros((len(told), 3))
     twists[:, 0] = kinematics.scale_v * told[:, 0]
-    twists[:, 2] = kinematics.scale_omega * told[:, 1]
+    twists[:, 2] = kinematics.scale_omega * told[:, 1] + kinematics.yaw_per_m * twists[:, 0]
     return twists
 
 

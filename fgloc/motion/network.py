@@ -30,22 +30,24 @@ class Network:
         self._weights = [np.ascontiguousarray(w.T) for w, _ in layers]
         self._biases = [b for _, b in layers]
         first = layers[0][0] / std
-        self._weights[0] = np.ascontiguousarray(first.T, dtype=np.float32)
-        self._biases[0] = (layers[0][1] - first @ mean).astype(np.float32)
+        with np.errstate(over="ignore"):
+            self._weights[0] = np.ascontiguousarray(first.T, dtype=np.float32)
+            self._biases[0] = (layers[0][1] - first @ mean).astype(np.float32)
         self._buffers: dict[int, list[Float32Array]] = {}
 
     def __call__(self, x: Float32Array) -> Float32Array:
-        """Outputs ``(rows, out)`` of inputs ``(rows, in)``. The result is overwritten by the next call."""
+        """Outputs ``(rows, out)`` of inputs ``(rows, in)``, perhaps not finite. The next call overwrites the result."""
         rows = len(x)
         buffers = self._buffers.get(rows)
         if buffers is None:
             buffers = [np.empty((rows, w.shape[1]), dtype=np.float32) for w in self._weights]
             self._buffers[rows] = buffers
         last = len(buffers) - 1
-        for i, (w, b, y) in enumerate(zip(self._weights, self._biases, buffers, strict=True)):
-            np.matmul(x, w, out=y)
-            np.add(y, b, out=y)
-            if i < last:
-                np.maximum(y, 0.0, out=y)
-            x = y
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, (w, b, y) in enumerate(zip(self._weights, self._biases, buffers, strict=True)):
+                np.matmul(x, w, out=y)
+                np.add(y, b, out=y)
+                if i < last:
+                    np.maximum(y, 0.0, out=y)
+                x = y
         return x

@@ -1,0 +1,229 @@
+"""Inference of learned motion: forms of model, composition, what the source of measurements carries and rejects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motion_models import make_card, make_tensors
+
+from fgloc import se2
+from fgloc.config import MotionConfig, NoiseDensity
+from fgloc.errors import ModelError
+from fgloc.motion import DisplacementModel, LearnedMotion, MotionModel, VelocityModel, load_model, save_model
+from fgloc.motion.commands import CommandTrack
+from fgloc.motion.forms import noise_density
+from fgloc.types import CommandEvent, Step
+
+SECOND = 1_000_000_000
+T0 = 1_700_000_000 * SECOND
+
+
+def commands(rng: np.random.Generator, seconds: float = 6.0) -> tuple[CommandEvent, ...]:
+    """Commands at irregular times, 20 ms apart on average, that change every half second."""
+    stamps = T0 + np.cumsum(rng.integers(5_000_000, 35_000_000, int(seconds / 0.02)))
+    levels = rng.uniform([-0.1, -0.5], [0.3, 0.5], (int(seconds * 2) + 3, 2))
+    return tuple(CommandEvent(int(t), int(t), "/cmd_vel", *map(float, levels[int((t - T0) * 2e-9)])) for t in stamps)
+
+
+def model_of(kind: str, rng: np.random.Generator, tmp_path: Path, **changes: object) -> MotionModel:
+    card = make_card(kind, **changes)
+    save_model(tmp_path / "model.safetensors", make_tensors(card, rng), card)
+    return load_model(tmp_path / "model.safetensors")
+
+
+def known(events: tuple[CommandEvent, ...], end_ns: int) -> tuple[CommandEvent, ...]:
+    return tuple(e for e in events if e.stamp_ns <= end_ns)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_file_round_trip(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    model = model_of(kind, rng, tmp_path)
+    assert isinstance(model, VelocityModel if kind == "velocity" else DisplacementModel)
+    assert model.card == make_card(kind)
+    assert model.joint is not None
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_command_track_averages_a_zero_order_hold() -> None:
+    events = tuple(
+        CommandEvent(T0 + round(t * SECOND), 0, "c", v, 2 * v)
+        for t, v in ((1.0, 1.0), (2.0, 3.0), (2.5, 0.0), (4.0, 5.0))
+    )
+    track = CommandTrack(events, T0)
+    means = track.means(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 9.0]))
+    np.testing.assert_allclose(means[:, 0], [0.0, 1.0, 1.5, 0.0, 5.0], atol=1e-12)
+    np.testing.assert_allclose(means[:, 1], 2 * means[:, 0], atol=1e-12)
+    np.testing.assert_allclose(track.means(np.array([3.0, 1.0]))[0], [1.25, 2.5], atol=1e-12)  # backwards alike
+
+
+def test_displacement_without_residual_is_the_calibrated_kinematics(rng: np.random.Generator, tmp_path: Path) -> None:
+    card = make_card("displacement", kinematics=dict(scale_v=0.9, scale_omega=1.1, yaw_per_m=0.5, delay_s=0.1))
+    save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
+    event = CommandEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
+    prediction = load_model(tmp_path / "m.safetensors").predict((event,), T0 + SECOND, T0 + 2 * SECOND, None)
+    assert prediction is not None
+    twist = np.array([0.45, 0.0, 0.88 + 0.5 * 0.45])
+    np.testing.assert_allclose(prediction.motion, se2.exp(twist), atol=1e-9)
+    np.testing.assert_allclose(prediction.velocity, twist[[0, 2]], atol=1e-9)
+
+
+def test_velocity_without_network_keeps_its_velocity(rng: np.random.Generator, tmp_path: Path) -> None:
+    card = make_card("velocity")
+    save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
+    model = load_model(tmp_path / "m.safetensors")
+    event = CommandEvent(T0, T0, "/cmd_vel", 9.0, 9.0)
+    prediction = model.predict((event,), T0, T0 + SECOND, np.array([0.5, 0.8]))
+    assert prediction is not None
+    np.testing.assert_allclose(prediction.motion, se2.exp((0.5, 0.0, 0.8)), atol=1e-12)
+    np.testing.assert_allclose(prediction.velocity, [0.5, 0.8])
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_steps_of_whole_sub_steps_compose_exactly(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of(kind, rng, tmp_path), commands(rng)
+    start, velocity = T0 + 3 * SECOND, np.array([0.1, 0.2])
+    whole = model.predict(events, start, start + SECOND, velocity)
+    half = model.predict(events, start, start + SECOND // 2, velocity)
+    assert whole is not None
+    assert half is not None
+    carried = half.velocity if kind == "velocity" else None
+    rest = model.predict(events, start + SECOND // 2, start + SECOND, carried)
+    assert rest is not None
+    np.testing.assert_allclose(se2.compose(half.motion, rest.motion), whole.motion, atol=1e-6)
+    np.testing.assert_allclose(se2.compose_cov(half.cov, rest.motion, rest.cov), whole.cov, rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_any_cadence_gives_the_same_motion_and_covariance(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of(kind, rng, tmp_path), commands(rng)
+    start = T0 + 3 * SECOND
+
+    def over(lengths_s: list[float]) -> tuple[np.ndarray, np.ndarray]:
+        motion, cov, at, velocity = np.zeros(3), np.zeros((3, 3)), start, np.array([0.1, 0.2])
+        for length in lengths_s:
+            part = model.predict(events, at, at + round(length * SECOND), velocity)
+            assert part is not None
+            motion, cov = se2.compose(motion, part.motion), se2.compose_cov(cov, part.motion, part.cov)
+            at, velocity = at + round(length * SECOND), part.velocity
+        return motion, cov
+
+    motion, cov = over([1.0, 1.0])
+    for lengths in ([0.05] * 40, [0.2] * 10, [0.13, 0.37, 0.5, 0.07, 0.93]):
+        other_motion, other_cov = over(lengths)
+        np.testing.assert_allclose(other_motion, motion, atol=0.004)
+        np.testing.assert_allclose(np.diag(other_cov), np.diag(cov), rtol=0.15)
+        assert np.linalg.eigvalsh(other_cov).min() > 0
+
+
+def test_velocity_model_starts_from_the_history(rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of("velocity", rng, tmp_path), commands(rng)
+    start = T0 + 3 * SECOND
+    warm = model.predict(events, start - 2 * SECOND, start, np.zeros(2))
+    assert warm is not None
+    told = model.predict(events, start, start + SECOND // 5, warm.velocity)
+    untold = model.predict(events, start, start + SECOND // 5, None)
+    assert told is not None
+    assert untold is not None
+    np.testing.assert_allclose(untold.motion, told.motion, atol=1e-7)
+
+
+def test_known_velocity_matters_at_first_and_fades(rng: np.random.Generator, tmp_path: Path) -> None:
+    reads = model_of("displacement", rng, tmp_path, inputs=("commands", "velocity"), velocity_decay_s=0.1)
+    events, start, velocity = commands(rng), T0 + 3 * SECOND, np.array([0.5, 0.5])
+    differences = []
+    for length in (SECOND // 10, SECOND):
+        untold = reads.predict(events, start, start + length, None)
+        told = reads.predict(events, start, start + length, velocity)
+        assert untold is not None
+        assert told is not None
+        differences.append(np.abs(told.velocity - untold.velocity).max())
+    assert differences[0] > 100 * differences[1]
+    deaf = model_of("displacement", rng, tmp_path)
+    a, b = (deaf.predict(events, start, start + SECOND, v) for v in (None, velocity))
+    assert a is not None
+    assert b is not None
+    np.testing.assert_array_equal(a.motion, b.motion)
+
+
+def test_noise_density_adds_up() -> None:
+    noise = NoiseDensity(
+        x_per_sqrt_m=1.0, y_per_sqrt_m=2.0, yaw_per_sqrt_m=3.0, xy_per_sqrt_rad=4.0, yaw_per_sqrt_rad=5.0,
+        xy_per_sqrt_s=6.0, yaw_per_sqrt_s=7.0,
+    )  # fmt: skip
+    np.testing.assert_allclose(noise_density(noise, -0.5, -0.1), [38.1, 39.6, 56.0])
+
+
+def test_prediction_needs_a_command_and_a_length(rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of("displacement", rng, tmp_path), commands(rng)
+    with pytest.raises(ModelError, match="no command"):
+        model.predict((), T0, T0 + SECOND, None)
+    with pytest.raises(ModelError, match="not after its start"):
+        model.predict(events, T0, T0, None)
+
+
+def step(events: tuple[CommandEvent, ...], index: int, segment: int = 0, length: int = SECOND // 5) -> Step:
+    start = T0 + 3 * SECOND + index * length
+    return Step(index, segment, start, start + length, commands=events)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of(kind, rng, tmp_path, history_s=0.1), commands(rng)
+    source = LearnedMotion(model, MotionConfig())
+    first, second = (source.measure(step(events, i), None) for i in (0, 1))
+    assert first is not None
+    assert second is not None
+    assert (first.source, first.start_ns, second.stamp_ns) == (
+        "learned",
+        step(events, 0).start_ns,
+        step(events, 1).stamp_ns,
+    )
+    whole = model.predict(events, first.start_ns, second.stamp_ns, None)
+    assert whole is not None
+    np.testing.assert_allclose(se2.compose(first.motion, second.motion), whole.motion, atol=1e-6)
+    again = LearnedMotion(model, MotionConfig())
+    again.measure(step(events, 0), None)
+    fresh = again.measure(step(events, 1, segment=1), None)  # a new segment: nothing carried
+    lone = model.predict(events, second.start_ns, second.stamp_ns, None)
+    assert fresh is not None
+    assert lone is not None
+    np.testing.assert_array_equal(fresh.motion, lone.motion)
+    if kind == "velocity":
+        assert np.abs(fresh.motion - second.motion).max() > 1e-6
+
+
+def test_source_says_why_it_is_silent(rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of("displacement", rng, tmp_path), commands(rng)
+    source = LearnedMotion(model, MotionConfig())
+    assert source.measure(step((), 0), None) is None
+    assert source.measure(step(known(events, T0 + 2 * SECOND), 0), None) is not None  # 1.2 s old: still believed
+    assert source.measure(step(known(events, T0 + SECOND), 0), None) is None
+    future = tuple(replace(e, stamp_ns=e.stamp_ns + 60 * SECOND) for e in events)
+    assert source.measure(step(future, 0), None) is None
+    assert source.rejections == {"learned.no_commands": 2, "learned.stale_commands": 1}
+    off = LearnedMotion(model, MotionConfig(use=False))
+    assert off.measure(step(events, 0), None) is None
+    assert not off.rejections
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_fault_33_network_returns_nan(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    card = make_card(kind)
+    tensors = make_tensors(card, rng)
+    for name in tensors:
+        tensors[name] = np.full_like(tensors[name], 3e38)  # finite, but their products are not
+    save_model(tmp_path / "m.safetensors", tensors, card)
+    model, events = load_model(tmp_path / "m.safetensors"), commands(rng)
+    assert model.predict(events, T0 + SECOND, T0 + 2 * SECOND, None) is None
+    source = LearnedMotion(model, MotionConfig())
+    assert source.measure(step(events, 0), None) is None
+    assert source.measure(step(events, 1), None) is None
+    assert source.rejections == {"learned.non_finite": 2}
