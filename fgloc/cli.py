@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
 
-SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run"
+SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run" / "bag"
 
 
 class _Commands(TyperGroup):
@@ -101,11 +101,11 @@ def demo(
     lost = False
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
-        text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[2])} --out {folder}"
+        text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
         result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
         runs.append((mode, metrics))
         lost = lost or Mode.LOST in result.modes
-    typer.echo(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.name}, {runs[0][1].keyframes} keyframes\n")
+    typer.echo(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
     typer.echo(_columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
     typer.echo("")
     for mode, _ in runs:
@@ -119,7 +119,7 @@ def info(bag: Bag, config: ConfigOption = None) -> None:
     """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong."""
     from fgloc.recording.info import format_info, inspect
 
-    typer.echo(format_info(inspect(bag, _config(bag, config, None).recording)))
+    typer.echo(format_info(inspect(bag, _config(bag, config, None))))
 
 
 @app.command()

@@ -24,6 +24,7 @@ FloatArray = NDArray[np.float64]
 
 _BLUE, _ORANGE, _GREEN, _RED, _SKY, _GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#555555"
 _MODE_LOOKS = {Mode.DEAD_RECKONING: (_ORANGE, "dead reckoning", "//"), Mode.LOST: (_RED, "lost", "xx")}
+_WIDTH = 9.0  # inches
 _MAX_ELLIPSES = 60
 _MAX_REASONS = 10
 _GAP_S = 1.0  # a line is not drawn across a longer silence
@@ -47,9 +48,11 @@ def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
         parts.append(np.array([lm.position[:2] for lm in result.landmarks.landmarks.values()]))
     low, high = np.min([p.min(axis=0) for p in parts], axis=0), np.max([p.max(axis=0) for p in parts], axis=0)
     extent = float(max(*(high - low), 0.5))
-    low, high = low - 0.06 * extent, high + 0.06 * extent
-    ratio = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.45, 1.3))
-    figure = Figure(figsize=(9.0, 9.0 * ratio + 0.9), dpi=110, layout="constrained")
+    center, half = 0.5 * (low + high), 0.5 * (high - low) + 0.06 * extent
+    ratio = float(np.clip(half[1] / half[0], 0.45, 1.0))
+    half = np.maximum(half, [half[1] / ratio, half[0] * ratio])
+    low, high = center - half, center + half
+    figure = Figure(figsize=(_WIDTH, (_WIDTH - 0.55) * ratio + 0.85), dpi=110, layout="constrained")  # room for labels
     axes = figure.add_subplot()
     handles: list[Artist] = [Line2D([], [], color=_BLUE, lw=1.8, label="estimate")]
     if matched is not None:
@@ -65,7 +68,7 @@ def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
             axes.add_collection(LineCollection(_mode_segments(result, mode), colors=color, linewidths=2.4, zorder=3))
             handles.append(Line2D([], [], color=color, lw=2.4, label=label))
     for index, shape, label in ((0, "o", "start"), (-1, "s", "end")):
-        look: dict[str, Any] = dict(marker=shape, markersize=8, color=_GREEN, markeredgecolor="white", linestyle="none")
+        look: dict[str, Any] = dict(marker=shape, markersize=7, color=_GREEN, markeredgecolor="white", linestyle="none")
         axes.plot(*estimate.poses[index, :2], zorder=5, **look)
         handles.append(Line2D([], [], label=label, **look))
     if result.landmarks is not None and len(result.landmarks):
@@ -80,7 +83,7 @@ def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
 def plot_error(result: RunResult, matched: Matched | None) -> Figure:
     """Error in x, y and yaw against its ±3σ band over time; without a truth the band alone."""
     trajectory = result.trajectory
-    figure = Figure(figsize=(9.0, 5.6), dpi=110, layout="constrained")
+    figure = Figure(figsize=(_WIDTH, 5.6), dpi=110, layout="constrained")
     rows: Sequence[Axes] = figure.subplots(3, 1, sharex=True)
     labels = ("x [m]", "y [m]", "yaw [°]")
     for axis, axes in enumerate(rows):
@@ -126,7 +129,7 @@ def plot_timeline(result: RunResult) -> Figure:
     ]
     groups = [group for group in groups if group[2]]
     count = sum(len(rows) for _, _, rows in groups)
-    figure = Figure(figsize=(9.0, 0.9 + 0.3 * (count + len(groups))), dpi=110, layout="constrained")
+    figure = Figure(figsize=(_WIDTH, 0.9 + 0.3 * (count + len(groups))), dpi=110, layout="constrained")
     heights = [len(rows) + 0.6 for _, _, rows in groups]
     panels: list[Axes] = figure.subplots(len(groups), 1, sharex=True, squeeze=False, height_ratios=heights)[
         :, 0
@@ -202,7 +205,7 @@ def _draw_activity(axes: Axes, rows: Mapping[str, FloatArray], color: str, bridg
     everything = np.concatenate(list(rows.values()))
     span = max(float(np.ptp(everything)), 1.0)
     for row, times in enumerate(rows.values()):
-        axes.broken_barh(_bars(np.sort(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
+        axes.broken_barh(_bars(np.unique(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
     axes.set_yticks(range(len(rows)), [f"{name} ({len(times)})" for name, times in rows.items()], **_TEXT)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.spines[["top", "right", "left"]].set_visible(False)

@@ -105,7 +105,7 @@ def render(
     provenance: Mapping[str, Any],
 ) -> str:
     """The report as one HTML page that needs no other file and no network."""
-    name = escape("recording" if result.source is None else result.source.name)
+    name = escape("recording" if result.source is None else "/".join(result.source.parts[-2:]))
     body = [
         f"<h1>{name}</h1>",
         f'<p class="sub"><code>{escape(str(provenance["command"]))}</code></p>',
