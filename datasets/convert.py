@@ -67,14 +67,6 @@ def write_robot(path: Path, settings: Mapping[str, Any], note: str) -> Path:
     return path
 
 
-def write_points(path: Path, points: Mapping[int, tuple[float, float]], note: str) -> Path:
-    """Write a ``map.yaml`` of points: id and x, y [m]."""
-    header = "".join(f"# {line}\n" for line in note.splitlines())
-    lines = [f"  - {{id: {i}, position: [{x:.6g}, {y:.6g}]}}\n" for i, (x, y) in sorted(points.items())]
-    write_text(path, header + "landmarks:\n" + "".join(lines))
-    return path
-
-
 def read_table(path: Path, columns: int, *, delimiter: str | None = None, header_rows: int = 0) -> FloatArray:
     """Numbers of a text table, ``(n, columns)``; text after ``#`` is a comment.
 

@@ -8,7 +8,7 @@ carries are left out, and counted.
 
 What ``robot.yaml`` corrects for was measured against the truth:
 
-- There is no encoder. The integrated command stands in for wheel odometry, with a delay and gains.
+- There is no encoder: the integrated command stands in for it, with a delay and gains.
 - The reported "range" is the distance along the camera's axis: the cosine of the bearing is missing.
 - Sightings are stamped about 0.04 s late.
 
@@ -38,13 +38,13 @@ from datasets.convert import (
     new_bag,
     read_table,
     write_merged,
-    write_points,
     write_robot,
 )
 from datasets.download import Remote, fetch, unpack
 from fgloc.errors import RecordingError
 from fgloc.frames import yaw_quaternion
-from fgloc.types import FloatArray, IntArray
+from fgloc.sensors.maps import write_map
+from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
 ROBOTS = (1, 2, 3, 4, 5)
 _LANDMARKS = range(6, 21)  # subjects; 1 to 5 are the robots
@@ -133,9 +133,9 @@ def read(source: Path, robot: int) -> Run:
     """
     if robot not in ROBOTS:
         raise RecordingError(f"robot {robot}: expected one of {ROBOTS}")
-    commands = _in_order(read_table(source / f"Robot{robot}_Odometry.dat", 3))
-    sightings = _in_order(read_table(source / f"Robot{robot}_Measurement.dat", 4))
-    truth = _in_order(read_table(source / f"Robot{robot}_Groundtruth.dat", 4))
+    commands = _rows_in_time(source / f"Robot{robot}_Odometry.dat", 3)
+    sightings = _rows_in_time(source / f"Robot{robot}_Measurement.dat", 4)
+    truth = _rows_in_time(source / f"Robot{robot}_Groundtruth.dat", 4)
     subject_of = {int(barcode): int(subject) for subject, barcode in read_table(source / "Barcodes.dat", 2)}
     landmarks = {int(row[0]): (row[1], row[2]) for row in read_table(source / "Landmark_Groundtruth.dat", 5)}
     subjects = np.array([subject_of.get(int(barcode), 0) for barcode in sightings[:, 1]], dtype=np.int64)
@@ -220,9 +220,14 @@ def _write(run: Run, robot: int, out: Path, storage: str) -> None:
         groups = list(frames(run))
         total = len(run.commands_ns) + len(groups) + len(run.truth_ns)
         write_merged(_commands(bag, run), _sightings(bag, run, groups), _truth(bag, run), total=total)
-    write_points(out / "map.yaml", {i: run.landmarks[i] for i in _LANDMARKS if i in run.landmarks}, "MRCLAM landmarks")
+    write_map(_map(run), out / "map.yaml")
     note = f"MRCLAM robot {robot}. Constants fitted on the other four robots of dataset 6 (datasets/mrclam.py)."
     write_robot(out / "robot.yaml", robot_settings(calibration(robot)), note)
+
+
+def _map(run: Run) -> LandmarkMap:
+    points = {i: np.array([*run.landmarks[i], 0.0]) for i in _LANDMARKS if i in run.landmarks}
+    return LandmarkMap({i: Landmark(i, point, np.eye(3), size_m=0.0) for i, point in points.items()})
 
 
 def _commands(bag: BagWriter, run: Run) -> Iterator[Message]:
@@ -242,10 +247,11 @@ def _truth(bag: BagWriter, run: Run) -> Iterator[Message]:
         yield stamp, partial(bag.truth, "/truth", stamp, (x, y, 0.0), yaw_quaternion(yaw).tolist())
 
 
-def _in_order(table: FloatArray) -> FloatArray:
-    """Rows by time. A few stamps of the odometry files come twice; both rows stay."""
+def _rows_in_time(path: Path, columns: int) -> FloatArray:
+    """Rows of a file by time. A few stamps of the odometry files come twice; both rows stay."""
+    table = read_table(path, columns)
     if not np.isfinite(table[:, 0]).all():
-        raise RecordingError("a stamp is not a number; download the set again")
+        raise RecordingError(f"{path}: a stamp is not a number; download the set again")
     return np.asarray(table[np.argsort(table[:, 0], kind="stable")])
 
 

@@ -49,7 +49,7 @@ def left_out(runs: Mapping[int, Run]) -> dict[int, Calibration]:
 def fit_sensor(run: Run) -> FloatArray:
     """Range scale, camera x [m], bearing bias [rad] and latency [s] of one robot's sightings ``(4,)``."""
     start = np.array([1.0, 0.0, 0.0, 0.04])
-    used = _usable(_all_errors(run, start))
+    used = _usable(run, start)
 
     def residuals(q: FloatArray) -> FloatArray:
         e = _all_errors(run, q)[used]
@@ -66,16 +66,14 @@ def sighting_errors(run: Run, sensor: FloatArray) -> FloatArray:
         run: a robot's run.
         sensor: range scale, camera x, bearing bias, latency.
     """
-    errors = _all_errors(run, sensor)
-    return np.asarray(errors[_usable(errors)])
+    return np.asarray(_all_errors(run, sensor)[_usable(run, sensor)])
 
 
 def _all_errors(run: Run, sensor: FloatArray) -> FloatArray:
-    """As `sighting_errors`, of every sighting; NaN where the truth is not known."""
+    """As `sighting_errors`, of every sighting, across gaps of the truth too."""
     scale, camera_x, bias, latency = sensor
     at = run.sightings_ns - int(latency * 1e9)
     pose = se2.interpolate(run.truth_ns, run.truth, at)
-    pose[~_has_truth(run.truth_ns, at)] = np.nan
     landmark = np.array([run.landmarks[int(i)] for i in run.subjects])
     d = landmark - pose[:, :2]
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
@@ -85,8 +83,10 @@ def _all_errors(run: Run, sensor: FloatArray) -> FloatArray:
     return np.column_stack([range_error, se2.wrap_array(bearing - np.arctan2(y, x)), np.hypot(x, y)])
 
 
-def _usable(errors: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray((abs(errors[:, 0]) < _GROSS_RANGE_M) & (abs(errors[:, 1]) < _GROSS_BEARING_RAD))
+def _usable(run: Run, sensor: FloatArray) -> NDArray[np.bool_]:
+    errors = _all_errors(run, sensor)
+    small = (abs(errors[:, 0]) < _GROSS_RANGE_M) & (abs(errors[:, 1]) < _GROSS_BEARING_RAD)
+    return np.asarray(small & _has_truth(run.truth_ns, run.sightings_ns - int(sensor[3] * 1e9)))
 
 
 def _row(

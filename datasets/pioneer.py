@@ -9,8 +9,8 @@ writes ``bag/`` and ``robot.yaml``; where the markers are is not known, so there
   1 ms, but for one message of duarte's that came 0.15 s late.
 - Motion capture comes without stamps, in bursts of about 12 poses every 0.1 s. They were measured 1/120 s apart: the
   way from one to the next, over the odometry's speed, is 8.4 ms within a burst, and between bursts too when none is
-  lost. So a burst is dated back from its last pose, which cuts the disagreement with odometry over 1 s from 14.7 to 10.6 mm
-  (duarte) and from 15.2 to 13.2 mm (pinto1). Receive times in the bag stay as recorded.
+  lost. So a burst is dated back from its last pose, which cuts the disagreement with odometry over 1 s from 14.7 to
+  10.6 mm (duarte) and from 15.2 to 13.2 mm (pinto1). Receive times in the bag stay as recorded.
 - Marker positions are in the camera's optical frame, although their header says base_link.
 
 In ``robot.yaml``, the camera's mounting, the scale of its ranges (in pinto1 the markers' size was configured 24 % too

@@ -2,9 +2,9 @@
 
     python -m datasets.turtlebot3 rosbag2_2025_11_25-15_11_34 --out DIR
 
-copies every message whose type is known, byte for byte, into ``bag/`` (``/camera/landmarks`` becomes ``/landmarks``), and
-writes ``robot.yaml``; with a list of landmarks, ``map.yaml`` too. Messages of packages without a definition are counted
-and left out.
+copies every message whose type is known, byte for byte, into ``bag/`` (``/camera/landmarks`` becomes ``/landmarks``),
+and writes ``robot.yaml``; with a list of landmarks, ``map.yaml`` too. Messages of packages without a definition are
+counted and left out.
 
 What was measured on ``...15_11_34`` with its map, and is in ``robot.yaml``:
 
