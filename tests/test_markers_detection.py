@@ -37,9 +37,8 @@ def test_corners_are_where_the_landmark_projects(dictionary: str, distance: floa
         found = detector(dictionary).detect(image_event(render(CAMERA, pose, [marker], dictionary, rng)))
         assert [s.marker_id for s in found.sightings] == [marker.landmark_id]
         errors.append(found.sightings[0].corners_px - project(CAMERA, pose, marker.corners()))
-    errors = np.array(errors)
-    assert np.abs(errors).max() < 0.6
-    assert np.sqrt((errors**2).mean()) < 0.25
+    assert np.abs(errors).max() < 0.25
+    assert np.sqrt((np.array(errors) ** 2).mean()) < 0.08
 
 
 def test_apriltags_are_upright_as_the_apriltag_project_prints_them() -> None:

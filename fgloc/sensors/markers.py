@@ -12,6 +12,7 @@ from cv2.typing import MatLike
 
 from fgloc.config import MarkersConfig
 from fgloc.sensors.dictionaries import load_dictionary, suggest, turned_by_180
+from fgloc.sensors.edges import refine_corners
 from fgloc.sensors.images import GrayImage, ImageError, decode
 from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent, MarkerCorners
 
@@ -44,6 +45,7 @@ class MarkerDetector:
         """
         self._config = config
         self._dictionary = load_dictionary(dictionary)
+        self._cells = int(self._dictionary.markerSize) + 2
         self._turn = 2 if turned_by_180(dictionary) else 0
         self._first = cv2.aruco.ArucoDetector(self._dictionary, _parameters(smallest=0.03))
         self._second = cv2.aruco.ArucoDetector(self._dictionary, _parameters(smallest=1.0))
@@ -69,7 +71,8 @@ class MarkerDetector:
         corners, ids, rejected = self._first.detectMarkers(image)
         found = _pairs(ids, corners)
         found += self._look_again(image, rejected, found)
-        turned = [(i, np.roll(c, self._turn, axis=0)) for i, c in found]
+        refined = [(i, refine_corners(image, c, self._cells)) for i, c in found]
+        turned = [(i, np.roll(c, self._turn, axis=0)) for i, c in refined]
         return sorted(turned, key=lambda f: (f[0], *f[1].mean(axis=0))), len(corners) + len(rejected)
 
     def diagnose(self, image: GrayImage) -> list[str]:
@@ -163,9 +166,9 @@ def _resolved(item: Event | Future[CornersEvent], rejections: Counter[str]) -> I
 def _parameters(smallest: float) -> cv2.aruco.DetectorParameters:
     """Detection settings; `smallest` is a marker's least perimeter in units of the image's longer side.
 
-    The refinement window of half a cell (at most 10 pixels) is the largest that never reaches the next cell's edge: on
-    rendered markers it halves the corner error of OpenCV's default. Cells are sampled 8 pixels wide without the outer
-    quarters, where blur mixes them with their neighbours.
+    The refinement window of half a cell (at most 10 pixels) is the largest that never reaches the next cell's edge; its
+    corners are where the fit of the edges starts. Cells are sampled 8 pixels wide without the outer quarters, where
+    blur mixes them with their neighbours.
     """
     p = cv2.aruco.DetectorParameters()
     p.minMarkerPerimeterRate = smallest
