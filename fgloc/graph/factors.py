@@ -203,7 +203,7 @@ def _covariance_problem(cov: FloatArray) -> str:
     """
     if cov.shape == (3, 3):
         (a, b, c), (d, e, f), (g, h, i) = cov.tolist()
-        minors = a, a * e - b * d, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        minors: tuple[float, ...] = a, a * e - b * d, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         skew = abs(b - d) + abs(c - g) + abs(f - h)
         size = abs(a) + abs(e) + abs(i)
     elif cov.shape == (2, 2):
