@@ -119,7 +119,7 @@ def info(bag: Bag, config: ConfigOption = None) -> None:
     """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong."""
     from fgloc.recording.info import format_info, inspect
 
-    typer.echo(format_info(inspect(bag, _config(bag, config, None))))
+    typer.echo(format_info(inspect(bag, _config(bag, config, None))), nl=False)
 
 
 @app.command()

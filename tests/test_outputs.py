@@ -69,7 +69,7 @@ def test_wrong_tum_is_refused_with_its_line(tmp_path, text, message):
 
 
 def test_missing_or_binary_tum_is_refused(tmp_path):
-    with pytest.raises(TrajectoryError, match="absent.tum: cannot be read"):
+    with pytest.raises(TrajectoryError, match=r"absent\.tum: cannot be read"):
         outputs.read_tum(tmp_path / "absent.tum")
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(TrajectoryError, match="cannot be read"):

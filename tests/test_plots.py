@@ -222,7 +222,7 @@ def test_report_is_complete_by_itself(written):
 
 
 def test_report_tells_all_and_escapes(written):
-    result, out = written
+    _, out = written
     text = (out / "report.html").read_text()
     for expected in (
         "fgloc smooth &quot;first &lt;run&gt;&quot; --out out",

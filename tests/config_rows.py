@@ -1,0 +1,38 @@
+"""The rows of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` prints them."""
+
+from pydantic import BaseModel
+
+from fgloc.config import Config
+
+
+def sections(model=Config, path=""):
+    """Dotted name and model of every section, outermost first."""
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield f"{path}{name}", kind
+            yield from sections(kind, f"{path}{name}.")
+
+
+def rows(model):
+    """One line of a Markdown table per value of a section."""
+    for name, field in model.model_fields.items():
+        if not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+            yield f"| `{name}` | {_default(field.default)} | {(field.description or '').replace('|', '/')} |"
+
+
+def _default(value):
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    return f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+if __name__ == "__main__":
+    for name, model in sections():
+        lines = list(rows(model))
+        if lines:
+            meaning = model.__doc__.strip().splitlines()[0]
+            print(f"### {name}\n\n{meaning}\n\n| key | default | meaning |\n|---|---|---|")
+            print("\n".join(lines) + "\n")

@@ -1,0 +1,254 @@
+"""The command line's contract: files, exit codes, one line for an error, silence on a pipe."""
+
+import json
+import math
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from datasets.bag import BagWriter
+from fgloc import cli, se2
+from fgloc.recording.outputs import write_tum
+from fgloc.sensors.maps import load_map
+from fgloc.types import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
+FILES = {
+    "trajectory.tum",
+    "covariance.csv",
+    "steps.csv",
+    "metrics.json",
+    "config.json",
+    "trajectory.png",
+    "timeline.png",
+    "report.html",
+}
+
+
+def write_circle(folder, seconds=10.0, kidnapped_at=None, truth=True):
+    """A robot on a circle that sees four beacons; ``bag`` with ``map.yaml`` beside it."""
+    rng = np.random.default_rng(3)
+    pose, odometry = np.array([1.0, 0.0, math.pi / 2]), np.zeros(3)
+    with BagWriter(folder / "bag") as bag:
+        for k in range(round(seconds * 20)):
+            stamp = START_NS + k * 50_000_000
+            if kidnapped_at is not None and k == round(kidnapped_at * 20):
+                pose = se2.compose((1.5, 1.5, 2.0), pose)
+            bag.odometry("/odom", stamp, odometry, (0.4, 0.4))
+            if truth:
+                bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
+            if k % 5 == 0:
+                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in BEACONS])
+            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
+            wobble = rng.normal(0.0, 0.001, 2)
+            odometry = se2.compose(odometry, se2.exp((0.02 + wobble[0], 0.0, 0.02 + wobble[1])))
+    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
+    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
+    return folder / "bag"
+
+
+def sight(rng, pose, i):
+    dx, dy = BEACONS[i][0] - pose[0], BEACONS[i][1] - pose[1]
+    distance = math.hypot(dx, dy) + rng.normal(0.0, 0.05)
+    return i, distance, se2.wrap(math.atan2(dy, dx) - pose[2] + rng.normal(0.0, 0.02))
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return write_circle(tmp_path_factory.mktemp("circle"))
+
+
+def fgloc(*arguments):
+    """Exit code, stdout and stderr of one command; an exception that leaves it fails the test."""
+    done = CliRunner().invoke(cli.app, [str(a) for a in arguments])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.exit_code, done.stdout, done.stderr
+
+
+def refused(*arguments):
+    """The one error line of a command that must fail with bad input."""
+    code, _, stderr = fgloc(*arguments)
+    assert code == 1
+    assert stderr.startswith("error: ")
+    return stderr
+
+
+@pytest.mark.parametrize("command", ["smooth", "online"])
+def test_run_writes_all_results(bag, tmp_path, command):
+    code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
+    assert (code, stderr) == (0, "")
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["ate_mean_m"] < 0.04
+    assert 0.1 < metrics["nees_over_3"] < 3.0
+    assert metrics["coverage"]["3"] > 0.95
+    assert metrics["duration_s"] == pytest.approx(9.9, abs=0.3)
+    assert metrics["factors"]["range_bearing"] > 100
+    assert f"{metrics['ate_mean_m']:.4f} m" in stdout
+    assert str(tmp_path / "out" / "report.html") in stdout
+
+
+def test_batch_is_better_than_online(bag, tmp_path):
+    for command in ("smooth", "online"):
+        fgloc(command, bag, "--out", tmp_path / command)
+    batch, online = (json.loads((tmp_path / c / "metrics.json").read_text()) for c in ("smooth", "online"))
+    assert batch["ate_mean_m"] < online["ate_mean_m"]
+
+
+def test_same_bag_twice_gives_the_same_bytes(bag, tmp_path):
+    for name in ("a", "b"):
+        fgloc("smooth", bag, "--out", tmp_path / name)
+    for file in ("trajectory.tum", "covariance.csv", "steps.csv"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_without_truth_the_run_is_still_done(tmp_path):
+    code, stdout, _ = fgloc("smooth", write_circle(tmp_path, seconds=4.0, truth=False), "--out", tmp_path / "out")
+    assert code == 0
+    assert "ATE" not in stdout
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ate_mean_m"] is None
+
+
+def test_lost_robot_exits_with_3_after_writing(tmp_path):
+    code, _, stderr = fgloc("online", write_circle(tmp_path, kidnapped_at=5.0), "--out", tmp_path / "out")
+    assert code == 3
+    assert "LOST for" in stderr
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
+    assert "LOST" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_files_beside_the_bag_are_the_defaults(tmp_path):
+    bag = write_circle(tmp_path, seconds=4.0)
+    (tmp_path / "robot.yaml").write_text("landmarks: {range_sigma_m: 0.07}\n")
+    fgloc("smooth", bag, "--out", tmp_path / "out")
+    resolved = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert resolved["config"]["landmarks"]["range_sigma_m"] == 0.07
+    assert len(resolved["input"]["sha256"]) == 64
+    (tmp_path / "other.yaml").write_text("landmarks: {range_sigma_m: 0.09}\n")
+    fgloc("smooth", bag, "--config", tmp_path / "other.yaml", "--out", tmp_path / "out")
+    resolved = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert resolved["config"]["landmarks"]["range_sigma_m"] == 0.09
+
+
+def test_bad_input_is_one_line_and_code_1(bag, tmp_path):
+    out = ("--out", tmp_path / "out")
+    assert "absent.bag" in refused("smooth", tmp_path / "absent.bag", *out)
+    assert "absent.yaml" in refused("smooth", bag, "--map", tmp_path / "absent.yaml", *out)
+    assert "absent.yaml" in refused("online", bag, "--config", tmp_path / "absent.yaml", *out)
+    assert "absent.safetensors" in refused("smooth", bag, "--model", tmp_path / "absent.safetensors", *out)
+    (tmp_path / "typo.yaml").write_text("wheels: {scale: 2}\n")
+    assert "wheels.scale" in refused("smooth", bag, "--config", tmp_path / "typo.yaml", *out)
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in refused("smooth", bag, "--out", tmp_path / "file")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("smooth",),
+        ("smooth", "bag"),
+        ("online", "bag", "--out", "x", "--speed", "2"),
+        ("evaluate", "a.tum", "b.tum", "--align", "sim3"),
+        ("nonsense",),
+        ("smooth", "bag", "--out", "x", "--nonsense"),
+    ],
+)
+def test_usage_is_code_2(arguments):
+    assert fgloc(*arguments)[0] == 2
+
+
+def test_real_time_replay_takes_the_recordings_time(tmp_path):
+    bag = write_circle(tmp_path, seconds=2.0)
+    began = time.perf_counter()
+    assert fgloc("online", bag, "--speed", "1", "--out", tmp_path / "live")[0] == 0
+    assert time.perf_counter() - began > 1.9
+    fgloc("online", bag, "--out", tmp_path / "fast")
+    assert (tmp_path / "live" / "trajectory.tum").read_bytes() == (tmp_path / "fast" / "trajectory.tum").read_bytes()
+    factor = json.loads((tmp_path / "live" / "metrics.json").read_text())["real_time_factor"]
+    assert 0.5 < factor <= 1.0
+
+
+def test_map_surveys_the_beacons(bag, tmp_path):
+    code, stdout, _ = fgloc("map", bag, "--out", tmp_path / "map.yaml")
+    assert code == 0
+    assert stdout == f"4 landmarks in {tmp_path / 'map.yaml'}\n"
+    landmarks = load_map(tmp_path / "map.yaml").landmarks
+    for i in BEACONS:
+        for j in BEACONS:
+            surveyed = np.linalg.norm(landmarks[i].position - landmarks[j].position)
+            assert surveyed == pytest.approx(math.dist(BEACONS[i], BEACONS[j]), abs=0.15)
+
+
+def test_info_names_what_would_be_used(bag):
+    code, stdout, _ = fgloc("info", bag)
+    assert code == 0
+    for name in ("/odom", "/landmarks", "/truth", "nav_msgs/Odometry", "20 Hz"):
+        assert name in stdout
+
+
+def test_evaluate_prints_the_errors(tmp_path):
+    stamps = START_NS + 100_000_000 * np.arange(101)
+    poses = np.column_stack([np.linspace(0, 10, 101), np.zeros((101, 2))])
+    write_tum(tmp_path / "truth.tum", Trajectory(stamps, poses))
+    write_tum(tmp_path / "estimate.tum", Trajectory(stamps, poses + np.array([0.0, 0.5, 0.1])))
+    code, stdout, _ = fgloc("evaluate", tmp_path / "estimate.tum", tmp_path / "truth.tum")
+    table = dict(line.split("  ", 1) for line in stdout.splitlines())
+    assert code == 0
+    assert table["ATE mean"].strip() == "0.500000 m"
+    assert table["yaw MAE"].strip() == f"{math.degrees(0.1):.6f} deg"
+    assert table["drift"].strip() == "5.0000 %"
+    _, aligned, _ = fgloc("evaluate", tmp_path / "estimate.tum", tmp_path / "truth.tum", "--align", "se2")
+    assert "0.000000 m" in aligned
+
+
+def test_evaluate_refuses_what_cannot_be_compared(bag, tmp_path):
+    (tmp_path / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    (tmp_path / "b.tum").write_text("5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n")
+    assert "check the clocks" in refused("evaluate", tmp_path / "a.tum", tmp_path / "b.tum")
+    (tmp_path / "b.tum").write_text("1.0 0 nan 0 0 0 0 1\n")
+    assert "line 1: 'nan'" in refused("evaluate", tmp_path / "a.tum", tmp_path / "b.tum")
+
+
+def test_pipe_gets_no_progress_bar_and_no_traceback(bag, tmp_path):
+    def shell(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "fgloc.cli", *map(str, arguments)], capture_output=True, text=True, check=False
+        )
+
+    done = shell("smooth", bag, "--out", tmp_path / "out")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"fgloc smooth {bag} --out {tmp_path / 'out'}" in (tmp_path / "out" / "report.html").read_text()
+    done = shell("smooth", tmp_path / "absent.bag", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "SAMPLE", bag)
+    code, stdout, _ = fgloc("demo", "--out", tmp_path / "out")
+    assert code == 0
+    for mode in ("batch", "online"):
+        assert {file.name for file in (tmp_path / "out" / mode).iterdir()} == FILES
+        assert str(tmp_path / "out" / mode / "report.html") in stdout
+
+
+def test_demo_without_the_sample_says_where_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "SAMPLE", tmp_path / "absent")
+    assert "clone the repository" in refused("demo", "--out", tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_bundled_sample_is_localised(tmp_path):
+    if not cli.SAMPLE.is_dir():
+        pytest.fail(f"{cli.SAMPLE} is missing: the demo has nothing to run on")
+    code, _, _ = fgloc("demo", "--out", tmp_path)
+    assert code == 0
+    assert json.loads((tmp_path / "batch" / "metrics.json").read_text())["ate_mean_m"] < 0.02

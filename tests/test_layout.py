@@ -1,0 +1,145 @@
+"""The architecture holds: who may import whom, what the documents promise, what the shipped files leave out."""
+
+import ast
+import pkgutil
+import re
+import subprocess
+import sys
+from importlib.metadata import requires
+from pathlib import Path
+
+import pytest
+from config_rows import rows, sections
+
+import fgloc
+
+ROOT = Path(fgloc.__file__).resolve().parent.parent
+MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
+BASE = {"types", "errors", "config", "frames", "se2"}
+PARTS = {"recording", "sensors", "motion", "graph"}
+ABOVE = {"evaluation", "ablation"}
+ONLY = {  # the one place that may import a library
+    "rosbags": "recording",
+    "mcap": "recording",
+    "gtsam": "graph",
+    "cv2": "sensors",
+    "matplotlib": "evaluation",
+    "typer": "cli",
+}
+NEVER = {"datasets", "training", "benchmarks", "tests", "torch", "mujoco", "evo", "dask", "distributed"}
+
+
+def imported(path):
+    """Dotted names of everything that a module imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            if node.module == "fgloc":
+                yield from (f"fgloc.{alias.name}" for alias in node.names)
+            else:
+                yield node.module
+
+
+def part_of(path):
+    """The first name below fgloc: a package or a module."""
+    return path.relative_to(ROOT / "fgloc").parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_follow_the_layers(path):
+    part = part_of(path)
+    for name in imported(path):
+        top, *rest = name.split(".")
+        assert top not in NEVER, f"{name} in {path}"
+        assert ONLY.get(top, part) == part, f"{name} in {path}; only fgloc/{ONLY[top]} imports it"
+        if top != "fgloc" or not rest:
+            continue
+        target = rest[0]
+        assert target != "cli" or part == "__main__", f"{name} in {path}: nothing imports the command line"
+        if part in BASE:
+            assert target in BASE, f"{name} in {path}: the foundation stands alone"
+        elif part in PARTS:
+            assert target in BASE | PARTS, f"{name} in {path}: a part knows nothing of the core loop"
+        elif part not in ABOVE | {"cli"}:
+            assert target not in ABOVE, f"{name} in {path}: the core does not judge itself"
+
+
+def test_only_the_command_line_prints_and_exits():
+    for path in MODULES:
+        if part_of(path) == "cli":
+            continue
+        calls = [node.func for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)]
+        names = {func.id for func in calls if isinstance(func, ast.Name)}
+        names |= {
+            func.attr for func in calls if isinstance(func, ast.Attribute) and ast.unparse(func).startswith("sys.")
+        }
+        assert not names & {"print", "exit", "quit", "breakpoint"}, path
+
+
+def run_python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+
+
+def test_base_install_is_enough_for_every_module():
+    """Nothing in the package needs torch or another extra, not even late."""
+    names = [module.name for module in pkgutil.walk_packages(fgloc.__path__, "fgloc.")]
+    code = (
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] in {NEVER!r}: raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+        f"for name in {names!r}: __import__(name)\n"
+    )
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+    assert len(names) > 20
+
+
+def test_help_does_not_wait_for_heavy_libraries():
+    done = run_python(
+        "import sys, fgloc.cli; print({'gtsam', 'cv2', 'matplotlib', 'scipy', 'rosbags'} & set(sys.modules))"
+    )
+    assert done.stdout.strip() == "set()", done.stdout + done.stderr
+
+
+def test_configuration_reference_is_complete():
+    """Every value with its default and meaning; `python tests/config_rows.py` prints what docs/ should hold."""
+    text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    missing = [
+        f"{name}: {row}"
+        for name, model in sections()
+        for row in rows(model)
+        if row not in text.partition(f"### {name}\n")[2].partition("\n### ")[0]
+    ]
+    assert not missing, "docs/configuration.md lacks\n" + "\n".join(missing)
+
+
+def test_readme_names_the_packages_that_ci_installs():
+    line = re.search(r"apt-get install [^\n]*\\\n\s*([^\n]+)", (ROOT / ".ci" / "run").read_text("utf-8"))
+    assert f"apt-get install {line[1].strip()}" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_links_of_the_documents_lead_somewhere():
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+            if not target.startswith("http"):
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_no_paths_of_one_machine():
+    pattern = re.compile(r"(?<![\w.])/(work|tmp|root|home)/")
+    files = [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), ROOT / "Makefile", *(ROOT / "docs").glob("*.md")]
+    files += [p for name in ("fgloc", "datasets", "training", "benchmarks") for p in (ROOT / name).rglob("*.py")]
+    assert not [str(path) for path in files if pattern.search(path.read_text(encoding="utf-8"))]
+
+
+def test_constraints_pin_every_dependency():
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pinned = {line.split("==")[0].lower() for line in text.splitlines() if "==" in line}
+    wanted = {re.match(r"[\w-]+", line)[0].lower() for line in requires("fgloc")} - {"fgloc"}
+    assert {"gtsam", "torch", "evo", "dask"} <= wanted
+    assert wanted <= pinned
+    assert "+cpu" not in text  # a wheel for every machine
