@@ -220,10 +220,11 @@ def _wpilib(path: Path, root: Item, tags: Item, builder: _Builder) -> LandmarkMa
 
     Source: WPILib's documentation of AprilTagFieldLayout: a tag's x looks out of its face, z up.
     """
-    notes = []
-    if builder.default_size_m is None:
-        builder.default_size_m = _WPILIB_SIZE_M
-        notes.append(f"{path}: WPILib's files give no size; {_WPILIB_SIZE_M} m is taken.")
+    builder.default_size_m = builder.default_size_m or _WPILIB_SIZE_M
+    notes = [
+        f"{path}: WPILib's files name neither tag family nor size; DICT_APRILTAG_36h11 and {builder.default_size_m:g} m "
+        "are taken."
+    ]
     for tag in tags.entries():
         pose = tag.need("pose")
         quaternion = pose.need("rotation").need("quaternion")
