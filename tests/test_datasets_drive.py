@@ -21,7 +21,7 @@ _ROWS = 40
 
 
 def _table(path: Path, windows: int = 4, columns: tuple[str, ...] = _COLUMNS) -> Path:
-    """Windows of constant wheel speeds, the ICP pose renewed every second row; columns in another order and one extra."""
+    """Windows of constant wheel speeds, ICP poses renewed every second row; columns in another order and one extra."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["extra", *reversed(columns)], extrasaction="ignore", restval=9.0)
         writer.writeheader()
