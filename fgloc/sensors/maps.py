@@ -222,8 +222,8 @@ def _wpilib(path: Path, root: Item, tags: Item, builder: _Builder) -> LandmarkMa
     """
     builder.default_size_m = builder.default_size_m or _WPILIB_SIZE_M
     notes = [
-        f"{path}: WPILib's files name neither tag family nor size; DICT_APRILTAG_36h11 and {builder.default_size_m:g} m "
-        "are taken."
+        f"{path}: WPILib's files name neither tag family nor size; DICT_APRILTAG_36h11 and "
+        f"{builder.default_size_m:g} m are taken."
     ]
     for tag in tags.entries():
         pose = tag.need("pose")
