@@ -12,6 +12,8 @@ import pytest
 from config_rows import rows, sections
 
 import fgloc
+from fgloc.config import Config, load_config
+from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
@@ -127,6 +129,20 @@ def test_links_of_the_documents_lead_somewhere():
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_examples_of_the_documents_load(tmp_path):
+    examples = []
+    for page in (ROOT / "README.md", ROOT / "docs" / "configuration.md", ROOT / "docs" / "formats.md"):
+        examples += re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(examples) >= 5
+    for number, text in enumerate(examples):
+        path = tmp_path / f"{number}.yaml"
+        path.write_text(text, encoding="utf-8")
+        if "landmarks:\n" in text:
+            assert load_map(path).landmarks
+        else:
+            assert load_config(path) != Config()
 
 
 def test_no_paths_of_one_machine():
