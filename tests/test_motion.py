@@ -102,6 +102,40 @@ def test_steps_of_whole_sub_steps_compose_exactly(kind: str, rng: np.random.Gene
 
 
 @pytest.mark.parametrize("kind", ["velocity", "displacement"])
+def test_covariance_is_composed_as_se2_does(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    model, events = model_of(kind, rng, tmp_path), commands(rng)
+    start, motion, cov, velocity = T0 + 3 * SECOND, np.zeros(3), np.zeros((3, 3)), np.array([0.1, 0.2])
+    whole = model.predict(events, start, start + SECOND, velocity)
+    for k in range(10):
+        part = model.predict(events, start + k * SECOND // 10, start + (k + 1) * SECOND // 10, velocity)
+        assert part is not None
+        motion, cov = se2.compose(motion, part.motion), se2.compose_cov(cov, part.motion, part.cov)
+        velocity = part.velocity
+    assert whole is not None
+    np.testing.assert_allclose(motion, whole.motion, atol=1e-6)
+    np.testing.assert_allclose(cov, whole.cov, rtol=1e-4, atol=1e-12)
+
+
+def test_a_track_followed_step_by_step_equals_one_made_at_once(rng: np.random.Generator) -> None:
+    events = commands(rng)
+    track = CommandTrack(events[:100])
+    for first in range(10, 180, 7):
+        window = events[first : first + 100]
+        assert track.following(window) is track
+        times = (window[-1].stamp_ns - track.origin_ns) * 1e-9 - np.linspace(1.0, -0.5, 20)
+        shifted = times + (track.origin_ns - window[0].stamp_ns) * 1e-9
+        np.testing.assert_allclose(track.means(times), CommandTrack(window).means(shifted), atol=1e-9)
+    late = (*window[:50], replace(window[50], v=9.0, stamp_ns=window[50].stamp_ns - 1), *window[50:])
+    assert track.following(late) is not track  # one came late, in the middle
+    assert track.following(events[:50]) is not track  # an earlier part
+    long = tuple(CommandEvent(T0 + i * 1000, 0, "c", 1.0, 0.0) for i in range(20_000))
+    track = CommandTrack(long[:50])
+    for first in range(0, 19_000, 40):
+        track = track.following(long[first : first + 50])
+    assert len(track._events) < 5000  # memory does not grow
+
+
+@pytest.mark.parametrize("kind", ["velocity", "displacement"])
 def test_any_cadence_gives_the_same_motion_and_covariance(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path), commands(rng)
     start = T0 + 3 * SECOND

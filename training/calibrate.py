@@ -41,7 +41,8 @@ def fit_kinematics(runs: list[Run]) -> Kinematics:
     windows = []
     for run in runs:
         k = run.starts(steps)
-        travelled = np.concatenate([[0.0], np.cumsum(run.velocities[:, 0] * run.dt_s)])
+        forward = run.velocities[:, 0]
+        travelled = np.concatenate([[0.0], np.cumsum(0.5 * (forward[1:] + forward[:-1]) * run.dt_s)])
         change = np.column_stack([travelled[k + steps] - travelled[k], run.poses[k + steps, 2] - run.poses[k, 2]])
         windows.append((run, k, change / (steps * run.dt_s)))
     v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, actual in windows]).std(axis=0))

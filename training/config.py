@@ -28,7 +28,7 @@ class NetworkConfig(Section):
     hidden: tuple[int, ...] = (128, 128)
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
-        (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5),
+        (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
         description="displacement: limits of the ages over which commands are averaged",
     )
     use_velocity: bool = Field(False, description="displacement: also read the velocity at the start")
@@ -41,8 +41,8 @@ class OptimizationConfig(Section):
     """Multi-step loss, Adam, early stopping."""
 
     seed: int = 0
-    horizon_s: float = Field(3.0, gt=0, description="length of the rollouts in the loss")
-    batch: int = Field(128, gt=0)
+    horizon_s: float = Field(2.0, gt=0, description="length of the rollouts in the loss")
+    batch: int = Field(256, gt=0)
     iterations: int = Field(1500, gt=0)
     validate_every: int = Field(125, gt=0)
     patience: int = Field(6, gt=0, description="validations without improvement after which to stop")

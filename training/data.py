@@ -64,11 +64,12 @@ def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataC
     settings = _settings(path)
     commands: list[CommandEvent] = []
     truth: list[TruthEvent] = []
-    for event in open_recording(path, settings.recording).events():
-        if isinstance(event, CommandEvent):
-            commands.append(event)
-        elif isinstance(event, TruthEvent):
-            truth.append(event)
+    with open_recording(path, settings.recording) as recording:
+        for event in recording.events():
+            if isinstance(event, CommandEvent):
+                commands.append(event)
+            elif isinstance(event, TruthEvent):
+                truth.append(event)
     for kind, events in (("commands", commands), ("truth", truth)):
         if len(events) < 2:
             raise RecordingError(f"{path}: {len(events)} messages of {kind}; identification needs commands and truth")

@@ -80,15 +80,16 @@ def evaluate(rollouts: list[Rollout], horizon_s: float) -> Figures:
     )
 
 
+def growth(rollouts: list[Rollout]) -> list[Figures]:
+    """Figures at every horizon that the rollouts are long enough for."""
+    return [evaluate(rollouts, h) for h in HORIZONS_S if any(len(r.starts(h)[0]) for r in rollouts)]
+
+
 def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
     """The figures a card keeps, by name."""
     out: dict[str, float] = {}
-    for horizon in HORIZONS_S:
-        try:
-            figures = evaluate(rollouts, horizon)
-        except ValueError:
-            continue
-        name = f"{horizon:.0f}s"
+    for figures in growth(rollouts):
+        name = f"{figures.horizon_s:.0f}s"
         out |= {f"drift_percent_{name}": figures.drift_percent, f"yaw_end_deg_{name}": figures.yaw_end_deg}
         if figures.nis_over_3 is not None and figures.coverage is not None:
             out[f"nis_over_3_{name}"] = figures.nis_over_3
@@ -140,8 +141,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         model = load_model(options.model)
         found = sources(options.model, _runs(model.card, options.bags))
-        rows = [(name, evaluate(rollouts, h)) for name, rollouts in found.items() for h in HORIZONS_S]
-    except (FglocError, ValueError) as error:
+        rows = [(name, figures) for name, rollouts in found.items() for figures in growth(rollouts)]
+    except FglocError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(_table(rows))

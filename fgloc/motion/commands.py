@@ -7,6 +7,7 @@ import numpy as np
 from fgloc.types import CommandEvent, FloatArray
 
 _FOREVER_S = 1e4  # a last command holds on; who asks decides whether to believe it
+_MIN_CAPACITY = 4096
 
 
 class CommandTrack:
@@ -15,24 +16,50 @@ class CommandTrack:
     Before the first command the robot is taken to be at rest.
     """
 
-    def __init__(self, commands: tuple[CommandEvent, ...], origin_ns: int) -> None:
+    def __init__(self, commands: tuple[CommandEvent, ...], origin_ns: int | None = None) -> None:
         """Integrate.
 
         Args:
             commands: at least one, in order of stamp.
-            origin_ns: time zero of all the later questions.
+            origin_ns: time zero of all the later questions; None: the first command's.
         """
+        self.origin_ns = commands[0].stamp_ns if origin_ns is None else origin_ns
         n = len(commands)
-        times = np.empty(n + 1)
-        times[:n] = [c.stamp_ns - origin_ns for c in commands]
-        times[:n] *= 1e-9
-        times[n] = times[n - 1] + _FOREVER_S
-        integrals = np.zeros((2, n + 1))
+        capacity = max(_MIN_CAPACITY, 2 * n)
+        self._events = list(commands)
+        self._times = np.empty(capacity)
+        self._integrals = np.zeros((2, capacity))
+        times = self._times[:n]
+        times[:] = [c.stamp_ns - self.origin_ns for c in commands]
+        times *= 1e-9
         steps = np.diff(times)
-        np.cumsum(np.multiply([c.v for c in commands], steps), out=integrals[0, 1:])
-        np.cumsum(np.multiply([c.omega for c in commands], steps), out=integrals[1, 1:])
-        self._times = times
-        self._integrals = integrals
+        np.cumsum(np.multiply([c.v for c in commands[:-1]], steps), out=self._integrals[0, 1:n])
+        np.cumsum(np.multiply([c.omega for c in commands[:-1]], steps), out=self._integrals[1, 1:n])
+        self._hold()
+
+    def following(self, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+        """This track, extended by what is new in the next step's commands; a new one if they do not continue it."""
+        last = self._events[-1]
+        i = len(commands) - 1
+        while i >= 0 and commands[i] is not last:
+            i -= 1
+        first = len(self._events) - 1 - i  # our index of commands[0], if they are the same
+        full = len(self._events) + len(commands) - i >= len(self._times)
+        if i < 0 or first < 0 or self._events[first] is not commands[0] or full:
+            return CommandTrack(commands)
+        for event in commands[i + 1 :]:
+            self._append(event)
+        self._hold()
+        return self
+
+    def integrals(self, times_s: FloatArray) -> FloatArray:
+        """Integrals of v and ω ``(2, ...)`` up to times ``(...)`` since the origin."""
+        n = len(self._events) + 1
+        known = self._times[:n]
+        out = np.empty((2, *times_s.shape))
+        out[0] = np.interp(times_s, known, self._integrals[0, :n])
+        out[1] = np.interp(times_s, known, self._integrals[1, :n])
+        return out
 
     def means(self, limits_s: FloatArray) -> FloatArray:
         """Mean (v, ω) between neighboring limits.
@@ -43,9 +70,21 @@ class CommandTrack:
         Returns:
             ``(..., m - 1, 2)``.
         """
-        widths = np.diff(limits_s)
-        out = np.empty((*widths.shape, 2))
-        for axis in (0, 1):
-            integral = np.interp(limits_s, self._times, self._integrals[axis])
-            np.divide(np.diff(integral), widths, out=out[..., axis])
-        return out
+        means = np.diff(self.integrals(limits_s)) / np.diff(limits_s)
+        return np.ascontiguousarray(np.moveaxis(means, 0, -1))
+
+    def _append(self, event: CommandEvent) -> None:
+        k, last = len(self._events), self._events[-1]
+        t = (event.stamp_ns - self.origin_ns) * 1e-9
+        dt = t - self._times[k - 1]
+        self._times[k] = t
+        self._integrals[0, k] = self._integrals[0, k - 1] + last.v * dt
+        self._integrals[1, k] = self._integrals[1, k - 1] + last.omega * dt
+        self._events.append(event)
+
+    def _hold(self) -> None:
+        """One more entry, overwritten by the next command: the last one holds."""
+        k, last = len(self._events), self._events[-1]
+        self._times[k] = self._times[k - 1] + _FOREVER_S
+        self._integrals[0, k] = self._integrals[0, k - 1] + last.v * _FOREVER_S
+        self._integrals[1, k] = self._integrals[1, k - 1] + last.omega * _FOREVER_S

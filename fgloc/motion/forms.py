@@ -18,11 +18,12 @@ from fgloc.errors import ModelError
 from fgloc.motion.card import Kinematics, ModelCard
 from fgloc.motion.commands import CommandTrack
 from fgloc.motion.joint import JointCalibration
-from fgloc.motion.network import Network
+from fgloc.motion.network import Float32Array, Network
 from fgloc.types import CommandEvent, FloatArray
 
 MIN_DENSITY = np.array([1e-3, 1e-3, 1e-3]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
+_SMALL = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,40 +76,41 @@ class VelocityModel:
         self._network = network
         self._noise = card.noise
         self._scale = np.array(card.output_scale)
+        self._track: CommandTrack | None = None
 
     def predict(
         self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
     ) -> MotionPrediction | None:
         """See `MotionModel.predict`."""
         duration = _duration(commands, start_ns, end_ns)
-        track = CommandTrack(commands, start_ns)
+        track = self._track = _follow(self._track, commands)
+        start = (start_ns - track.origin_ns) * 1e-9
         if velocity is None:
-            velocity = self._roll(track, -self.card.history_s, 0.0, np.zeros(2))[-1]
-        states = self._roll(track, 0.0, duration, np.asarray(velocity, dtype=float))
+            velocity = self._roll(track, start - self.card.history_s, self.card.history_s, np.zeros(2))[-1]
+        states = self._roll(track, start, duration, np.asarray(velocity, dtype=float))
         if not np.isfinite(states).all():
             return None
         dt = duration / (len(states) - 1)
-        motion, cov = np.zeros(3), np.zeros((3, 3))
-        for v, omega in 0.5 * (states[:-1] + states[1:]):
-            part = se2.exp((v * dt, 0.0, omega * dt))
-            cov = se2.compose_cov(cov, part, np.diag(noise_density(self._noise, v, omega) * dt))
-            motion = se2.compose(motion, part)
-        return MotionPrediction(motion, cov, states[-1])
+        middles = 0.5 * (states[:-1] + states[1:])
+        twists = np.zeros((len(middles), 3))
+        twists[:, 0], twists[:, 2] = middles[:, 0] * dt, middles[:, 1] * dt
+        variances = np.array([noise_density(self._noise, v, omega) for v, omega in middles.tolist()]) * dt
+        return MotionPrediction(*_composed(twists, variances), states[-1])
 
-    def _roll(self, track: CommandTrack, start_s: float, end_s: float, velocity: FloatArray) -> FloatArray:
+    def _roll(self, track: CommandTrack, start: float, duration: float, velocity: FloatArray) -> FloatArray:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
-        limits = _sub_steps(start_s, end_s, self.card.dt_s)
-        dt = limits[1] - limits[0]
-        kinematics = self.card.kinematics
-        told = track.means(limits - kinematics.delay_s)
-        states = np.empty((len(limits), 2))
+        n = _sub_steps(duration, self.card.dt_s)
+        dt = duration / n
+        told = track.means(start - self.card.kinematics.delay_s + dt * np.arange(n + 1, dtype=np.float64))
+        states = np.empty((n + 1, 2))
         states[0] = velocity
         x = np.empty((1, 5), dtype=np.float32)
         x[0, 4] = dt
-        for k in range(len(told)):
+        gain = dt * self._scale
+        for k in range(n):
             x[0, :2] = states[k]
             x[0, 2:4] = told[k]
-            states[k + 1] = states[k] + dt * self._scale * self._network(x)[0]
+            states[k + 1] = states[k] + gain * self._network(x)[0]
         return states
 
 
@@ -129,59 +131,99 @@ class DisplacementModel:
         self._network = network
         self._scale = np.array(card.output_scale)
         self._ages = np.array(card.edges_s)
-        self._variance_scale = np.array(card.variance_scale)
-        self._n_bins = 2 * (len(card.edges_s) - 1)
+        self._widths = np.diff(self._ages)[:, None]
+        self._log_scale = np.log(card.variance_scale)
+        self._n_bins = 2 * len(self._widths)
+        self._track: CommandTrack | None = None
 
     def predict(
         self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
     ) -> MotionPrediction | None:
         """See `MotionModel.predict`."""
         duration = _duration(commands, start_ns, end_ns)
-        track = CommandTrack(commands, start_ns)
-        limits = _sub_steps(0.0, duration, self.card.dt_s)
-        dt = limits[1] - limits[0]
-        twists, log_density = self._twists(track, limits, velocity)
-        if not (np.isfinite(twists).all() and np.isfinite(log_density).all()):
-            return None
-        variances = np.exp(np.minimum(log_density, _MAX_LOG_VARIANCE)) * self._variance_scale
-        variances = np.maximum(variances, MIN_DENSITY) * dt
-        motion, cov = np.zeros(3), np.zeros((3, 3))
-        for twist, variance in zip(twists * dt, variances, strict=True):
-            part = se2.exp(twist)
-            cov = se2.compose_cov(cov, part, np.diag(variance))
-            motion = se2.compose(motion, part)
-        return MotionPrediction(motion, cov, twists[-1, [0, 2]])
-
-    def _twists(
-        self, track: CommandTrack, limits: FloatArray, velocity: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Body twists ``(n, 3)`` at the middles of the sub-steps and log-variance densities ``(n, 3)``."""
-        middles = 0.5 * (limits[:-1] + limits[1:])
-        base = calibrated(self.card.kinematics, track, limits)
-        x = np.zeros((len(middles), self.card.n_inputs), dtype=np.float32)
-        x[:, : self._n_bins] = track.means(middles[:, None] - self._ages).reshape(len(middles), -1)
-        if "velocity" in self.card.inputs and velocity is not None:
-            fade = np.exp(-middles / self.card.velocity_decay_s)
-            x[:, self._n_bins :] = fade[:, None] * (np.asarray(velocity) - base[0, [0, 2]])
+        track = self._track = _follow(self._track, commands)
+        n = _sub_steps(duration, self.card.dt_s)
+        dt = duration / n
+        base, x = self._inputs(track, (start_ns - track.origin_ns) * 1e-9, dt, n, velocity)
         y = self._network(x).astype(np.float64)
-        return base + self._scale * y[:, :3], y[:, 3:]
+        if not np.isfinite(y).all():
+            return None
+        twists = base + self._scale * y[:, :3]
+        variances = np.exp(np.minimum(y[:, 3:] + self._log_scale, _MAX_LOG_VARIANCE))
+        variances = np.maximum(variances, MIN_DENSITY)
+        return MotionPrediction(*_composed(twists * dt, variances * dt), twists[-1, ::2])
+
+    def _inputs(
+        self, track: CommandTrack, start: float, dt: float, n: int, velocity: FloatArray | None
+    ) -> tuple[FloatArray, Float32Array]:
+        """Twists ``(n, 3)`` of the calibrated kinematics and inputs ``(n, ·)`` of the network, one row a sub-step."""
+        kinematics = self.card.kinematics
+        limits = start + dt * np.arange(n + 1)
+        middles = limits[:-1] + 0.5 * dt
+        times = np.concatenate([limits - kinematics.delay_s, (middles[:, None] - self._ages).ravel()])
+        integrals = track.integrals(times).T
+        told = (integrals[1 : n + 1] - integrals[:n]) / dt
+        bins = integrals[n + 1 :].reshape(n, -1, 2)
+        base = _twists(kinematics, told)
+        x = np.zeros((n, self.card.n_inputs), dtype=np.float32)
+        x[:, : self._n_bins] = ((bins[:, :-1] - bins[:, 1:]) / self._widths).reshape(n, -1)
+        if velocity is not None and "velocity" in self.card.inputs:
+            fade = np.exp((start - middles) / self.card.velocity_decay_s)
+            x[:, self._n_bins :] = fade[:, None] * (np.asarray(velocity) - base[0, ::2])
+        return base, x
 
 
 def calibrated(kinematics: Kinematics, track: CommandTrack, limits: FloatArray) -> FloatArray:
     """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
-    told = track.means(limits - kinematics.delay_s)
+    return _twists(kinematics, track.means(limits - kinematics.delay_s))
+
+
+def _twists(kinematics: Kinematics, told: FloatArray) -> FloatArray:
     twists = np.zeros((len(told), 3))
     twists[:, 0] = kinematics.scale_v * told[:, 0]
     twists[:, 2] = kinematics.scale_omega * told[:, 1] + kinematics.yaw_per_m * twists[:, 0]
     return twists
 
 
-def noise_density(noise: NoiseDensity, v: float, omega: float) -> FloatArray:
-    """Variances per second ``(3,)`` of x, y, yaw at a velocity."""
+def noise_density(noise: NoiseDensity, v: float, omega: float) -> tuple[float, float, float]:
+    """Variances per second of x, y, yaw at a velocity."""
     v, omega = abs(v), abs(omega)
     turning = noise.xy_per_sqrt_rad**2 * omega + noise.xy_per_sqrt_s**2
     yaw = noise.yaw_per_sqrt_m**2 * v + noise.yaw_per_sqrt_rad**2 * omega + noise.yaw_per_sqrt_s**2
-    return np.array([noise.x_per_sqrt_m**2 * v + turning, noise.y_per_sqrt_m**2 * v + turning, yaw])
+    return noise.x_per_sqrt_m**2 * v + turning, noise.y_per_sqrt_m**2 * v + turning, yaw
+
+
+def _composed(twists: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Motion ``(3,)`` and covariance ``(3, 3)`` of consecutive parts.
+
+    Scalars, because a step has two or three parts: five times as fast here as `fgloc.se2` on small arrays.
+
+    Args:
+        twists: ``(n, 3)``, each held over its part, times the part's length.
+        variances: ``(n, 3)`` of each part's right perturbation, independent.
+    """
+    x = y = yaw = 0.0
+    xx = xy = xt = yy = yt = tt = 0.0
+    for (vx, vy, turn), (qx, qy, qt) in zip(twists.tolist(), variances.tolist(), strict=True):
+        sine, cosine = math.sin(turn), math.cos(turn)
+        a, b = (sine / turn, (1.0 - cosine) / turn) if abs(turn) > _SMALL else (1.0, 0.5 * turn)
+        px, py = a * vx - b * vy, b * vx + a * vy
+        # 1. Pose: compose with the exponential of the twist
+        c, s = math.cos(yaw), math.sin(yaw)
+        x, y, yaw = x + c * px - s * py, y + s * px + c * py, yaw + turn
+        # 2. Covariance: Ad(p⁻¹) P Ad(p⁻¹)ᵀ + Q. The lever arm first, then the rotation
+        xx, xy, yy = (
+            xx - 2.0 * py * xt + py * py * tt,
+            xy + px * xt - py * yt - px * py * tt,
+            yy + 2.0 * px * yt + px * px * tt,
+        )
+        xt, yt = xt - py * tt, yt + px * tt
+        rxx = cosine * (cosine * xx + 2.0 * sine * xy) + sine * sine * yy
+        rxy = (cosine * cosine - sine * sine) * xy + cosine * sine * (yy - xx)
+        ryy = cosine * (cosine * yy - 2.0 * sine * xy) + sine * sine * xx
+        xx, xy, yy = rxx + qx, rxy, ryy + qy
+        xt, yt, tt = cosine * xt + sine * yt, cosine * yt - sine * xt, tt + qt
+    return np.array([x, y, se2.wrap(yaw)]), np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
 def _joint(card: ModelCard) -> JointCalibration | None:
@@ -196,7 +238,10 @@ def _duration(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) ->
     return (end_ns - start_ns) * 1e-9
 
 
-def _sub_steps(start_s: float, end_s: float, longest_s: float) -> FloatArray:
-    """Limits ``(n + 1,)`` of the fewest equal parts no longer than the longest."""
-    n = max(1, math.ceil((end_s - start_s) / longest_s - 1e-6))
-    return np.linspace(start_s, end_s, n + 1)
+def _follow(track: CommandTrack | None, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+    return CommandTrack(commands) if track is None else track.following(commands)
+
+
+def _sub_steps(duration: float, longest_s: float) -> int:
+    """How many equal parts, no longer than the longest."""
+    return max(1, math.ceil(duration / longest_s - 1e-6))

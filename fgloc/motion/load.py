@@ -58,7 +58,7 @@ def read_model(path: Path) -> tuple[Tensors, ModelCard]:
 
 def save_model(path: Path, tensors: Tensors, card: ModelCard) -> None:
     """Write a model file that `load_model` accepts, atomically."""
-    metadata = {"format": FORMAT, "version": str(VERSION), "card": card.model_dump_json()}
+    metadata = {"card": card.model_dump_json()}  # one entry: the order of several would differ from run to run
     temporary = path.with_name(path.name + ".part")
     temporary.write_bytes(save(tensors, metadata=metadata))
     try:
@@ -69,17 +69,19 @@ def save_model(path: Path, tensors: Tensors, card: ModelCard) -> None:
 
 
 def _card(metadata: dict[str, str], path: Path) -> ModelCard:
-    found = (metadata.get("format"), metadata.get("version"))
-    if found != (FORMAT, str(VERSION)):
-        raise ModelError(
-            f"{path}: format and version are {found}, this program reads {(FORMAT, str(VERSION))}; {_REMEDY}"
-        )
     try:
-        return ModelCard.model_validate(json.loads(metadata["card"]))
+        fields = json.loads(metadata["card"])
     except KeyError:
         raise ModelError(f"{path}: has no card (inputs, normalization, noise) in its header; {_REMEDY}") from None
-    except json.JSONDecodeError as error:
+    except ValueError as error:
         raise ModelError(f"{path}: its card is not JSON ({error}); {_REMEDY}") from error
+    found = (fields.get("format"), fields.get("version")) if isinstance(fields, dict) else fields
+    if found != (FORMAT, VERSION):
+        raise ModelError(
+            f"{path}: format and version are {found!r}, this program reads {(FORMAT, VERSION)!r}; {_REMEDY}"
+        )
+    try:
+        return ModelCard.model_validate(fields)
     except ValidationError as error:
         lines = "; ".join(
             f"{'.'.join(str(p) for p in e['loc']) or 'card'}: {e['msg']}"

@@ -54,12 +54,11 @@ class LearnedMotion:
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
     def _unusable(self, step: Step) -> str:
-        known = [c.stamp_ns for c in step.commands if c.stamp_ns <= step.stamp_ns]
-        if not known:
-            return "learned.no_commands"
-        if (step.stamp_ns - known[-1]) * 1e-9 > self.model.card.hold_s:
-            return "learned.stale_commands"
-        return ""
+        for command in reversed(step.commands):
+            if command.stamp_ns <= step.stamp_ns:
+                stale = (step.stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
+                return "learned.stale_commands" if stale else ""
+        return "learned.no_commands"
 
     def _reject(self, reason: str) -> None:
         self.rejections[reason] += 1
