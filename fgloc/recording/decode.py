@@ -1,4 +1,4 @@
-"""Messages to events: typestores and one converter for each message type of each role. No validation: the gate's part.
+"""Messages to events: one converter for each message type of each role. No validation: that is the gate's part.
 
 AprilTag corners. ``apriltag_msgs`` passes on the AprilTag library's corners: bottom-left, bottom-right, top-right,
 top-left of the tag as that library holds it upright, in pixels whose first pixel's *corner* is (0, 0). OpenCV's
@@ -12,17 +12,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
-from functools import cache
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
-from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from fgloc.config import Role
-from fgloc.recording.messages import default_typestore
 from fgloc.types import (
     CameraInfoEvent,
     CommandEvent,
@@ -44,98 +39,11 @@ from fgloc.types import (
 
 When = tuple[int, int, str]  # stamp_ns, received_ns, topic: an Event's first fields
 TF_TYPES = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
+HEADERLESS = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/Pose2D"})
 
 _OPENCV_ORDER = (1, 0, 3, 2)
 _OPENCV_SHIFT_PX = -0.5
 _ID = re.compile(r"(?:^|[^0-9A-Za-z])(\d+)$")  # "7", "tag36h11:7", "marker_7"; not the 11 of "tag36h11"
-
-
-class Decoder:
-    """Deserializes messages of one recording and turns them into events.
-
-    Definitions that the recording embeds win; the defaults serve for the rest.
-
-    Attributes:
-        notes: what the user should know of the definitions used.
-    """
-
-    def __init__(self, ros1: bool, definitions: Iterable[tuple[str, MessageDefinition]]) -> None:
-        """Build the typestore.
-
-        Args:
-            ros1: messages are in ROS 1 serialization, else CDR.
-            definitions: message type and embedded definition (format NONE if there is none) of each topic in use.
-        """
-        embedded: Typesdict = {}
-        used, missing, damaged = set(), set(), set()
-        for message_type, definition in definitions:
-            used.add(message_type)
-            if definition.format == MessageDefinitionFormat.NONE:
-                missing.add(message_type)
-                continue
-            try:
-                embedded.update(_parse(message_type, definition))
-            except Exception:  # the parser leaks what damaged text makes it meet
-                damaged.add(message_type)
-        default = _default_definitions(ros1)
-        self._store = get_typestore(Stores.EMPTY)
-        try:
-            self._store.register(_needed(used, {**default, **embedded}))
-        except Exception:  # a definition that parses may still be nonsense
-            self._store = get_typestore(Stores.EMPTY)
-            self._store.register(_needed(used, default))
-            damaged |= embedded.keys() & used
-        self._deserialize = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
-        self.notes: list[str] = []
-        name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
-        if missing:
-            self.notes.append(
-                f"The recording holds no definitions of {', '.join(sorted(missing))}: those of {name} are used."
-            )
-        if damaged:
-            self.notes.append(f"Damaged definitions of {', '.join(sorted(damaged))}: those of {name} are used.")
-
-    def message(self, message_type: str, raw: bytes) -> Any:
-        """Deserialize. Raises whatever rosbags leaks on damaged bytes."""
-        return self._deserialize(raw, message_type)
-
-
-@cache
-def _default_definitions(ros1: bool) -> Typesdict:
-    return default_typestore(ros1).fielddefs
-
-
-def _needed(used: Iterable[str], definitions: Typesdict) -> Typesdict:
-    """The definitions of some types and of all the types inside them: registering hundreds more takes a while."""
-    needed: Typesdict = {}
-    queue = list(used)
-    while queue:
-        name = queue.pop()
-        if name in definitions and name not in needed:
-            needed[name] = definitions[name]
-            queue += [inner for _, field in definitions[name][1] for inner in _names(field)]
-    return needed
-
-
-def _names(field: Any) -> Iterator[str]:
-    """Message types that a field's description holds."""
-    kind, value = field
-    if kind == Nodetype.NAME:
-        yield value
-    elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        yield from _names(value[0])
-
-
-def _parse(message_type: str, definition: MessageDefinition) -> Typesdict:
-    if definition.format == MessageDefinitionFormat.MSG:
-        return get_types_from_msg(definition.data, message_type)
-    types: Typesdict = {}
-    separator = "=" * 80 + "\n"
-    for part in definition.data.split(separator):
-        text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-        if text.strip():
-            types.update(get_types_from_idl(text))
-    return types
 
 
 def header_stamp(message: Any) -> int | None:

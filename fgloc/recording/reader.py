@@ -10,7 +10,8 @@ from types import TracebackType
 
 from fgloc.config import RecordingConfig, Role
 from fgloc.errors import RecordingError
-from fgloc.recording.decode import CONVERTERS, TF_TYPES, Decoder, header_stamp, transforms
+from fgloc.recording.decode import CONVERTERS, TF_TYPES, header_stamp, transforms
+from fgloc.recording.definitions import Decoder
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.recording.storage import RawMessage, Storage
 from fgloc.recording.transforms import FrameTree
@@ -128,7 +129,7 @@ class Recording:
         """Events of one message in a role (None: tf); empty, and counted, if it cannot be decoded."""
         topic, message_type, received_ns, raw = message
         try:
-            content = self._decoder.message(message_type, raw)
+            content = self._decoder.deserialize(message_type, raw)
             if message_type in TF_TYPES:
                 return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
             if role is None:
@@ -140,6 +141,11 @@ class Recording:
         except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             self.undecodable[topic] = self.undecodable.get(topic, 0) + 1
             return []
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the storage files."""
+        return self._storage.size_bytes
 
     def content_hash(self) -> str:
         """Hex SHA-256 of the storage file, or of several one after the other."""

@@ -125,6 +125,11 @@ class Storage:
         streams = [file.messages(topics) for file in self._files]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda message: message[2])
 
+    @property
+    def size_bytes(self) -> int:
+        """Size of the storage files."""
+        return sum(file.stat().st_size for file in self.files)
+
     def content_hash(self) -> str:
         """Hex SHA-256 of the storage files' bytes, one after the other."""
         digest = hashlib.sha256()
@@ -165,6 +170,8 @@ class _File:
                 return
             try:
                 for connection, received_ns, raw in reader.messages(wanted):
+                    if not 0 <= received_ns < 2**63:
+                        raise RecordingError(f"receive time {received_ns} ns of a message on {connection.topic}")
                     if received_ns < resume[0] or (received_ns == resume[0] and (connection.topic, raw) in resume[1]):
                         continue
                     if received_ns != last_ns:

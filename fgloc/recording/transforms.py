@@ -37,8 +37,10 @@ class FrameTree:
         self._edges: dict[tuple[str, str], _Edge] = {}
         for t in transforms:
             key = (_bare(t.parent), _bare(t.child))
+            if key[0] == key[1] or not (np.isfinite(t.translation).all() and (np.abs(t.rotation) < 2.0).all()):
+                continue
             norm = float(np.linalg.norm(t.rotation))
-            if key[0] == key[1] or not np.isfinite(t.translation).all() or not abs(norm - 1.0) < 0.05:
+            if abs(norm - 1.0) > 0.05:
                 continue
             known = self._edges.get(key)
             if known is None or t.static:
