@@ -222,6 +222,33 @@ class BagWriter:
         )
         self._write(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, received_ns, frame_id, dict(pose=pose))
 
+    def twist(
+        self,
+        topic: str,
+        stamp_ns: int,
+        linear: Sequence[float],
+        angular: Sequence[float],
+        received_ns: int | None = None,
+        frame_id: str = "base_link",
+    ) -> None:
+        """``geometry_msgs/TwistWithCovarianceStamped`` (which nothing takes for a command), covariance zero."""
+        content = self._make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=self._twist(linear, angular), covariance=np.zeros(36)
+        )
+        kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+        self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(twist=content))
+
+    def flag(self, topic: str, value: bool, received_ns: int) -> None:
+        """``std_msgs/Bool``, which has no stamp."""
+        self.write(topic, "std_msgs/msg/Bool", self._make("std_msgs/msg/Bool", data=value), received_ns)
+
+    def illuminance(
+        self, topic: str, stamp_ns: int, lux: float, received_ns: int | None = None, frame_id: str = "map"
+    ) -> None:
+        """``sensor_msgs/Illuminance``."""
+        content = dict(illuminance=lux, variance=0.0)
+        self._write(topic, "sensor_msgs/msg/Illuminance", stamp_ns, received_ns, frame_id, content)
+
     def range_bearing(
         self,
         topic: str,

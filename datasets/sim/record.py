@@ -1,0 +1,96 @@
+"""Recording: a scenario and a seed in; a bag, a map, a robot file and the resolved scenario out."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import yaml
+
+from datasets.bag import BagWriter
+from datasets.convert import write_merged, write_robot
+from datasets.sim.mjcf import wheel_names
+from datasets.sim.physics import make_scene, simulate
+from datasets.sim.scenario import Scenario
+from datasets.sim.sensors import streams
+from fgloc.sensors.maps import write_map
+
+DONE = "scenario.yaml"  # written last: a folder that holds it is complete
+_FILES = ("bag", "map.yaml", "robot.yaml", DONE)
+
+
+def record(scenario: Scenario, seed: int, out: Path, camera: bool = True) -> Path:
+    """Record one run into ``out``: ``bag/``, ``map.yaml``, ``robot.yaml``, ``scenario.yaml``.
+
+    Nothing appears in ``out`` before the run is complete; an earlier recording there is replaced.
+
+    Args:
+        scenario: what to record.
+        seed: what is drawn; the same seed and versions give the same messages.
+        out: folder.
+        camera: render images (if the scenario has a camera); without, no OpenGL is needed.
+
+    Returns:
+        The bag's folder.
+    """
+    scene = make_scene(scenario, seed)
+    log = simulate(scene)
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out, prefix=".recording-") as scratch:
+        stage = Path(scratch)
+        with BagWriter(stage / "bag", compress=True) as bag:
+            write_merged(*streams(scene, log, bag, camera))
+        write_map(scene.landmarks, stage / "map.yaml")
+        write_robot(stage / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
+        (stage / DONE).write_text(describe(scenario, seed, camera), encoding="utf-8")
+        (out / DONE).unlink(missing_ok=True)
+        for name in _FILES:
+            if (out / name).is_dir():
+                shutil.rmtree(out / name)
+            (stage / name).replace(out / name)
+    return out / "bag"
+
+
+def is_recorded(scenario: Scenario, seed: int, out: Path, camera: bool) -> bool:
+    """Whether ``out`` holds exactly this run, complete."""
+    done = out / DONE
+    return done.is_file() and done.read_text(encoding="utf-8") == describe(scenario, seed, camera)
+
+
+def describe(scenario: Scenario, seed: int, camera: bool) -> str:
+    """The resolved scenario with its seed and the versions that matter, as YAML."""
+    content = {
+        "seed": seed,
+        "camera": camera,
+        "mujoco": mujoco.__version__,
+        "fgloc": version("fgloc"),
+        "scenario": scenario.model_dump(mode="json"),
+    }
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+
+
+def robot_settings(scenario: Scenario) -> dict[str, Any]:
+    """``robot.yaml``: what a user would know of the robot: nominal geometry, not the true radii."""
+    robot = scenario.robot
+    wheels: dict[str, Any]
+    if robot.kind == "diff_drive":
+        left, right = wheel_names(robot)
+        wheels = {"source": "ticks", "left_joint": left, "right_joint": right}
+        wheels |= {"left_radius": robot.radius_m, "right_radius": robot.radius_m, "track": robot.track_m}
+    else:
+        wheels = {"source": "twist"}
+    wheels["noise"] = {
+        "x_per_sqrt_m": 0.01,
+        "y_per_sqrt_m": 0.005,
+        "yaw_per_sqrt_m": 0.02,
+        "xy_per_sqrt_rad": 0.005,
+        "yaw_per_sqrt_rad": 0.02 if robot.kind == "diff_drive" else 0.2,
+        "xy_per_sqrt_s": 0.001,
+        "yaw_per_sqrt_s": 0.001,
+    }
+    topics = {"command": "/cmd_vel", "odometry": "/odom", "truth": "/truth"}
+    return {"recording": {"topics": topics}, "wheels": wheels, "markers": {"sigma_px": 0.2}}

@@ -1,0 +1,271 @@
+"""Every parameter of a simulated run: robot, world, sensors, control. Strict: unknown keys are errors.
+
+The contact and motor figures were measured: with them true and wheel motion agree on a grippy floor, and wheels slip
+by friction where the floor is not.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Section(BaseModel):
+    """A part of a scenario: unknown keys are errors, values are immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# --- Robot ------------------------------------------------------------------------------------------------------------
+
+
+class Contact(Section):
+    """How wheels touch the floor (MuJoCo's contact parameters)."""
+
+    timestep_s: Positive = 0.001
+    solref: Vector2 = (0.008, 1.0)
+    solimp: tuple[float, float, float, float, float] = (0.95, 0.99, 0.001, 0.5, 2.0)
+    impratio: Positive = 10.0
+    torsional_friction: float = 0.003  # m
+    rolling_friction: float = 0.0002  # m
+    caster_friction: float = 0.05
+
+
+class Motor(Section):
+    """A DC motor per wheel under a PI speed regulator: it lags, overshoots, saturates, and droops on slopes."""
+
+    supply_v: Positive = 12.0
+    stall_torque_nm: Positive = 0.9
+    no_load_rad_s: Positive = 24.0
+    kp: float = 0.6  # V per rad/s
+    ki: float = 3.0  # V per rad
+    regulator_hz: Positive = 100.0
+    armature: float = 0.008  # kg m², of the rotor through the gear
+    damping: float = 0.004  # Nm s
+    friction_nm: float = 0.01
+    effort_noise_nm: float = 0.01  # of the measured torque (motor current)
+
+
+class Payload(Section):
+    """A load on a rail that is moved during the run."""
+
+    mass_kg: Positive = 3.0
+    start: Vector3 = (0.0, 0.0, 0.12)
+    end: Vector3 = (-0.06, 0.08, 0.12)
+    shift_at_s: float = Field(60.0, ge=0)
+
+
+class Robot(Section):
+    """A wheeled robot. The base frame lies on the floor between the wheels."""
+
+    kind: Literal["diff_drive", "skid_steer"] = "diff_drive"
+    mass_kg: Positive = 6.0
+    wheel_mass_kg: Positive = 0.2
+    radius_m: Positive = 0.05  # nominal: what the odometry believes
+    radius_scale: Vector2 = (1.0, 1.0)  # true over nominal, left and right
+    wheel_width_m: Positive = 0.03
+    track_m: Positive = 0.26
+    track_scale: Positive = 1.0  # what regulator and odometry believe over the true track (skid-steer: more than 1)
+    wheelbase_m: Positive = 0.24  # skid-steer only
+    caster_behind_m: Positive = 0.12  # differential drive only
+    center_of_mass: Vector3 = (-0.02, 0.01, 0.06)
+    chassis: Vector3 = (0.30, 0.20, 0.08)  # length, width, height
+    payload: Payload | None = None
+    ticks_per_turn: int = Field(2048, gt=0)
+    motor: Motor = Motor()
+    contact: Contact = Contact()
+    command_delay_s: float = Field(0.03, ge=0)  # from the command's stamp to the regulator
+    max_v: Positive = 0.6  # m/s
+    max_omega: Positive = 1.8  # rad/s
+    max_acceleration: Positive = 2.5  # m/s², of the set point
+    max_angular_acceleration: Positive = 8.0  # rad/s²
+
+
+class Imu(Section):
+    """Gyro and accelerometer: constant bias drawn once, a slow walk of the gyro's, white noise."""
+
+    gyro_noise: float = 0.004  # rad/s per sample
+    gyro_bias: float = 0.005  # rad/s, sigma of the draw
+    gyro_walk: float = 0.0002  # rad/s/√s
+    accel_noise: float = 0.05  # m/s²
+    accel_bias: float = 0.05  # m/s²
+    position: Vector3 = (0.0, 0.0, 0.08)
+
+
+class Camera(Section):
+    """A gray camera with a linear response, a lens and an automatic exposure that lengthens before it amplifies."""
+
+    rate_hz: Positive = 10.0
+    width: int = Field(640, gt=0)
+    height: int = Field(480, gt=0)
+    focal_px: Positive = 525.0
+    distortion: tuple[float, float, float, float, float] = (-0.12, 0.04, 0.0005, -0.0003, 0.0)  # plumb_bob
+    position: Vector3 = (0.10, 0.0, 0.25)  # in the base frame
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)  # of the forward looking body axes
+    blur_px: float = Field(0.7, ge=0)  # sigma of the lens's point spread
+    motion_blur: bool = True
+    exposure_s: Positive = 0.006  # in full light
+    max_exposure_s: Positive = 0.033
+    max_gain: float = Field(4.0, ge=1.0)
+    exposure_lag_s: Positive = 0.4  # time constant of the automatic exposure
+    noise: float = 2.3  # gray levels at gain 1
+    jpeg_quality: int = Field(80, ge=1, le=100)
+    oversampling: Positive = 1.5  # rendered pixels per image pixel and axis
+
+
+class Rates(Section):
+    """How often each channel speaks [Hz]."""
+
+    command: Positive = 20.0
+    odometry: Positive = 50.0
+    imu: Positive = 100.0
+    truth: Positive = 50.0
+
+
+class Latency(Section):
+    """From stamp to recorder [s]: the least, and the mean of an exponential rest."""
+
+    command: Vector2 = (0.0005, 0.0005)
+    odometry: Vector2 = (0.002, 0.001)
+    imu: Vector2 = (0.001, 0.0005)
+    camera: Vector2 = (0.030, 0.004)
+    truth: Vector2 = (0.004, 0.001)
+
+
+# --- World ------------------------------------------------------------------------------------------------------------
+
+
+class Markers(Section):
+    """Square markers on the walls."""
+
+    count: int = Field(14, ge=0)
+    size_m: Positive = 0.20  # of the black square
+    dictionary: str = "DICT_4X4_50"
+    heights_m: Vector2 = (0.22, 0.50)  # of the centers
+
+
+class Patch(Section):
+    """A piece of floor with its own friction. ``points`` only for a polygon, relative to the center."""
+
+    shape: Literal["ellipse", "rectangle", "polygon"] = "ellipse"
+    center: Vector2
+    size: Vector2 = (1.0, 1.0)  # full length and width
+    yaw_deg: float = 0.0
+    points: tuple[Vector2, ...] = ()
+    mu: Positive
+
+
+class RandomPatches(Section):
+    """Patches of all shapes, drawn by the seed."""
+
+    count: int = Field(ge=0)
+    mu: Vector2 = (0.04, 0.15)
+    size_m: Vector2 = (0.6, 1.6)
+
+
+class Ramp(Section):
+    """Up, level, down along x."""
+
+    start_x: float
+    angle_deg: Positive = 7.0
+    rise_m: Positive = 1.0  # horizontal length of each slope
+    top_m: Positive = 1.0
+    center_y: float = 0.0
+    width_m: Positive = 2.0
+
+
+class Humps(Section):
+    """Smooth humps drawn by the seed."""
+
+    count: int = Field(ge=0)
+    height_m: Vector2 = (0.01, 0.03)
+    sigma_m: Vector2 = (0.12, 0.25)
+
+
+class Floor(Section):
+    """Friction and height of the ground."""
+
+    mu: Positive = 0.8
+    patches: tuple[Patch, ...] = ()
+    random_patches: RandomPatches | None = None
+    ramp: Ramp | None = None
+    humps: Humps | None = None
+
+    @property
+    def uneven(self) -> bool:
+        """Whether there is any height at all."""
+        return self.ramp is not None or self.humps is not None
+
+
+class LightStep(Section):
+    """From ``at_s`` on the light has this level (1 is full)."""
+
+    at_s: float = Field(ge=0)
+    level: float = Field(gt=0, le=1.0)
+
+
+class Occlusion(Section):
+    """Screens stand in front of markers for a while."""
+
+    start_s: float = Field(ge=0)
+    end_s: float
+    share: float = Field(1.0, gt=0, le=1.0)  # of the markers, drawn by the seed
+
+
+class World(Section):
+    """A room with its floor, markers and light."""
+
+    size_m: Vector2 = (6.0, 5.0)
+    wall_height_m: Positive = 1.4
+    keep_off_m: float = Field(0.7, ge=0)  # the driver turns back before walls
+    markers: Markers = Markers()
+    floor: Floor = Floor()
+    light: tuple[LightStep, ...] = ()
+    occlusions: tuple[Occlusion, ...] = ()
+
+
+# --- Control ----------------------------------------------------------------------------------------------------------
+
+ControlKind = Literal[
+    "straight", "turns", "steps", "ramps", "sines", "random_walk", "stop_and_go", "figure_eight", "spiral", "spin"
+]
+
+
+class Control(Section):
+    """A set of control functions vʲ(t), one after the other, drawn by the seed; or a waypoint follower.
+
+    Source: the paper's eq. 1, a set of control functions that covers the robot's velocities.
+    """
+
+    functions: tuple[ControlKind, ...] = ("straight", "turns", "steps", "ramps", "sines", "random_walk", "figure_eight")
+    segment_s: Positive = 15.0
+    waypoints: tuple[Vector2, ...] = ()  # if any: followed in a circle instead
+    speed: Positive = 0.4  # m/s, of the waypoint follower
+    rest_s: float = Field(1.0, ge=0)  # at the start
+
+
+class Scenario(Section):
+    """One kind of run, complete but for the seed."""
+
+    name: str = Field(pattern=r"^[a-z0-9_]+$")
+    description: str = ""
+    duration_s: Positive = 60.0
+    start: Vector3 = (0.0, 0.0, 0.0)  # x, y [m], yaw [rad]
+    robot: Robot = Robot()
+    world: World = World()
+    imu: Imu = Imu()
+    camera: Camera | None = Camera()
+    rates: Rates = Rates()
+    latency: Latency = Latency()
+    control: Control = Control()
+
+
+def channel_rng(seed: int, channel: str) -> np.random.Generator:
+    """A generator of its own for each use, so that adding one draw does not change the others."""
+    return np.random.default_rng([seed, *channel.encode()])
