@@ -26,6 +26,7 @@ def make_card(kind: str, **changes: Any) -> ModelCard:
         hold_s=1.5,
         history_s=2.0,
         kinematics=dict(scale_v=0.95, scale_omega=0.9, delay_s=0.1),
+        lag=dict(delay_s=0.05, lag_s=(0.2, 0.3)) if kind == "velocity" else None,
         edges_s=edges,
         input_mean=(0.1,) * n,
         input_std=(0.5,) * n,

@@ -75,15 +75,19 @@ def test_displacement_without_residual_is_the_calibrated_kinematics(rng: np.rand
     np.testing.assert_allclose(prediction.velocity, twist[[0, 2]], atol=1e-9)
 
 
-def test_velocity_without_network_keeps_its_velocity(rng: np.random.Generator, tmp_path: Path) -> None:
-    card = make_card("velocity")
+def test_velocity_without_network_is_a_first_order_lag(rng: np.random.Generator, tmp_path: Path) -> None:
+    card = make_card("velocity", kinematics=dict(scale_v=0.9, scale_omega=1.1))
     save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
-    model = load_model(tmp_path / "m.safetensors")
-    event = CommandEvent(T0, T0, "/cmd_vel", 9.0, 9.0)
-    prediction = model.predict((event,), T0, T0 + SECOND, np.array([0.5, 0.8]))
-    assert prediction is not None
-    np.testing.assert_allclose(prediction.motion, se2.exp((0.5, 0.0, 0.8)), atol=1e-12)
-    np.testing.assert_allclose(prediction.velocity, [0.5, 0.8])
+    event = CommandEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
+    predictions = [
+        load_model(tmp_path / "m.safetensors").predict((event,), T0 + SECOND, T0 + n * SECOND, np.zeros(2))
+        for n in (2, 5)
+    ]
+    aim = np.array([0.45, 0.88])
+    for prediction, t in zip(predictions, (1.0, 4.0), strict=True):
+        assert prediction is not None
+        np.testing.assert_allclose(prediction.velocity, aim * (1 - np.exp(-t / np.array([0.2, 0.3]))), atol=1e-9)
+        assert prediction.motion[2] == pytest.approx(se2.wrap(0.88 * (t - 0.3 * (1 - np.exp(-t / 0.3)))), abs=0.004)
 
 
 @pytest.mark.parametrize("kind", ["velocity", "displacement"])

@@ -19,7 +19,7 @@ from fgloc.motion.card import Kinematics
 from fgloc.types import CommandEvent, FloatArray
 from training import evaluate as evaluation
 from training import train as training
-from training.calibrate import fit_joint, fit_kinematics, fit_noise, nis, noise_covs
+from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, nis, noise_covs
 from training.config import (
     CalibrationConfig,
     DataConfig,
@@ -31,7 +31,7 @@ from training.config import (
 from training.data import Run, load_run, make_run, mirrored
 from training.export import card_of, export
 from training.losses import composed_nll, end_errors, rollout_loss
-from training.models import DisplacementNet, VelocityNet, integrate, relative
+from training.models import integrate, relative
 from training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics, roll_model
 
 SECOND = 1_000_000_000
@@ -207,9 +207,7 @@ def test_torch_and_numpy_agree(kind: str, use_velocity: bool, runs: dict[str, Ru
     torch.manual_seed(1)
     network = NetworkConfig(kind=kind, hidden=(32, 32), use_velocity=use_velocity, dt_s=0.1)
     config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, leave_one_out=True, network=network)
-    net = (DisplacementNet if kind == "displacement" else VelocityNet)(
-        network, Kinematics(scale_v=0.9, delay_s=0.2), list(runs.values())
-    )
+    net = training.new_net(network, list(runs.values()))
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape))
@@ -246,6 +244,12 @@ def test_kinematics_are_recovered() -> None:
     assert fitted.scale_omega == pytest.approx(1.1, abs=0.01)
     assert fitted.yaw_per_m == pytest.approx(-0.05, abs=0.01)
     assert fitted.delay_s == pytest.approx(0.2, abs=0.02)
+
+
+def test_lag_is_recovered(runs: dict[str, Run]) -> None:
+    fitted = fit_lag(list(runs.values()), fit_kinematics(list(runs.values())))
+    assert fitted.delay_s == pytest.approx(DELAY, abs=0.03)
+    assert fitted.lag_s[1] == pytest.approx(TAU, abs=0.04)
 
 
 def noisy_rollouts(runs: dict[str, Run], noise: NoiseDensity, seed: int) -> list[Rollout]:
@@ -297,7 +301,7 @@ def tiny_config(kind: str, names: list[str]) -> TrainConfig:
         recordings={name: Path(name) for name in names},
         leave_one_out=True,
         network=NetworkConfig(kind=kind, hidden=(32, 32), edges_s=tuple(0.1 * i for i in range(8)), dt_s=0.1),
-        optimization=OptimizationConfig(**TINY | {"iterations": 700 if kind == "velocity" else 300}),
+        optimization=OptimizationConfig(**TINY),
         calibration=CalibrationConfig(horizons_s=(2.0, 5.0), window_s=2.0),
     )
 

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
+from scipy.signal import lfilter
 
 from fgloc.config import NoiseDensity
-from fgloc.motion.card import JointErrors, Kinematics
+from fgloc.motion.card import JointErrors, Kinematics, Lag
+from fgloc.motion.forms import calibrated
 from fgloc.types import FloatArray
 from training.config import CalibrationConfig
 from training.data import Run
@@ -50,6 +52,25 @@ def fit_kinematics(runs: list[Run]) -> Kinematics:
     fit = least_squares(residuals, [1.0, 1.0, 0.0, 0.2], bounds=bounds, diff_step=1e-2, x_scale=[1.0, 1.0, 0.1, 0.2])
     scale_v, scale_omega, yaw_per_m, delay_s = (float(value) for value in fit.x)
     return Kinematics(scale_v=scale_v, scale_omega=scale_omega, yaw_per_m=yaw_per_m, delay_s=delay_s)
+
+
+def fit_lag(runs: list[Run], kinematics: Kinematics) -> Lag:
+    """Delay and time constants with which a first-order lag towards the scaled commands fits the true velocities."""
+
+    def residuals(parameters: FloatArray) -> FloatArray:
+        parts = []
+        for run in runs:
+            aims = calibrated(kinematics.model_copy(update={"delay_s": float(parameters[0])}), run.track, run.times)
+            for axis, column in enumerate((0, 2)):
+                keep = np.exp(-run.dt_s / parameters[1 + axis])
+                state = lfilter([1.0 - keep], [1.0, -keep], aims[:, column])
+                parts.append(((state - run.velocities[1:, column]) / units[axis])[run.valid[1:]])
+        return np.concatenate(parts)
+
+    units = [max(1e-3, float(np.concatenate([run.velocities[:, column] for run in runs]).std())) for column in (0, 2)]
+    fit = least_squares(residuals, [0.1, 0.2, 0.2], bounds=([0.0, 0.02, 0.02], [1.0, 2.0, 2.0]), diff_step=1e-2)
+    delay, lag_v, lag_omega = (float(value) for value in fit.x)
+    return Lag(delay_s=delay, lag_s=(lag_v, lag_omega))
 
 
 def fit_noise(rollouts: list[Rollout], config: CalibrationConfig) -> NoiseDensity:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fgloc.motion.card import Kinematics
+from fgloc.motion.card import Kinematics, Lag
 from fgloc.motion.forms import calibrated
 from fgloc.types import FloatArray
 from training.config import NetworkConfig
@@ -105,30 +105,31 @@ class DisplacementNet(nn.Module):
 
 
 class VelocityNet(nn.Module):
-    """[v, ω] a step later from (v, ω, u_v, u_ω, Δt), in the rate form. Source: paper eq. 6, 10."""
+    """[v, ω] a step later from (v, ω, u_v, u_ω, Δt): a lag plus Δt times a network. Source: paper eq. 6, 10."""
 
-    def __init__(self, config: NetworkConfig, kinematics: Kinematics, runs: list[Run]) -> None:
+    def __init__(self, config: NetworkConfig, kinematics: Kinematics, lag: Lag, runs: list[Run]) -> None:
         """Take the normalization from the training runs."""
         super().__init__()
-        self.config, self.kinematics = config, kinematics
+        self.config, self.kinematics, self.lag = config, kinematics, lag
         told = np.concatenate([self._features(run) for run in runs])
         actual = np.concatenate([run.velocities[:, [0, 2]] for run in runs])
         dts = np.array([0.5, 1.0]) * config.dt_s  # the range that sub-steps will have
         mean = [*actual.mean(axis=0), *told.mean(axis=0), dts.mean()]
         std = [*actual.std(axis=0), *told.std(axis=0), dts.std()]
-        rate = np.concatenate([np.diff(run.velocities[:, [0, 2]], axis=0) / run.dt_s for run in runs])
+        rate = np.maximum(actual.std(axis=0), 1e-3) / np.array(lag.lag_s)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
-        self.register_buffer("scale", torch.tensor(3.0 * rate.std(axis=0), dtype=torch.float32))
+        self.register_buffer("scale", torch.tensor(rate, dtype=torch.float32))
         self.net = mlp([5, *config.hidden, 2])
 
     def _features(self, run: Run) -> FloatArray:
         limits = np.append(run.times, len(run.poses) * run.dt_s)
-        return run.track.means(limits - self.kinematics.delay_s)
+        return run.track.means(limits - self.lag.delay_s)
 
     def samples(self, runs: list[Run]) -> Samples:
         """Samples of runs, in order."""
-        return _samples(runs, [self._features(run) for run in runs], self.kinematics)
+        aims = self.kinematics.model_copy(update={"delay_s": self.lag.delay_s})
+        return _samples(runs, [self._features(run) for run in runs], aims)
 
     def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
         """Poses ``(b, steps, 3)`` after each step, seen from the start.
@@ -138,14 +139,18 @@ class VelocityNet(nn.Module):
         """
         pair = 2 if rng is not None and steps % 2 == 0 and torch.rand(1, generator=rng).item() < 0.5 else 1
         dt = samples.dt_s * pair
-        told = samples.features[starts[:, None] + torch.arange(steps)]
-        told = told.reshape(len(starts), steps // pair, pair, 2).mean(dim=2)
+        rows = starts[:, None] + torch.arange(steps)
+        told, aims = (
+            part.reshape(len(starts), steps // pair, pair, 2).mean(dim=2)
+            for part in (samples.features[rows], samples.base[rows][..., [0, 2]])
+        )
+        keep = torch.exp(-dt / torch.tensor(self.lag.lag_s))
         state = samples.velocities[starts]
         dts = torch.full((len(starts), 1), dt)
         states = [state]
         for k in range(steps // pair):
             x = torch.cat([state, told[:, k], dts], dim=1)
-            state = state + dt * self.scale * self.net((x - self.mean) / self.std)
+            state = aims[:, k] + keep * (state - aims[:, k]) + dt * self.scale * self.net((x - self.mean) / self.std)
             states.append(state)
         velocity = torch.stack(states, dim=1)
         between = 0.5 * (velocity[:, :-1] + velocity[:, 1:]).repeat_interleave(pair, dim=1) * samples.dt_s

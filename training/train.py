@@ -18,9 +18,9 @@ from tqdm import tqdm
 
 from fgloc.errors import FglocError
 from fgloc.motion.card import ModelCard, Split
-from fgloc.motion.load import load_model, save_model
-from training.calibrate import fit_joint, fit_kinematics, fit_noise, fit_variance_scale, noise_covs
-from training.config import OptimizationConfig, TrainConfig, load_train_config
+from fgloc.motion.load import load_model, read_model, save_model
+from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance_scale, noise_covs
+from training.config import NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
@@ -40,9 +40,7 @@ def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, m
     torch.manual_seed(config.optimization.seed)
     training = [runs[name] for name in split.train]
     validation = [runs[name] for name in split.validation]
-    kinematics = fit_kinematics(training)
-    kind = DisplacementNet if config.network.kind == "displacement" else VelocityNet
-    net = kind(config.network, kinematics, training)
+    net = new_net(config.network, training)
     train_mean(net, training, validation, config.optimization)
     if isinstance(net, DisplacementNet):
         train_variance(net, training, validation, config.optimization)
@@ -57,6 +55,14 @@ def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, m
     card = card.model_copy(update={"figures": card_figures([roll_model(load_model(path), r, STEP_S) for r in tested])})
     save_model(path, tensors_of(net), card)
     return card
+
+
+def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
+    """An untrained network on top of what is known of these recordings' robot."""
+    kinematics = fit_kinematics(training)
+    if config.kind == "displacement":
+        return DisplacementNet(config, kinematics, training)
+    return VelocityNet(config, kinematics, fit_lag(training, kinematics), training)
 
 
 def train_mean(net: MotionNet, training: list[Run], validation: list[Run], config: OptimizationConfig) -> None:
@@ -202,8 +208,6 @@ def _from_all(config: TrainConfig, runs: dict[str, Run], folds: list[ModelCard],
         parts = [getattr(c, name) for c in folds]
         if parts[0] is not None:
             update[name] = type(parts[0]).model_validate(_mean([p.model_dump() for p in parts]))
-    from fgloc.motion.load import read_model
-
     tensors, _ = read_model(path)
     card = card.model_copy(update=update)
     save_model(path, tensors, card)

@@ -35,6 +35,13 @@ class Kinematics(Section):
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)] = 0.0
 
 
+class Lag(Section):
+    """First-order response to commands, from which a velocity model's network learns the difference."""
+
+    delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)]
+    lag_s: tuple[Positive, Positive] = Field(description="time constants of v and ω")
+
+
 class JointErrors(Section):
     """Error covariances of wheels (W) and model (N) over windows, and C = E[e_n e_wᵀ]; body frame at the window's end.
 
@@ -73,6 +80,7 @@ class ModelCard(Section):
     hold_s: Positive = Field(description="a command is believed to hold for this long when the next one is missing")
     history_s: Positive = Field(description="seconds of commands before a step that the model wants")
     kinematics: Kinematics = Kinematics()
+    lag: Lag | None = Field(None, description="velocity: the known part of the response")
     edges_s: tuple[FiniteFloat, ...] = Field((), description="displacement: limits of the age bins, youngest first")
     velocity_decay_s: Positive = Field(0.3, description="displacement: time constant of the velocity's innovation")
     input_mean: tuple[FiniteFloat, ...]
@@ -107,8 +115,8 @@ class ModelCard(Section):
             raise ValueError(f"a {self.kind} model needs the inputs {sorted(needed)}, the card lacks {sorted(missing)}")
         if self.kind == "displacement":
             _increasing(self.edges_s)
-        elif self.noise is None:
-            raise ValueError("a velocity model needs the noise densities of its error; the card has none")
+        elif self.noise is None or self.lag is None:
+            raise ValueError("a velocity model needs a lag and the noise densities of its error; the card lacks one")
         n_scales = {"velocity": 2, "displacement": 3}[self.kind]
         for name, values, wanted in (
             ("input_mean", self.input_mean, self.n_inputs),

@@ -62,19 +62,23 @@ class MotionModel(Protocol):
 
 
 class VelocityModel:
-    """The paper's model: [v, ω] rolled out, ``[v, ω]ₖ₊₁ = [v, ω]ₖ + Δt F(v, ω, u_v, u_ω, Δt)``, kinematics known.
+    """The paper's model: ``[v, ω]ₖ₊₁ = F(v, ω, u_v, u_ω, Δt)``, rolled out, kinematics known.
 
-    Source: paper eq. 9 and 10, written in the rate form of eq. 6, so that Δt may vary.
+    F is a first-order lag towards the calibrated commands plus Δt times a network, so that Δt may vary and the network
+    starts from what is known.
+
+    Source: paper eq. 9 and 10; the network's part in the rate form of eq. 6.
     """
 
     def __init__(self, card: ModelCard, network: Network) -> None:
         """Take a checked card and its network."""
-        if card.noise is None:
-            raise ModelError("a velocity model's card needs noise densities")
+        if card.noise is None or card.lag is None:
+            raise ModelError("a velocity model's card needs noise densities and a lag")
         self.card = card
         self.joint = _joint(card)
         self._network = network
         self._noise = card.noise
+        self._delay, self._lag = card.lag.delay_s, np.array(card.lag.lag_s)
         self._scale = np.array(card.output_scale)
         self._track: CommandTrack | None = None
 
@@ -101,7 +105,9 @@ class VelocityModel:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
         n = _sub_steps(duration, self.card.dt_s)
         dt = duration / n
-        told = track.means(start - self.card.kinematics.delay_s + dt * np.arange(n + 1, dtype=np.float64))
+        told = track.means(start - self._delay + dt * np.arange(n + 1, dtype=np.float64))
+        aims = _twists(self.card.kinematics, told)[:, ::2]
+        keep = np.exp(-dt / self._lag)
         states = np.empty((n + 1, 2))
         states[0] = velocity
         x = np.empty((1, 5), dtype=np.float32)
@@ -110,7 +116,7 @@ class VelocityModel:
         for k in range(n):
             x[0, :2] = states[k]
             x[0, 2:4] = told[k]
-            states[k + 1] = states[k] + gain * self._network(x)[0]
+            states[k + 1] = aims[k] + keep * (states[k] - aims[k]) + gain * self._network(x)[0]
         return states
 
 
