@@ -159,13 +159,13 @@ class Gate:
             return "stamp_zero"
         if topic is None or stamp > topic.newest_ns:
             return ""
-        far_back = stamp < topic.newest_ns - self._config.clock_back_s * 1e9
-        if far_back and topic.back:  # twice running: the clock was set back (a bag loops), stamps may come again
+        if stamp >= topic.newest_ns - self._config.clock_back_s * 1e9:
+            return "duplicate_stamp" if stamp in topic.recent else ""
+        if topic.back:  # twice running: the clock was set back (a bag loops), its stamps may come again
             topic.recent.clear()
             topic.newest_ns = stamp
-            far_back = False
-        topic.back = far_back
-        return "duplicate_stamp" if stamp in topic.recent else ""
+        topic.back = not topic.back
+        return ""
 
     def _remember(self, event: Event, topic: _Topic | None) -> None:
         stamp = event.stamp_ns

@@ -247,13 +247,13 @@ class Stepper:
                 f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped"
             )
         else:
-            jump_s = (event.stamp_ns - self._last_ns) * 1e-9
+            jump_s = (event.stamp_ns - self._newest_ns) * 1e-9
+            steps = self._finish()
             self._segment += 1
             self._jumps.append(
                 f"the clock jumped {'ahead' if jump_s > 0 else 'back'} by {abs(jump_s):.1f} s at "
                 f"{event.stamp_ns * 1e-9:.3f} s: segment {self._segment} begins"
             )
-            steps = self._finish()
         self._reset()
         return steps
 
@@ -264,8 +264,9 @@ class Stepper:
         last = self._last_ns
         if last is None:
             stamps = [buffer.stamps[0] for buffer in self._motion.values() if buffer.stamps]
-            stamps += [event.stamp_ns for event in self._pending[:1]]
-            return min(stamps, default=None)
+            sightings = [event.stamp_ns for event in self._pending[:1]]
+            first = min(stamps + sightings, default=None)
+            return sightings[0] if first is not None and sightings and sightings[0] < first + self._min_ns else first
         if self._newest_ns < last + self._min_ns:
             return None
         at = bisect_left(self._pending, last + self._min_ns, key=lambda e: e.stamp_ns)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.sensors.timeline import Twist
-from fgloc.sensors.tracks import MAX_SPEED, MAX_TURN, Track, mean_twist
+from fgloc.sensors.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
 from fgloc.types import FloatArray, JointsEvent
 
 _PATIENCE = 20  # messages without the wheels' joints before that is said
@@ -42,7 +42,8 @@ class TicksTrack(Track):
 
     def _forget(self) -> None:
         self._angles: tuple[float, float] | None = None
-        self._moving: Twist | None = None
+        self._reported: Twist | None = None
+        self._moving: Twist | None = None  # the newest twist that is known
 
     def _take(self, event: JointsEvent) -> None:
         found = self._find(event.names)
@@ -57,14 +58,14 @@ class TicksTrack(Track):
             seconds = (event.stamp_ns - self._last_ns) * 1e-9
             piece = self._turned(angles, seconds)
             if piece is None and reported is not None and seconds <= self._config.hold_s:
-                piece = mean_twist(self._moving, reported)
+                piece = mean_twist(self._reported, reported)
         self._extend(event.stamp_ns, piece, self._moving)
-        self._angles, self._moving = angles, piece or reported or self._moving
+        self._angles, self._reported, self._moving = angles, reported, reported or piece or self._moving
         self._reach(event.stamp_ns, self._moving)
 
     def _turned(self, angles: tuple[float, float] | None, seconds: float) -> Twist | None:
         """The twist that turned the wheels from the last message's angles to these; None if they cannot tell."""
-        if angles is None or self._angles is None:
+        if angles is None or self._angles is None or seconds > MAX_GAP_S:
             return None
         left, right = angles[0] - self._angles[0], angles[1] - self._angles[1]
         roll = self._config.angle_range

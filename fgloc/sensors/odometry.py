@@ -9,13 +9,13 @@ from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.timeline import Twist
-from fgloc.sensors.tracks import MAX_SPEED, MAX_TURN, Track, mean_twist
+from fgloc.sensors.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
 from fgloc.types import OdometryEvent
 
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 _CHECK_TURN, _CHECK_PATH = 0.2, 5.0  # rad or m of motion after which twist and pose are compared
-_STILL = 0.05  # a path shorter than this share of the other's did not move
+_STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
 _DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
 
 
@@ -48,6 +48,8 @@ class OdometryTrack(Track):
         x, y, _ = event.position.tolist()
         twist = None if math.isnan(vx + vy + w) else (vx, vy, w)
         pose = None if math.isnan(x + y) else (x, y, quaternion_yaw(event.orientation))
+        if twist is None and pose is None:
+            return
         piece = None
         if self._last_ns is not None:
             piece = self._connect((event.stamp_ns - self._last_ns) * 1e-9, pose, twist)
@@ -71,10 +73,10 @@ class OdometryTrack(Track):
         return moved if any(moved) else mean
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
-        """The constant twist from the last pose to this one; None if one is unknown, or if the pose jumped."""
-        if pose is None or self._pose is None:
+        """The constant twist from the last pose to this one; None if that cannot be known."""
+        if pose is None or self._pose is None or seconds > MAX_GAP_S:
             return None
-        dx, dy, dyaw = se2.log(se2.between(self._pose, pose)).tolist()
+        dx, dy, dyaw = _difference(self._pose, pose)
         speed, turn = math.hypot(dx, dy) / seconds, abs(dyaw) / seconds
         # Judged by what the twist says or, if that is silent, by the motion just before.
         slack = 1.0
@@ -132,6 +134,15 @@ class OdometryTrack(Track):
             text = "the odometry's twist is used; it agrees with its pose"
         self._mode = "twist" if insists else mode
         self.notes["source"] = text
+
+
+def _difference(a: Pose, b: Pose) -> Twist:
+    """``log(a⁻¹ b)``, as `fgloc.se2` has it, without arrays: it runs for every message."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    x, y, turn = c * (b[0] - a[0]) + s * (b[1] - a[1]), c * (b[1] - a[1]) - s * (b[0] - a[0]), se2.wrap(b[2] - a[2])
+    half = 0.5 * turn
+    k = 1.0 - half * half / 3.0 if abs(turn) < 1e-5 else half / math.tan(half)
+    return k * x + half * y, k * y - half * x, turn
 
 
 def _differ(a: float, b: float) -> bool:

@@ -17,8 +17,9 @@ Twist = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s] in the body
 _KEEP_NS = 30_000_000_000  # late sightings reach back no further
 _TRIM_EVERY = 256
 _MAX_TURN = 1.0  # rad: longer arcs are cut, so that the quadrature of the noise stays exact to 1e-6
-_NODES = tuple(0.5 + 0.5 * s * math.sqrt(0.6) for s in (-1.0, 0.0, 1.0))  # Gauss-Legendre on [0, 1]
-_WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
+_SHORT_TURN = 0.1  # rad: below it two nodes do
+_TWO_NODES = ((0.5 - 0.5 / math.sqrt(3.0), 0.5), (0.5 + 0.5 / math.sqrt(3.0), 0.5))  # Gauss-Legendre on [0, 1]
+_THREE_NODES = tuple((0.5 + 0.5 * s * math.sqrt(0.6), w / 18.0) for s, w in ((-1.0, 5.0), (0.0, 8.0), (1.0, 5.0)))
 _SILENT_SPEED = 0.5  # m/s and rad/s that a silent robot is believed capable of at least ...
 _SILENT_TAU_S = 2.0  # ... changing its mind after this time
 _FLOOR = 1e-12  # keeps a covariance without any noise positive definite
@@ -162,7 +163,7 @@ def _advance(
     p11, p12, p22 = c * b11 + s * b12 + yi * b13, c * b12 - s * b11 - xi * b13, c * b22 - s * b21 - xi * b23
     p13, p23 = b13, b23
     along, left = sx * vx - cx * vy, cx * vx + sx * vy
-    for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+    for node, weight in _TWO_NODES if abs(angle) < _SHORT_TURN else _THREE_NODES:
         k, u = weight * h, node * h
         angle = w * u
         c, s = math.cos(angle), math.sin(angle)

@@ -12,6 +12,7 @@ from fgloc.sensors.timeline import Twist, TwistTimeline
 from fgloc.types import CommandEvent, Step
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
+MAX_GAP_S = 5.0  # over a longer silence no difference is trusted: the robot may have been restarted
 
 
 class Track:

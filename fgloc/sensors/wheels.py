@@ -33,7 +33,7 @@ class WheelMotion:
     its largest speed so far, so that every step has a measurement; such steps are counted as "wheels.silence".
 
     Sources: with "auto" wheel angles if the geometry is given, else the odometry (see `OdometryTrack`), else commands:
-    the best that has been heard since before the step.
+    the best that has been heard.
 
     ``rejections`` counts wheels.silence, wheels.pose_reset (an odometry that jumped) and wheels.encoder_reset.
     """
@@ -132,11 +132,11 @@ class WheelMotion:
             track.ingest(step)
 
     def _active(self, step: Step) -> TwistTimeline:
-        """The best source that has spoken since before the step, else the best that has spoken at all."""
+        """The best source that has spoken before the step's end, else the best that has spoken at all."""
         heard = [track for track in self._tracks if track.timeline.start_ns is not None]
         for track in heard:
             start = track.timeline.start_ns
-            if start is not None and start <= step.start_ns - self._delay_ns:
+            if start is not None and start < step.stamp_ns - self._delay_ns:
                 if track is not self._tracks[-1]:  # worse ones are not needed any more
                     self._tracks = self._tracks[: self._tracks.index(track) + 1]
                 self._chosen = track.kind

@@ -1,0 +1,375 @@
+"""Wheel motion: exact integration, honest covariance, every source."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from event_makers import command, corners, in_order_of_receipt, joints, ns, odometry, run, stepper, times
+
+from fgloc import se2
+from fgloc.config import NoiseDensity, WheelsConfig
+from fgloc.errors import ConfigError
+from fgloc.sensors.timeline import TwistTimeline
+from fgloc.sensors.wheels import WheelMotion
+
+GEOMETRY = dict(left_radius=0.05, right_radius=0.06, track=0.3)
+
+
+class Drive:
+    """A smooth drive with its exact path, from t = 0."""
+
+    def __init__(self, seconds=20.0, dt=1e-3):
+        self.t = np.arange(0.0, seconds + dt, dt)
+        poses = [np.zeros(3)]
+        for t in self.t[:-1]:
+            v, w = self.twist(t + 0.5 * dt)
+            poses.append(se2.compose(poses[-1], se2.exp((v * dt, 0.0, w * dt))))
+        self.poses = np.array(poses)
+        self.stamps = np.array([ns(t) for t in self.t])
+
+    @staticmethod
+    def twist(t):
+        return 0.4 + 0.3 * math.sin(0.7 * t), 0.8 * math.sin(0.5 * t + 1.0)
+
+    def pose(self, t):
+        return se2.interpolate(self.stamps, self.poses, np.array([ns(t)]))[0]
+
+    def motion(self, start_ns, end_ns):
+        a, b = se2.interpolate(self.stamps, self.poses, np.array([start_ns, end_ns]))
+        return se2.between(a, b)
+
+    def wheel_angles(self, rate):
+        """Angles of both wheels at these times, from their speeds."""
+        v, w = np.array([self.twist(t) for t in self.t]).T
+        left = np.concatenate([[0], np.cumsum((v - 0.15 * w)[:-1] * np.diff(self.t))]) / GEOMETRY["left_radius"]
+        right = np.concatenate([[0], np.cumsum((v + 0.15 * w)[:-1] * np.diff(self.t))]) / GEOMETRY["right_radius"]
+        stride = round(1000 / rate)
+        return zip(self.t[::stride], left[::stride], right[::stride], strict=True)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return Drive()
+
+
+def total(steps, config):
+    wheels = WheelMotion(config)
+    pose, cov = np.zeros(3), np.zeros((3, 3))
+    for step in steps:
+        measured = wheels.measure(step)
+        if measured is not None:
+            assert measured.source == "wheels"
+            assert (measured.start_ns, measured.stamp_ns) == (step.start_ns, step.stamp_ns)
+            cov = se2.compose_cov(cov, measured.motion, measured.cov)
+            pose = se2.compose(pose, measured.motion)
+    return pose, cov, wheels
+
+
+def timeline(vx, vy, w, seconds=1.0, pieces=20):
+    made = TwistTimeline()
+    made.begin(0)
+    for k in range(pieces):
+        made.extend(ns(seconds * (k + 1) / pieces), (vx, vy, w))
+    return made
+
+
+# --- integration and covariance ---
+
+
+@pytest.mark.parametrize(
+    "twist", [(0.5, 0.0, 0.0), (0.5, 0.0, 0.8), (0.0, 0.0, 2.0), (-0.3, 0.0, -4.0), (0.3, 0.2, 0.5), (0.0, 0.0, 0.0)]
+)
+@pytest.mark.parametrize("cuts", [20, 7])
+def test_covariance_does_not_depend_on_the_cadence(twist, cuts):
+    """One second as one step, and as many: straight, arc, spin, backwards, sideways, at rest."""
+    noise = NoiseDensity(xy_per_sqrt_s=0.01, yaw_per_sqrt_s=0.02)
+    whole = timeline(*twist)
+    motion, cov, unknown = whole.integrate(0, ns(1.0), noise)
+    assert unknown == 0.0
+    assert motion == pytest.approx(se2.exp(twist), abs=1e-12)
+    pose, split = np.zeros(3), np.zeros((3, 3))
+    limits = [ns(k / cuts) for k in range(cuts)] + [ns(1.0)]
+    for start, end in itertools.pairwise(limits):
+        part, part_cov, _ = whole.integrate(start, end, noise)
+        split = se2.compose_cov(split, part, part_cov)
+        pose = se2.compose(pose, part)
+    assert pose == pytest.approx(motion, abs=1e-9)
+    scale = np.sqrt(np.outer(cov.diagonal(), cov.diagonal()))
+    assert np.abs(split - cov).max() / scale.max() < 1e-4
+    assert np.all(np.abs(split - cov) <= 0.01 * scale)
+    assert np.linalg.eigvalsh(cov)[0] > 0.0
+
+
+def test_covariance_does_not_depend_on_the_rate_of_messages():
+    noise = NoiseDensity()
+    covs = [timeline(0.5, 0.0, 1.5, pieces=pieces).integrate(0, ns(1.0), noise)[1] for pieces in (1, 5, 200)]
+    assert covs[1] == pytest.approx(covs[0], rel=1e-4, abs=1e-8)
+    assert covs[2] == pytest.approx(covs[0], rel=1e-4, abs=1e-8)
+
+
+def test_covariance_is_that_of_simulated_noise():
+    """White noise of the given densities in a fine simulation spreads as predicted."""
+    rng = np.random.default_rng(5)
+    noise = NoiseDensity()
+    v, w, seconds, n, runs = 0.6, 0.9, 2.0, 400, 20_000
+    h = seconds / n
+    sigmas = np.sqrt(
+        h
+        * np.array(
+            [
+                noise.x_per_sqrt_m**2 * v + noise.xy_per_sqrt_rad**2 * w + noise.xy_per_sqrt_s**2,
+                noise.y_per_sqrt_m**2 * v + noise.xy_per_sqrt_rad**2 * w + noise.xy_per_sqrt_s**2,
+                noise.yaw_per_sqrt_m**2 * v + noise.yaw_per_sqrt_rad**2 * w + noise.yaw_per_sqrt_s**2,
+            ]
+        )
+    )
+    x, y, yaw = np.zeros(runs), np.zeros(runs), np.zeros(runs)
+    for _ in range(n):
+        dx, dy, dyaw = rng.normal(size=(3, runs)) * sigmas[:, None]
+        dx += v * h
+        middle = yaw + 0.5 * w * h
+        x += np.cos(middle) * dx - np.sin(middle) * dy
+        y += np.sin(middle) * dx + np.cos(middle) * dy
+        yaw += w * h + dyaw
+    motion, cov, _ = timeline(v, 0.0, w, seconds).integrate(0, ns(seconds), noise)
+    errors = np.array([se2.log(se2.between(motion, pose)) for pose in zip(x, y, yaw, strict=True)])
+    sampled = np.cov(errors.T)
+    scale = np.sqrt(np.outer(cov.diagonal(), cov.diagonal()))
+    assert np.abs(sampled - cov).max() < 0.03 * scale.max()
+    assert np.all(np.abs(sampled - cov) < 0.05 * scale)
+
+
+def test_noise_along_is_xx_and_across_is_yy():
+    none = dict.fromkeys(NoiseDensity.model_fields, 0.0)
+    noise = NoiseDensity(**(none | dict(x_per_sqrt_m=0.1, y_per_sqrt_m=0.01)))
+    _, cov, _ = timeline(2.0, 0.0, 0.0).integrate(0, ns(1.0), noise)
+    assert cov[0, 0] == pytest.approx(0.1**2 * 2.0)
+    assert cov[1, 1] == pytest.approx(0.01**2 * 2.0)
+
+
+def test_covariance_without_any_noise_is_still_positive_definite():
+    nothing = NoiseDensity(**dict.fromkeys(NoiseDensity.model_fields, 0.0))
+    _, cov, _ = timeline(0.5, 0.0, 0.5).integrate(0, ns(1.0), nothing)
+    assert np.linalg.eigvalsh(cov)[0] > 0.0
+
+
+def test_silence_grows_alike_however_it_is_cut():
+    made = timeline(0.5, 0.0, 0.0)
+    noise = NoiseDensity()
+    _, whole, unknown = made.integrate(ns(1.0), ns(21.0), noise)
+    parts = sum(made.integrate(ns(1.0 + k), ns(2.0 + k), noise)[1] for k in range(20))
+    assert unknown == pytest.approx(20.0)
+    assert parts == pytest.approx(whole, rel=1e-9, abs=1e-9)
+    assert 1.0 < math.sqrt(whole[0, 0]) < 10.0  # a robot of 0.5 m/s may be anywhere near
+
+
+# --- sources ---
+
+
+def test_twists_repeat_a_smooth_drive(drive):
+    steps = run(stepper(), [odometry(t, twist=drive.twist(t)) for t in times(0.1, 18, 20)])
+    pose, _, wheels = total(steps, WheelsConfig(source="twist"))
+    expected = drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns)
+    assert pose == pytest.approx(expected, abs=2e-3)
+    assert not wheels.rejections
+
+
+def test_poses_repeat_a_drive_exactly(drive):
+    steps = run(
+        stepper(),
+        in_order_of_receipt(
+            [odometry(t, drive.pose(t)) for t in times(0.1, 18, 20)], [corners(t) for t in times(0.113, 18, 7)]
+        ),
+    )
+    pose, _, _ = total(steps, WheelsConfig(source="pose"))
+    expected = drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns)
+    assert pose == pytest.approx(expected, abs=1e-3)
+
+
+def test_wheel_angles_repeat_a_drive(drive):
+    events = [joints(t, left, right) for t, left, right in drive.wheel_angles(50) if 0.1 <= t < 18]
+    steps = run(stepper(), events)
+    for config in (WheelsConfig(source="ticks", **GEOMETRY), WheelsConfig(**GEOMETRY)):
+        pose, _, wheels = total(steps, config)
+        assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=5e-3)
+        assert not wheels.rejections
+
+
+def test_wheel_rates_stand_in_for_angles(drive):
+    def rates(t):
+        v, w = drive.twist(t)
+        return (v - 0.15 * w) / GEOMETRY["left_radius"], (v + 0.15 * w) / GEOMETRY["right_radius"]
+
+    steps = run(stepper(), [joints(t, None, None, rates=rates(t)) for t in times(0.1, 18, 50)])
+    pose, _, _ = total(steps, WheelsConfig(source="ticks", **GEOMETRY))
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=2e-3)
+
+
+def test_commands_hold_until_the_next_over_gaps():
+    stamps = [*times(1, 3, 10), 3.4, *times(3.8, 6, 10)]
+    events = [command(t, 0.5 if t < 3 else 0.2, 0.0) for t in stamps]
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig(source="command", hold_s=0.6))
+    end = steps[-1].stamp_ns * 1e-9
+    held = 3.4  # the last command of 0.5 m/s was given at 2.9 and holds until 3.4
+    assert pose[0] == pytest.approx(0.5 * (held - 1.0) + 0.2 * (end - held), abs=1e-9)
+    assert not wheels.rejections
+
+
+def test_the_delay_shifts_commands():
+    events = [command(t, 1.0 if t >= 2.0 else 0.0) for t in times(1, 4, 20)]
+    steps = run(stepper(), events)
+    end = steps[-1].stamp_ns * 1e-9
+    for delay in (0.0, 0.12, 0.7):
+        pose, _, _ = total(steps, WheelsConfig(source="command", delay_s=delay))
+        assert pose[0] == pytest.approx(end - 2.0 - delay, abs=1e-9)
+
+
+def test_scales_and_veer():
+    steps = run(stepper(), [command(t, 0.5, 0.2) for t in times(1, 3, 20)])
+    config = WheelsConfig(source="command", scale_v=0.9, scale_omega=1.2, yaw_per_m=-0.1)
+    pose, _, _ = total(steps, config)
+    seconds = (steps[-1].stamp_ns - steps[0].stamp_ns) * 1e-9
+    assert pose == pytest.approx(se2.exp((0.45 * seconds, 0.0, (0.24 - 0.045) * seconds)), abs=1e-9)
+
+
+def test_auto_prefers_odometry_and_says_so(drive):
+    events = in_order_of_receipt(
+        [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 10, 20)],
+        [command(t, 9.0, 9.0) for t in times(0.12, 10, 10)],
+    )
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=2e-3)
+    assert wheels.notes[0] == "wheel motion from the odometry"
+    assert any("agrees with its pose" in note for note in wheels.notes)
+
+
+def test_auto_takes_commands_where_nothing_else_speaks():
+    steps = run(stepper(), [command(t, 0.5) for t in times(1, 3, 10)])
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose[0] == pytest.approx(0.5 * (steps[-1].stamp_ns - steps[0].stamp_ns) * 1e-9, abs=1e-9)
+    assert "commands" in wheels.notes[0]
+
+
+def test_auto_uses_the_twist_of_an_odometry_whose_pose_never_moves():
+    steps = run(stepper(), [odometry(t, twist=(0.5, 0.3)) for t in times(1, 6, 20)])
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose[2] == pytest.approx(0.3 * (steps[-1].stamp_ns - steps[0].stamp_ns) * 1e-9, abs=1e-9)
+    assert any("pose does not move" in note for note in wheels.notes)
+
+
+def test_a_disagreement_of_twist_and_pose_is_said():
+    """A skid-steered robot whose pose comes from elsewhere."""
+    steps = run(stepper(), [odometry(t, (0, 0, 0.34 * t), (0.0, 1.0)) for t in times(1, 3, 20)])
+    _, _, wheels = total(steps, WheelsConfig())
+    assert any("disagrees" in note for note in wheels.notes)
+
+
+def test_a_later_better_source_takes_over(drive):
+    events = in_order_of_receipt(
+        [command(t, *drive.twist(t)) for t in times(0.1, 18, 20)],
+        [odometry(t, drive.pose(t), drive.twist(t)) for t in times(4.0, 18, 20)],
+    )
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.05)
+    assert wheels.notes[0] == "wheel motion from the odometry"
+    assert sum(wheels.rejections.values()) <= 1  # the step in which it began
+
+
+def test_source_none_measures_nothing_but_can_carry():
+    steps = run(stepper(), [odometry(t, twist=(1.0, 0.0)) for t in times(1, 2, 20)])
+    wheels = WheelMotion(WheelsConfig(source="none"))
+    assert all(wheels.measure(step) is None for step in steps)
+    motion, cov = wheels.carry(steps[-1], steps[-1].stamp_ns, steps[-1].stamp_ns - ns(0.1))
+    assert not motion.any()
+    assert cov[0, 0] > 0.04**2
+
+
+def test_ambiguous_or_missing_wheels_are_named():
+    four = ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel")
+    steps = run(stepper(), [joints(t, 1, 2, names=four) for t in times(1, 4, 20)])
+    with pytest.raises(ConfigError, match=r"front_left_wheel, rear_left_wheel.*wheels\.left_joint"):
+        total(steps, WheelsConfig(source="ticks", **GEOMETRY))
+    arm = run(stepper(), [joints(t, 1, 2, names=("shoulder", "elbow")) for t in times(1, 4, 20)])
+    with pytest.raises(ConfigError, match="shoulder, elbow"):
+        total(arm, WheelsConfig(source="ticks", **GEOMETRY))
+    _, _, wheels = total(arm, WheelsConfig(**GEOMETRY))
+    assert any("none holds both wheels" in note for note in wheels.notes)
+    with pytest.raises(ConfigError, match=r"wheels\.track"):
+        WheelMotion(WheelsConfig(source="ticks", left_radius=0.05))
+
+
+def test_configured_joints_are_used():
+    four = ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel")
+    names = dict(left_joint=four[2], right_joint=four[3])
+    angles = [(t, np.array([50 * t, -50 * t, 2 * t, 2 * t])) for t in times(1, 4, 20)]
+    made = [joints(t, 0, 0, names=four) for t, _ in angles]
+    events = [
+        type(e)(e.stamp_ns, e.received_ns, e.topic, e.names, a, e.velocity, e.effort)
+        for e, (_, a) in zip(made, angles, strict=True)
+    ]
+    steps = run(stepper(), events)
+    equal = dict(left_radius=0.1, right_radius=0.1, track=0.4)
+    pose, _, _ = total(steps, WheelsConfig(source="ticks", **equal, **names))
+    assert pose == pytest.approx([0.2 * (steps[-1].stamp_ns - steps[0].stamp_ns) * 1e-9, 0, 0], abs=1e-9)
+
+
+# --- faults and edges ---
+
+
+def test_a_refused_twist_without_pose_is_held_then_unknown():
+    nan = np.full(3, np.nan)
+    events = [
+        odometry(t, twist=(0.5, 0.0), position=nan, **(dict(linear=nan, angular=nan) if 2 < t < 4 else {}))
+        for t in times(1, 6, 20)
+    ]
+    steps = run(stepper(), events)
+    pose, cov, wheels = total(steps, WheelsConfig(source="twist", hold_s=0.5))
+    assert wheels.rejections["wheels.silence"] > 0
+    assert cov[0, 0] > 0.2
+    assert 0.5 * 3 < pose[0] < 0.5 * 4.9
+
+
+def test_the_same_step_measured_again_gives_the_same(drive):
+    steps = run(stepper(), [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 18, 20)])
+    wheels = WheelMotion(WheelsConfig())
+    first = [wheels.measure(step) for step in steps]
+    counted = wheels.rejections
+    again = [wheels.measure(step) for step in steps]
+    assert all(a is b for a, b in zip(first, again, strict=True))
+    assert wheels.rejections == counted
+
+
+def test_carry_goes_both_ways_and_agrees_with_measure(drive):
+    steps = run(stepper(), [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 18, 20)])
+    wheels = WheelMotion(WheelsConfig(source="pose"))
+    for step in steps[:40]:
+        measured = wheels.measure(step)
+    motion, cov = wheels.carry(step, step.start_ns, step.stamp_ns)
+    assert motion == pytest.approx(measured.motion, abs=1e-12)
+    assert cov == pytest.approx(measured.cov, abs=1e-15)
+    back, back_cov = wheels.carry(step, step.stamp_ns, step.stamp_ns - ns(3.0))
+    there, there_cov = wheels.carry(step, step.stamp_ns - ns(3.0), step.stamp_ns)
+    assert se2.compose(there, back) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert back == pytest.approx(drive.motion(step.stamp_ns, step.stamp_ns - ns(3.0)), abs=1e-3)
+    # Going there and back by the same measurement ends where it began, without any error.
+    ad = se2.adjoint(there)
+    assert back_cov == pytest.approx(ad @ there_cov @ ad.T, rel=1e-9, abs=1e-15)
+
+
+def test_a_new_segment_shares_no_motion_with_the_last():
+    stamps = [*times(1, 3, 20), *times(1001, 1003, 20)]
+    steps = run(stepper(), [odometry(t, (0.3 * t, 0, 0), (0.3, 0)) for t in stamps])
+    assert {step.segment for step in steps} == {0, 1}
+    pose, _, wheels = total(steps, WheelsConfig(source="pose"))
+    inside = sum((step.stamp_ns - step.start_ns) * 1e-9 for step in steps)
+    assert pose[0] == pytest.approx(0.3 * inside, abs=1e-6)
+    assert not wheels.rejections
+
+
+def test_a_step_of_no_length_has_no_motion():
+    steps = run(stepper(), [odometry(t) for t in times(1, 2, 20)])
+    assert WheelMotion(WheelsConfig()).measure(steps[0]) is None
