@@ -44,7 +44,7 @@ def read_metadata(folder: Path) -> BagMetadata | None:
         count = information.get("message_count")
         return BagMetadata(
             files=tuple(folder / name for name in dict.fromkeys(names)),
-            compressed=str(information.get("compression_mode") or "none").lower() not in ("none", ""),
+            compressed=str(information.get("compression_mode")).lower() in ("file", "message"),
             message_count=count if isinstance(count, int) and count >= 0 else None,
         )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
