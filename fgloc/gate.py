@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import GateConfig
+from fgloc.gate_sightings import EMPTIED, SightingsGate
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -19,24 +20,19 @@ from fgloc.types import (
     ImageEvent,
     ImuEvent,
     JointsEvent,
-    MarkerCorners,
-    MarkerPose,
     MarkerPosesEvent,
     OdometryEvent,
-    RangeBearing,
     RangeBearingEvent,
     TransformEvent,
     TruthEvent,
 )
-from fgloc.validate import PLANAR, judge_corners, judge_covariance, judge_quaternion
+from fgloc.validate import PLANAR, Changes, Parts
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
 _MAX_ANGLE = 1e9  # rad, of a joint
 _MAX_ACCELERATION = 1e3  # m/s²
 _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
-
-Changes = dict[str, Any]  # fields of a repaired copy
 
 
 @dataclass(slots=True)
@@ -82,13 +78,11 @@ class Gate:
         """
         self.rejections: Counter[str] = Counter()
         self._config = config
-        self._known = None if known_ids is None else frozenset(known_ids)
         self._notes: dict[str, None] = {}  # an ordered set
-        self._unknown: set[int] = set()
+        self._parts = Parts(config, self._note)
+        self._sightings = SightingsGate(config, known_ids, self._parts, self.rejections, self._note)
         self._seen: Counter[str] = Counter()  # events by sensor
         self._topics: dict[str, _Topic] = {}
-        self._bearings: dict[str, list[int]] = {}  # by topic: beyond 2 pi, all
-        self._covs: dict[tuple[str, str], tuple[bytes, FloatArray | str]] = {}  # last covariance and its verdict
         self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {
             OdometryEvent: ("odometry", self._odometry),
             CommandEvent: ("command", self._command),
@@ -96,18 +90,15 @@ class Gate:
             ImuEvent: ("imu", self._imu),
             ImageEvent: ("image", self._image),
             TruthEvent: ("truth", self._truth),
-            CornersEvent: ("sightings", lambda e: self._sightings(e, self._corners)),
-            MarkerPosesEvent: ("sightings", lambda e: self._sightings(e, self._marker_pose)),
-            RangeBearingEvent: ("sightings", lambda e: self._sightings(e, self._range_bearing)),
+            CornersEvent: ("sightings", self._sightings.corners),
+            MarkerPosesEvent: ("sightings", self._sightings.marker_poses),
+            RangeBearingEvent: ("sightings", self._sightings.range_bearings),
         }
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each; nothing is said twice."""
-        notes = list(self._notes)
-        if self._unknown:
-            ids = ", ".join(str(i) for i in sorted(self._unknown)[:12]) + (", ..." if len(self._unknown) > 12 else "")
-            notes.append(f"sightings of ids that are not in the map are ignored: {ids}")
+        notes = [*self._notes, *self._sightings.notes]
         for reason in ("odometry.twist_yaw_rate_bound", "command.yaw_rate_bound", "imu.yaw_rate_bound"):
             bad, seen = self.rejections[reason], self._seen[reason.split(".")[0]]
             if bad >= 10 and bad > 0.1 * seen:
@@ -142,7 +133,7 @@ class Gate:
                 self._remember(event, topic)
                 return checked
             reason = checked
-        if reason != "emptied":  # its parts are counted already
+        if reason != EMPTIED:  # its parts are counted already
             self.rejections[f"{sensor}.{reason}"] += 1
         return None
 
@@ -194,14 +185,14 @@ class Gate:
         elif max(abs(wx), abs(wy), abs(wz)) > config.max_yaw_rate:
             twist = "yaw_rate_bound"
         else:
-            twist = self._cov(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
+            twist = self._parts.covariance(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
         x, y, z = event.position.tolist()
         if not math.isfinite(x + y + z):
             pose = "non_finite"
         elif max(abs(x), abs(y), abs(z)) > config.max_position:
             pose = "position_bound"
         else:
-            pose = self._quaternion(event.orientation, "orientation", changes) or self._cov(
+            pose = self._parts.quaternion(event.orientation, "orientation", changes) or self._parts.covariance(
                 event.topic, "pose", event.pose_cov, PLANAR, "pose_cov", changes
             )
         if twist:
@@ -211,7 +202,7 @@ class Gate:
             self.rejections[f"odometry.pose_{pose}"] += 1
             changes |= _NO_POSE
         if twist and pose:
-            return "emptied"
+            return EMPTIED
         return replace(event, **changes) if changes else event
 
     def _command(self, event: CommandEvent) -> Event | str:
@@ -261,7 +252,9 @@ class Gate:
             return "non_finite"
         if max(abs(wx), abs(wy), abs(wz)) > self._config.max_yaw_rate:
             return "yaw_rate_bound"
-        if reason := self._cov(event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes):
+        if reason := self._parts.covariance(
+            event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes
+        ):
             return reason
         ax, ay, az = event.linear_acceleration.tolist()
         if not abs(ax) + abs(ay) + abs(az) <= _MAX_ACCELERATION:  # also NaN
@@ -282,7 +275,7 @@ class Gate:
             return "non_finite"
         if max(abs(x), abs(y), abs(z)) > self._config.max_position:
             return "position_bound"
-        if reason := self._quaternion(event.orientation, "orientation", changes):
+        if reason := self._parts.quaternion(event.orientation, "orientation", changes):
             return reason
         return replace(event, **changes) if changes else event
 
@@ -290,106 +283,9 @@ class Gate:
         changes: Changes = {}
         if not np.isfinite(event.translation).all():
             return "non_finite"
-        if reason := self._quaternion(event.rotation, "rotation", changes):
+        if reason := self._parts.quaternion(event.rotation, "rotation", changes):
             return reason
         return replace(event, **changes) if changes else event
-
-    # --- sightings: as above, for one entry ---
-
-    def _sightings(self, event: Any, check: Callable[[str, Any], Any]) -> Any:
-        """The event with what ``check`` lets through of its sightings."""
-        after = []
-        changed = False
-        for sighting in event.sightings:
-            checked = check(event.topic, sighting)
-            if isinstance(checked, str):
-                self.rejections[f"sightings.{checked}"] += 1
-                changed = True
-            else:
-                after.append(checked)
-                changed = changed or checked is not sighting
-        if not changed:
-            return event
-        return replace(event, sightings=tuple(after)) if after else "emptied"
-
-    def _unknown_id(self, landmark_id: int) -> bool:
-        if self._known is None or landmark_id in self._known:
-            return False
-        if len(self._unknown) < 1000:
-            self._unknown.add(landmark_id)
-        return True
-
-    def _corners(self, topic: str, sighting: MarkerCorners) -> MarkerCorners | str:
-        if self._unknown_id(sighting.marker_id):
-            return "unknown_id"
-        return judge_corners(sighting.corners_px, self._config.min_marker_side_px) or sighting
-
-    def _marker_pose(self, topic: str, sighting: MarkerPose) -> MarkerPose | str:
-        if self._unknown_id(sighting.marker_id):
-            return "unknown_id"
-        changes: Changes = {}
-        distance = math.hypot(*sighting.position.tolist())
-        if not math.isfinite(distance):
-            return "non_finite"
-        if not self._config.min_range <= distance <= self._config.max_range:
-            return "range_bound"
-        reason = self._quaternion(sighting.orientation, "orientation", changes)
-        reason = reason or self._cov(topic, "marker pose", sighting.cov, range(6), "cov", changes)
-        if reason:
-            return reason
-        return replace(sighting, **changes) if changes else sighting
-
-    def _range_bearing(self, topic: str, sighting: RangeBearing) -> RangeBearing | str:
-        if self._unknown_id(sighting.landmark_id):
-            return "unknown_id"
-        distance, bearing = sighting.range_m, sighting.bearing_rad
-        if not math.isfinite(distance + bearing):
-            return "non_finite"
-        if not self._config.min_range <= distance <= self._config.max_range:
-            return "range_bound"
-        bearings = self._bearings.setdefault(topic, [0, 0])
-        bearings[1] += 1
-        if abs(bearing) > 2.0 * math.pi:
-            bearings[0] += 1
-            return "bearing_bound"
-        if bearings[0] >= 3 and bearings[0] > 0.2 * bearings[1]:
-            self._note(
-                f"{topic}: many bearings lie beyond 2 pi: probably degrees where radians were expected; none is used "
-                "while that is so: convert the recording"
-            )
-            return "bearing_unit"
-        if abs(bearing) > math.pi:
-            return replace(sighting, bearing_rad=math.remainder(bearing, 2.0 * math.pi))
-        return sighting
-
-    # --- parts: "" or the reason for rejection; a repaired copy goes into ``changes`` ---
-
-    def _quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
-        verdict = judge_quaternion(quaternion, self._config.quaternion_tolerance)
-        if isinstance(verdict, str):
-            return verdict
-        if verdict is not quaternion:
-            changes[name] = verdict
-        return ""
-
-    def _cov(
-        self, topic: str, what: str, cov: FloatArray, axes: tuple[int, ...] | range, name: str, changes: Changes
-    ) -> str:
-        raw = cov.tobytes()
-        key = (topic, what)
-        last = self._covs.get(key)
-        if last is not None and last[0] == raw:  # most drivers send the same one for ever
-            verdict = last[1]
-        else:
-            verdict, was = judge_covariance(cov, axes, self._config.max_variance)
-            if was:
-                self._note(f"{topic}: {what} covariance is {was}; the configured default is used")
-            self._covs[key] = (raw, verdict)
-        if isinstance(verdict, str):
-            return verdict
-        if verdict is not cov and verdict.tobytes() != raw:
-            changes[name] = verdict
-        return ""
 
     def _note(self, text: str) -> None:
         self._notes.setdefault(text)

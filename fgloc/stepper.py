@@ -5,8 +5,8 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
+from fgloc.buffers import EventBuffer
 from fgloc.clock import MOTION_EVENTS, ClockGuard, Verdict
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.types import (
@@ -26,54 +26,6 @@ _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MAX_PATIENCE_NS = 1_000_000_000
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
-
-E = TypeVar("E", bound=Event)
-
-
-class _Buffer(Generic[E]):
-    """Events of one kind in order of stamp."""
-
-    def __init__(self) -> None:
-        self.stamps: list[int] = []
-        self._events: list[E] = []
-
-    def insert(self, event: E) -> bool:
-        """Put in order of stamp; False if the topic has said something at this stamp already."""
-        stamp = event.stamp_ns
-        if not self.stamps or stamp > self.stamps[-1]:
-            self.stamps.append(stamp)
-            self._events.append(event)
-            return True
-        at = bisect_right(self.stamps, stamp)
-        k = at
-        while k > 0 and self.stamps[k - 1] == stamp:
-            k -= 1
-            if self._events[k].topic == event.topic:
-                return False
-        self.stamps.insert(at, stamp)
-        self._events.insert(at, event)
-        return True
-
-    def window(self, start_ns: int, end_ns: int) -> tuple[E, ...]:
-        """Events inside, the last one at or before the start, and the first one at or after the end."""
-        first = max(bisect_right(self.stamps, start_ns) - 1, 0)
-        return tuple(self._events[first : bisect_left(self.stamps, end_ns) + 1])
-
-    def after(self, stamp_ns: int) -> int | None:
-        """The first stamp later than this."""
-        at = bisect_right(self.stamps, stamp_ns)
-        return self.stamps[at] if at < len(self.stamps) else None
-
-    def trim(self, start_ns: int) -> None:
-        """Forget what no window from this start on needs."""
-        first = bisect_right(self.stamps, start_ns) - 1
-        if first > 0:
-            del self.stamps[:first]
-            del self._events[:first]
-
-    def clear(self) -> None:
-        self.stamps.clear()
-        self._events.clear()
 
 
 @dataclass(slots=True)
@@ -120,11 +72,11 @@ class Stepper:
         self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
         self._index = 0
         self._segment = 0
-        self._odometry: _Buffer[OdometryEvent] = _Buffer()
-        self._commands: _Buffer[CommandEvent] = _Buffer()
-        self._joints: _Buffer[JointsEvent] = _Buffer()
-        self._imu: _Buffer[ImuEvent] = _Buffer()
-        self._motion: dict[type, _Buffer[Event]] = {
+        self._odometry: EventBuffer[OdometryEvent] = EventBuffer()
+        self._commands: EventBuffer[CommandEvent] = EventBuffer()
+        self._joints: EventBuffer[JointsEvent] = EventBuffer()
+        self._imu: EventBuffer[ImuEvent] = EventBuffer()
+        self._motion: dict[type, EventBuffer[Event]] = {
             OdometryEvent: self._odometry,  # type: ignore[dict-item]
             CommandEvent: self._commands,  # type: ignore[dict-item]
             JointsEvent: self._joints,  # type: ignore[dict-item]

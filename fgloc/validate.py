@@ -6,15 +6,18 @@ A judgement is the thing itself (perhaps a repaired copy) or a ``str``: the reas
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from fgloc.config import GateConfig
 from fgloc.types import FloatArray
 
 _ASYMMETRY = 1e-4  # of a correlation: less is rounding, more is a mistake
 _INDEFINITE = 1e-6  # an eigenvalue of a correlation matrix may be this negative
 _MAX_PIXEL = 1e5
+Changes = dict[str, Any]  # fields of a repaired copy
 PLANAR = (0, 1, 5)  # x, y, yaw of a ROS covariance
 
 
@@ -99,3 +102,42 @@ def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
     if not (min(turns) > flat or max(turns) < -flat):  # crossed, dented, or on a line
         return "corners_degenerate"
     return "corners_small" if side < min_side_px else ""
+
+
+class Parts:
+    """Judges the quaternions and covariances of events; what was assumed is noted."""
+
+    def __init__(self, config: GateConfig, note: Callable[[str], None]) -> None:
+        """Set up with the bounds and a place for notes."""
+        self._config = config
+        self._note = note
+        self._covs: dict[tuple[str, str], tuple[bytes, FloatArray | str]] = {}  # last covariance and its verdict
+
+    def quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
+        """Reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
+        verdict = judge_quaternion(quaternion, self._config.quaternion_tolerance)
+        if isinstance(verdict, str):
+            return verdict
+        if verdict is not quaternion:
+            changes[name] = verdict
+        return ""
+
+    def covariance(
+        self, topic: str, what: str, cov: FloatArray, axes: Sequence[int], name: str, changes: Changes
+    ) -> str:
+        """Reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
+        raw = cov.tobytes()
+        key = (topic, what)
+        last = self._covs.get(key)
+        if last is not None and last[0] == raw:  # most drivers send the same one for ever
+            verdict = last[1]
+        else:
+            verdict, was = judge_covariance(cov, axes, self._config.max_variance)
+            if was:
+                self._note(f"{topic}: {what} covariance is {was}; the configured default is used")
+            self._covs[key] = (raw, verdict)
+        if isinstance(verdict, str):
+            return verdict
+        if verdict is not cov and verdict.tobytes() != raw:
+            changes[name] = verdict
+        return ""

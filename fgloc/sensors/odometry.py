@@ -14,8 +14,9 @@ from fgloc.types import OdometryEvent
 
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
-_CHECK_TURN, _CHECK_PATH = 0.2, 5.0  # rad or m of motion after which twist and pose are compared
+_CHECK_TURN, _CHECK_PATH = 0.5, 5.0  # rad or m of motion after which twist and pose are compared
 _STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
+_SLACK_M, _SLACK_RAD = 0.03, 0.1
 _DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
 
 
@@ -77,7 +78,9 @@ class OdometryTrack(Track):
         if pose is None or self._pose is None or seconds > MAX_GAP_S:
             return None
         dx, dy, dyaw = _difference(self._pose, pose)
-        speed, turn = math.hypot(dx, dy) / seconds, abs(dyaw) / seconds
+        # Less than the slack is no jump, however short the time: stamps of receipt come in bursts.
+        speed = max(math.hypot(dx, dy) - _SLACK_M, 0.0) / seconds
+        turn = max(abs(dyaw) - _SLACK_RAD, 0.0) / seconds
         # Judged by what the twist says or, if that is silent, by the motion just before.
         slack = 1.0
         reference = mean if mean is not None and any(mean) else None

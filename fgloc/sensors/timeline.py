@@ -22,6 +22,7 @@ _TWO_NODES = ((0.5 - 0.5 / math.sqrt(3.0), 0.5), (0.5 + 0.5 / math.sqrt(3.0), 0.
 _THREE_NODES = tuple((0.5 + 0.5 * s * math.sqrt(0.6), w / 18.0) for s, w in ((-1.0, 5.0), (0.0, 8.0), (1.0, 5.0)))
 _SILENT_SPEED = 0.5  # m/s and rad/s that a silent robot is believed capable of at least ...
 _SILENT_TAU_S = 2.0  # ... changing its mind after this time
+_STEADY_NS = 20_000_000  # a speed over less time may be a jitter of stamps
 _FLOOR = 1e-12  # keeps a covariance without any noise positive definite
 
 
@@ -62,11 +63,12 @@ class TwistTimeline:
         """Add a piece from the last one's end to ``end_ns``; None: the twist is not known."""
         if end_ns <= self._end:
             return
-        if twist is not None or self._pieces[-1] is not None:
+        if twist != self._pieces[-1]:
             self._starts.append(self._end)
             self._pieces.append(twist)
+        long = end_ns - self._end >= _STEADY_NS
         self._end = self._tail_end = end_ns
-        if twist is not None:
+        if twist is not None and long:
             self._fastest = max(self._fastest, math.hypot(twist[0], twist[1]))
             self._fastest_turn = max(self._fastest_turn, abs(twist[2]))
         if len(self._starts) % _TRIM_EVERY == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -41,7 +42,8 @@ class Track:
     def ingest(self, step: Step) -> None:
         """Take in the step's events that are newer than all before."""
         found: Sequence[Any] = getattr(step, self.events)
-        for event in found:
+        first = 0 if self._last_ns is None else bisect_right(found, self._last_ns, key=lambda e: e.stamp_ns)
+        for event in found[first:]:
             if self._last_ns is None or event.stamp_ns > self._last_ns:
                 self._take(event)
 
