@@ -27,6 +27,7 @@ _MODE_LOOKS = {Mode.DEAD_RECKONING: (_ORANGE, "dead reckoning", "//"), Mode.LOST
 _WIDTH = 9.0  # inches
 _MAX_ELLIPSES = 60
 _MAX_REASONS = 10
+_SMALL_M = 0.1  # smaller errors are drawn in millimetres
 _GAP_S = 1.0  # a line is not drawn across a longer silence
 _TEXT: dict[str, Any] = {"fontsize": 9, "color": "#222222"}
 
@@ -83,28 +84,34 @@ def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
 def plot_error(result: RunResult, matched: Matched | None) -> Figure:
     """Error in x, y and yaw against its ±3σ band over time; without a truth the band alone."""
     trajectory = result.trajectory
+    bands = None if trajectory.covs is None else 3.0 * np.sqrt(np.diagonal(trajectory.covs, axis1=1, axis2=2))
+    heights = np.full(3, 1e-9)
+    if bands is not None:
+        heights = np.maximum(heights, 1.15 * np.percentile(bands, 98, axis=0))  # a short excursion may leave the frame
+    if matched is not None:
+        heights = np.maximum(heights, 1.1 * np.max(np.abs(matched.errors), axis=0))
+    length, symbol = (1e3, "mm") if max(heights[:2]) < _SMALL_M else (1.0, "m")
     figure = Figure(figsize=(_WIDTH, 5.6), dpi=110, layout="constrained")
-    rows: Sequence[Axes] = figure.subplots(3, 1, sharex=True)
-    labels = ("x [m]", "y [m]", "yaw [°]")
-    for axis, axes in enumerate(rows):
-        unit = math.degrees(1.0) if axis == 2 else 1.0
-        heights = [1e-6]
-        if trajectory.covs is not None:
-            band = 3.0 * unit * np.sqrt(trajectory.covs[:, axis, axis])
-            broken = _broken(trajectory.stamps_ns, np.column_stack([_seconds(result, trajectory.stamps_ns), band]))
-            axes.fill_between(broken[:, 0], -broken[:, 1], broken[:, 1], color=_SKY, alpha=0.25, lw=0)
-            axes.plot(broken[:, 0], broken[:, 1], color=_SKY, lw=0.8)
-            axes.plot(broken[:, 0], -broken[:, 1], color=_SKY, lw=0.8)
-            heights.append(1.15 * float(np.percentile(band, 98)))
+    rows: list[Axes] = figure.subplots(3, 1, sharex=True).tolist()
+    for axis, (axes, name, unit) in enumerate(
+        zip(rows, ("x", "y", "yaw"), (length, length, math.degrees(1.0)), strict=True)
+    ):
+        if bands is not None:
+            times = _seconds(result, trajectory.stamps_ns)
+            t, band = _broken(trajectory.stamps_ns, np.column_stack([times, unit * bands[:, axis]])).T
+            axes.fill_between(t, -band, band, color=_SKY, alpha=0.25, lw=0)
+            axes.plot(t, band, color=_SKY, lw=0.8)
+            axes.plot(t, -band, color=_SKY, lw=0.8)
         if matched is not None:
-            error = unit * matched.errors[:, axis]
-            broken = _broken(matched.stamps_ns, np.column_stack([_seconds(result, matched.stamps_ns), error]))
-            axes.plot(broken[:, 0], broken[:, 1], color=_BLUE, lw=1.0)
-            heights.append(1.1 * float(np.max(np.abs(error))))
+            times = _seconds(result, matched.stamps_ns)
+            t, error = _broken(matched.stamps_ns, np.column_stack([times, unit * matched.errors[:, axis]])).T
+            axes.plot(t, error, color=_BLUE, lw=1.0)
         axes.axhline(0.0, color=_GREY, lw=0.6)
-        axes.set(ylabel=labels[axis], ylim=(-max(heights), max(heights)))
+        axes.set_ylabel(f"{name} [{'°' if axis == 2 else symbol}]")
+        axes.set(ylim=(-unit * heights[axis], unit * heights[axis]))
         _shade_modes(axes, result)
         _tidy(axes)
+    figure.align_ylabels(rows)
     rows[-1].set_xlabel("time [s]")
     handles: list[Artist] = [Patch(facecolor=_SKY, alpha=0.4, label="±3σ of the estimate")]
     if matched is not None:
@@ -139,6 +146,7 @@ def plot_timeline(result: RunResult) -> Figure:
         axes.set_ylabel(title, fontsize=9)
         _shade_modes(axes, result)
     panels[-1].set_xlabel("time [s]")
+    figure.align_ylabels(panels)
     if handles := _mode_handles(result):
         _legend(figure, handles)
     return figure
