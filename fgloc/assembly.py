@@ -133,7 +133,8 @@ def _base_frame(recording: Recording, config: Config, first: dict[type[Event], E
 def _camera(recording: Recording, config: Config, first: dict[type[Event], Event]) -> Camera:
     info = first.get(CameraInfoEvent)
     image = first.get(ImageEvent)
-    frame = next((e.frame_id for e in (info, image, first.get(CornersEvent)) if hasattr(e, "frame_id")), "")
+    seen = (info, image, first.get(CornersEvent))
+    frame = next((e.frame_id for e in seen if isinstance(e, CameraInfoEvent | ImageEvent | CornersEvent)), "")
     T_base_cam = given_pose(config, default_axes="optical")
     if T_base_cam is None:
         T_base_cam = recording.frames.lookup(_base_frame(recording, config, first), frame)
@@ -185,8 +186,8 @@ def _sensor_pose(
         T = recording.frames.lookup(base, event.frame_id)
     else:
         notes.append(
-            f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at the "
-            "base; set recording.sightings_pose otherwise."
+            f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at "
+            "the base; set recording.sightings_pose otherwise."
         )
         if config.recording.sightings_axes == "optical":
             T[:3, :3] = _OPTICAL_TO_BODY

@@ -146,6 +146,12 @@ class LandmarksConfig(Section):
     )
     range_bias_m: float = Field(0.0, description="subtracted from the reported range")
     bearing_bias_rad: float = Field(0.0, description="subtracted from the reported bearing")
+    range_scale_sigma: float = Field(
+        0.0, ge=0, le=0.5, description="how far range_scale may be off; above 0 it is estimated during the run"
+    )
+    bearing_bias_sigma_rad: float = Field(
+        0.0, ge=0, le=0.5, description="how far bearing_bias_rad may be off; above 0 it is estimated during the run"
+    )
     yaw_sigma_rad: float | None = Field(
         None, gt=0, description="of a marker pose's yaw; None: marker poses are used as range and bearing only"
     )
@@ -156,6 +162,11 @@ class LandmarksConfig(Section):
         ge=0,
         description="correlation time of one landmark's errors: sightings closer than this share their information",
     )
+
+    @property
+    def self_calibrating(self) -> bool:
+        """Whether range scale or bearing offset are estimated during the run."""
+        return self.range_scale_sigma > 0.0 or self.bearing_bias_sigma_rad > 0.0
 
 
 class MotionConfig(Section):

@@ -11,12 +11,13 @@ from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.incremental import IncrementalEstimator
+from fgloc.graph.incremental import IncrementalEstimator, fuse
 from fgloc.graph.log import Belief
 from fgloc.graph.weights import Weights
 from fgloc.initializer import Initializer
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
+from fgloc.selfcal import Calibration, Calibrator
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.timing import Stopwatch
@@ -78,6 +79,9 @@ class Localizer:
         self._learned = learned
         self._joint = joint
         self._landmarks = landmarks
+        self.calibrator: Calibrator | None = None
+        if landmark_map is not None and config.landmarks.self_calibrating:
+            self.calibrator = Calibrator(config.landmarks, landmark_map)
         self._initializer = Initializer(config, landmark_map, self.factors)
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
@@ -100,7 +104,7 @@ class Localizer:
         return self._advance(step, motions, sightings)
 
     def measure_motion(self, step: Step, velocity: FloatArray | None = None) -> list[MotionMeasurement]:
-        """Motion factors of a step; ``velocity`` ``(2,)`` at its start, if known better than by the learned model itself."""
+        """Motion factors of a step; ``velocity`` ``(2,)`` at its start, if known better than by the learned model."""
         if step.dt <= 0.0:
             return []
         wheels = self._wheels.measure(step)
@@ -152,7 +156,10 @@ class Localizer:
         return estimate
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
-        believed, _, decisions = self.weights.weigh(self.estimator.k + 1, step.stamp_ns, sightings, prior)
+        k = self.estimator.k + 1
+        believed, _, decisions = self.weights.weigh(k, step.stamp_ns, sightings, prior, self._calibration())
+        if self.calibrator is not None:
+            self.calibrator.start(prior.pose, prior.cov)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
@@ -168,7 +175,9 @@ class Localizer:
         # 2. Weigh: sightings against the prediction
         with self.stopwatch("weigh"):
             predicted = self.estimator.predict(motions)
-            believed, refused, decisions = self.weights.weigh(k, step.stamp_ns, sightings, predicted)
+            believed, refused, decisions = self.weights.weigh(
+                k, step.stamp_ns, sightings, predicted, self._calibration()
+            )
         # 3. Fuse
         with self.stopwatch("fuse"):
             rebuilt = self.estimator.rebuilt
@@ -176,6 +185,8 @@ class Localizer:
         if self.estimator.rebuilt > rebuilt:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
+        if self.calibrator is not None:
+            self.calibrator.step(*fuse(motions), [s.raw for s in believed])
         self.counts.update(m.source for m in motions)
         self._count_landmarks(decisions)
         if believed:
@@ -208,6 +219,9 @@ class Localizer:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, mode, tuple(decisions))
+
+    def _calibration(self) -> Calibration | None:
+        return None if self.calibrator is None else self.calibrator.calibration
 
     def _count_landmarks(self, decisions: Sequence[Decision]) -> None:
         self.counts.update(d.kind for d in decisions if not d.reason)

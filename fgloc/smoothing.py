@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly
-from fgloc.errors import EstimatorError
-from fgloc.graph.batch import Smoothed, smooth
-from fgloc.types import Estimate, FloatArray, LandmarkMap, Mode, Step
+from fgloc.config import LandmarksConfig
+from fgloc.graph.batch import BatchSmoother
+from fgloc.selfcal import Calibration, calibration_gradient, prior, shifted
+from fgloc.types import (
+    Estimate,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    Mode,
+    MotionMeasurement,
+    RangeBearingMeasurement,
+    Step,
+)
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
+_NUDGE = 0.005  # of log scale, and of radians: finite differences
+_NEWTON_STEPS = 2
 
 
 def smooth_run(
@@ -29,48 +42,123 @@ def smooth_run(
         Estimates at every keyframe, the map (given or estimated), and notes.
     """
     localizer, config = parts.localizer, parts.config
-    log = localizer.estimator.log
-    by_stamp = {step.stamp_ns: step for step in steps}
-    result: Smoothed | None = None
-    for _ in range(config.batch.outer_iterations if parts.learned is not None else 1):
-        if result is not None:
-            _measure_again(parts, by_stamp, result)
-        result = smooth(log, localizer.factors, config.batch, config.estimator.gate_probability)
-        for frame, pose in zip(log.keyframes.values(), result.poses, strict=True):
-            frame.belief.pose = pose
-    if result is None:
-        raise EstimatorError("batch.outer_iterations is 0; expected at least 1")
+    solver = BatchSmoother(localizer.estimator.log, localizer.factors, config.batch, config.estimator.gate_probability)
+    if parts.learned is not None and parts.learned.reads_velocity:
+        by_stamp = {step.stamp_ns: step for step in steps}
+        for _ in range(config.batch.outer_iterations - 1):
+            solver.replace_motions(_measure_again(parts, by_stamp, solver))
+    notes = []
+    spread = np.zeros((len(solver.frames), 3, 3))
+    if localizer.calibrator is not None and parts.landmark_map is not None:
+        refined = refine(solver, parts.landmark_map, config.landmarks, localizer.calibrator.calibration)
+        spread = refined.pose_covs
+        scale, offset = np.exp(refined.value[0]), refined.value[1]
+        sigmas = np.sqrt(np.diag(refined.cov))
+        notes.append(
+            f"Sightings calibrated on top of the configuration: ranges x {scale:.4f} ± {sigmas[0]:.4f}, "
+            f"bearings - {offset:.4f} ± {sigmas[1]:.4f} rad."
+        )
+    result = solver.result()
     modes = {e.stamp_ns: e.mode for e in filtered}
     estimates = [
         Estimate(int(stamp), pose, se2.rotate_cov(cov, float(pose[2])), modes.get(int(stamp), Mode.OK))
-        for stamp, pose, cov in zip(result.stamps_ns, result.poses, result.covs, strict=True)
+        for stamp, pose, cov in zip(result.stamps_ns, result.poses, result.covs + spread, strict=True)
     ]
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
-    note = f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}."
-    return estimates, landmarks, (note,)
+    notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
+    return estimates, landmarks, tuple(notes)
 
 
-def _measure_again(parts: Assembly, steps: Mapping[int, Step], result: Smoothed) -> None:
+def _measure_again(
+    parts: Assembly, steps: Mapping[int, Step], solver: BatchSmoother
+) -> dict[int, tuple[MotionMeasurement, ...]]:
     """Evaluate the learned motion at the velocities of the smoothed trajectory."""
-    velocities = smoothed_velocities(result)
-    for frame, velocity in zip(parts.localizer.estimator.log.keyframes.values(), velocities, strict=True):
+    stamps = np.array([frame.stamp_ns for frame in solver.frames], dtype=np.int64)
+    velocities = smoothed_velocities(stamps, solver.poses())
+    again = {}
+    for frame, velocity in zip(solver.frames, velocities, strict=True):
         step = steps.get(frame.stamp_ns)
-        if frame.prior is None and step is not None:
-            motions = parts.localizer.measure_motion(step, velocity)
-            frame.motions = tuple(motions) or frame.motions
+        if frame.prior is None and step is not None and (motions := parts.localizer.measure_motion(step, velocity)):
+            again[frame.k] = tuple(motions)
+    return again
 
 
-def smoothed_velocities(result: Smoothed) -> FloatArray:
+def smoothed_velocities(stamps_ns: IntArray, poses: FloatArray) -> FloatArray:
     """Body velocity ``(n, 2)`` (forward [m/s], yaw rate [rad/s]) at the *start* of each keyframe's step."""
-    stamps = result.stamps_ns
     half = round(0.5e9 * _VELOCITY_WINDOW_S)
-    at = np.concatenate([stamps[:1], stamps[:-1]])
-    before = np.clip(at - half, stamps[0], stamps[-1])
-    after = np.clip(at + half, stamps[0], stamps[-1])
+    at = np.concatenate([stamps_ns[:1], stamps_ns[:-1]])
+    before = np.clip(at - half, stamps_ns[0], stamps_ns[-1])
+    after = np.clip(at + half, stamps_ns[0], stamps_ns[-1])
     span = np.maximum((after - before) * 1e-9, 1e-3)
-    start = se2.interpolate(stamps, result.poses, before)
-    end = se2.interpolate(stamps, result.poses, after)
+    start = se2.interpolate(stamps_ns, poses, before)
+    end = se2.interpolate(stamps_ns, poses, after)
     tangents = np.array([se2.log(se2.between(a, b)) for a, b in zip(start, end, strict=True)])
     return np.asarray(tangents[:, [0, 2]] / span[:, None])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Calibration of the sightings over the whole run.
+
+    Attributes:
+        value: ``(2,)`` log range scale, bearing offset [rad].
+        cov: ``(2, 2)``.
+        pose_covs: ``(n, 3, 3)`` what the calibration's uncertainty adds to each pose (body frame).
+    """
+
+    value: FloatArray
+    cov: FloatArray
+    pose_covs: FloatArray
+
+
+def refine(solver: BatchSmoother, landmark_map: LandmarkMap, config: LandmarksConfig, online: Calibration) -> Refined:
+    """Newton's method on the cost that is left when the poses have been solved for, by finite differences.
+
+    At the optimum over the poses, the derivative of the whole cost with respect to the calibration is the partial one
+    (envelope theorem). Its differences between nearby calibrations give the Hessian, and the poses' differences how
+    far an error of the calibration moves them.
+    """
+    fixed = config.range_scale_sigma == 0.0, config.bearing_bias_sigma_rad == 0.0
+    free = [i for i in range(2) if not fixed[i]]
+    information = np.linalg.inv(prior(config)[np.ix_(free, free)])
+    value = np.zeros(2)
+
+    def move(to: FloatArray) -> FloatArray:
+        """Solve with this calibration; gradient of the profiled cost."""
+        nonlocal value
+        value = to
+        solver.replace_sightings(lambda raw: shifted(raw, *to) if isinstance(raw, RangeBearingMeasurement) else raw)
+        return gradient()
+
+    def gradient() -> FloatArray:
+        poses, seen = [], []
+        for frame, pose in zip(solver.frames, solver.poses(), strict=True):
+            for sighting in solver.believed[frame.k]:
+                if isinstance(sighting.measurement, RangeBearingMeasurement):
+                    poses.append(pose)
+                    seen.append(sighting.measurement)
+        partial, _ = calibration_gradient(poses, seen, landmark_map, config.cauchy_k)
+        return np.asarray(partial[free] + information @ value[free])
+
+    # 1. Every sighting was corrected by what was known when it was made: take the last word for all
+    here = move(online.value.copy())
+    # 2. Hessian of the profiled cost, and derivative of the poses
+    at, poses = value.copy(), solver.poses()
+    hessian, slopes = np.zeros((len(free), len(free))), []
+    for column, i in enumerate(free):
+        nudged = at.copy()
+        nudged[i] += _NUDGE
+        hessian[:, column] = (move(nudged) - here) / _NUDGE
+        slopes.append([se2.log(se2.between(a, b)) / _NUDGE for a, b in zip(poses, solver.poses(), strict=True)])
+    hessian = 0.5 * (hessian + hessian.T)
+    # 3. Newton, with that Hessian
+    step = here
+    for _ in range(_NEWTON_STEPS):
+        at[free] -= np.linalg.solve(hessian, step)
+        step = move(at.copy())
+    cov = np.zeros((2, 2))
+    cov[np.ix_(free, free)] = np.linalg.inv(hessian)
+    J = np.array(slopes).transpose(1, 2, 0)  # (n, 3, free)
+    return Refined(value, cov, J @ np.linalg.inv(hessian) @ J.transpose(0, 2, 1))

@@ -11,7 +11,7 @@ from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
-from fgloc.graph.batch import smooth
+from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
 from fgloc.graph.incremental import IncrementalEstimator, fuse
 from fgloc.graph.log import Belief
@@ -234,7 +234,7 @@ def nees(belief: Belief, truth: np.ndarray) -> float:
 
 def test_batch_agrees_with_full_incremental():
     estimator, factors, beliefs, _ = replay(0, "isam2")
-    result = smooth(estimator.log, factors, BatchConfig(), 0.999999)
+    result = BatchSmoother(estimator.log, factors, BatchConfig(), 0.999999).result()
     last = se2.log(se2.between(result.poses[-1], beliefs[-1].pose))
     assert np.abs(last).max() < 2e-3
     assert np.abs(result.covs[-1] - beliefs[-1].cov).max() < 0.03 * np.abs(beliefs[-1].cov).max()
@@ -250,7 +250,7 @@ def test_fixed_lag_agrees_with_full_isam2_within_the_noise():
 
 def test_factors_held_equal_factors_added():
     estimator, factors, _, _ = replay(2)
-    result = smooth(estimator.log, factors, BatchConfig(), 1 - 1e-12)
+    result = BatchSmoother(estimator.log, factors, BatchConfig(), 1 - 1e-12).result()
     added = sum(1 if f.prior is not None else len(f.motions) for f in estimator.log.keyframes.values())
     added += sum(len(f.sightings) for f in estimator.log.keyframes.values())
     assert result.factors == added
@@ -260,7 +260,7 @@ def test_nees_is_consistent_over_seeds():
     values = {"online": [], "batch": []}
     for seed in range(12):
         estimator, factors, beliefs, truths = replay(seed)
-        result = smooth(estimator.log, factors, BatchConfig(), 0.999999)
+        result = BatchSmoother(estimator.log, factors, BatchConfig(), 0.999999).result()
         values["online"].append(nees(beliefs[-1], truths[-1]))
         values["batch"].append(nees(Belief(result.poses[75], result.covs[75]), truths[75]))
     low, high = chi2.ppf([0.001, 0.999], 3 * 12)

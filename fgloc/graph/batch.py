@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -14,49 +15,116 @@ from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
 from fgloc.graph.log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.weights import chi2_bound
-from fgloc.types import FloatArray, IntArray, Landmark, MarkerPoseMeasurement, RangeBearingMeasurement
+from fgloc.types import (
+    FloatArray,
+    IntArray,
+    Landmark,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+    MotionMeasurement,
+    RangeBearingMeasurement,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
     """The result: keyframes in order."""
 
-    keys: tuple[int, ...]
     stamps_ns: IntArray  # (n,)
     poses: FloatArray  # (n, 3)
     covs: FloatArray  # (n, 3, 3) right perturbation (body frame)
     landmarks: Mapping[int, Landmark]  # those that were variables
-    used: frozenset[tuple[int, int]]  # (keyframe, landmark) sightings that the last pass believed
     factors: int  # held by the last graph
     error: float  # its GTSAM error
 
 
-def smooth(log: MeasurementLog, factors: LandmarkFactors, config: BatchConfig, gate_probability: float) -> Smoothed:
-    """Smooth the whole log.
+class BatchSmoother:
+    """Solves the whole log, as often as what depends on the solution is measured again.
 
-    The first pass holds every sighting, also those the online gate refused, under its robust kernel; the second drops
-    those that the smoothed trajectory finds less likely than ``1 - gate_probability``.
-
-    Args:
-        log: all keyframes, with filtered beliefs as initial values.
-        factors: maker of landmark factors.
-        config: iterations.
-        gate_probability: of the χ² gate.
-
-    Raises:
-        EstimatorError: the log is empty or the optimum is not finite.
+    The first solution holds every sighting, also those the online gate refused, under its robust kernel; then those
+    that the smoothed trajectory finds less likely than ``1 - gate_probability`` are left out.
     """
-    frames = list(log.keyframes.values())
-    if not frames:
-        raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
-    believed = {frame.k: (*frame.sightings, *frame.refused) for frame in frames}
-    values = _initial(frames, believed, factors)
-    graph = _graph(frames, believed)
-    values = _optimize(graph, values, config.max_iterations)
-    believed = {k: _gated(k, sightings, factors, values, gate_probability) for k, sightings in believed.items()}
-    graph = _graph(frames, believed)
-    values = _optimize(graph, _without_orphans(values, graph), config.max_iterations)
-    return _result(frames, believed, factors, graph, values)
+
+    def __init__(
+        self, log: MeasurementLog, factors: LandmarkFactors, config: BatchConfig, gate_probability: float
+    ) -> None:
+        """Take the log, whose filtered beliefs are the initial values.
+
+        Raises:
+            EstimatorError: the log is empty.
+        """
+        self.frames = list(log.keyframes.values())
+        if not self.frames:
+            raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
+        self._factors = factors
+        self._config = config
+        self.believed = {frame.k: (*frame.sightings, *frame.refused) for frame in self.frames}
+        self._values = _initial(self.frames, self.believed, factors)
+        self._graph = self._optimize()
+        bound = gate_probability
+        self.believed = {
+            k: tuple(s for s in sightings if _nis(s, self._values) <= chi2_bound(bound, _dof(s)))
+            for k, sightings in self.believed.items()
+        }
+        self._graph = self._optimize()
+
+    def poses(self) -> FloatArray:
+        """Smoothed poses ``(n, 3)``."""
+        return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
+
+    def replace_motions(self, motions: Mapping[int, tuple[MotionMeasurement, ...]]) -> None:
+        """Take other motion measurements for these keyframes, and solve again from the last solution."""
+        for frame in self.frames:
+            frame.motions = motions.get(frame.k, frame.motions)
+        self._graph = self._optimize()
+
+    def replace_sightings(self, change: Callable[[LandmarkMeasurement], LandmarkMeasurement]) -> None:
+        """Derive every believed sighting anew from its raw one, and solve again from the last solution."""
+        self.believed = {
+            k: tuple(self._factors.sighting(k, change(s.raw), s.cauchy_k, s.raw) for s in sightings)
+            for k, sightings in self.believed.items()
+        }
+        self._graph = self._optimize()
+
+    def result(self) -> Smoothed:
+        """The last solution with its covariances."""
+        marginals = gtsam.Marginals(self._graph, self._values)
+        covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
+        return Smoothed(
+            stamps_ns=np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64),
+            poses=self.poses(),
+            covs=np.array(covs),
+            landmarks={} if self._factors.known else _landmarks(self.believed, self._values, marginals),
+            factors=self._graph.size(),
+            error=self._graph.error(self._values),
+        )
+
+    def _optimize(self) -> gtsam.NonlinearFactorGraph:
+        graph = _graph(self.frames, self.believed)
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(self._config.max_iterations)
+        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
+        params.setRelativeErrorTol(1e-7)
+        values = _without_orphans(self._values, graph)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        if not np.isfinite(graph.error(values)):
+            raise EstimatorError("the batch optimum is not finite; look at steps.csv for the sighting that broke it")
+        self._values = values
+        return graph
+
+
+def _nis(sighting: Sighting, values: gtsam.Values) -> float:
+    """Squared whitened residual without the kernel, from ``e = k²/2 · log(1 + r²/k²)`` of each robust factor."""
+    total = 0.0
+    for factor in sighting.factors:
+        error = factor.error(values)
+        k2 = None if sighting.cauchy_k is None else sighting.cauchy_k**2
+        total += 2.0 * error if k2 is None else k2 * math.expm1(min(2.0 * error / k2, 700.0))
+    return total
+
+
+def _dof(sighting: Sighting) -> int:
+    return sum(factor.dim() for factor in sighting.factors)
 
 
 def _graph(frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]]) -> gtsam.NonlinearFactorGraph:
@@ -105,54 +173,6 @@ def _without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) ->
     return kept
 
 
-def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(iterations)
-    params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
-    params.setRelativeErrorTol(1e-7)
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-    if not np.isfinite(graph.error(result)):
-        raise EstimatorError("the batch optimum is not finite; look at steps.csv for the sighting that broke it")
-    return result
-
-
-def _gated(
-    k: int, sightings: tuple[Sighting, ...], factors: LandmarkFactors, values: gtsam.Values, probability: float
-) -> tuple[Sighting, ...]:
-    kept = []
-    for sighting in sightings:
-        made = factors.make(k, sighting.measurement, None)
-        nis = sum(2.0 * factor.error(values) for factor in made)
-        if nis <= chi2_bound(probability, sum(factor.dim() for factor in made)):
-            kept.append(sighting)
-    return tuple(kept)
-
-
-def _result(
-    frames: list[Keyframe],
-    believed: Mapping[int, tuple[Sighting, ...]],
-    factors: LandmarkFactors,
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-) -> Smoothed:
-    marginals = gtsam.Marginals(graph, values)
-    poses, covs = np.empty((len(frames), 3)), np.empty((len(frames), 3, 3))
-    for i, frame in enumerate(frames):
-        pose = values.atPose2(pose_key(frame.k))
-        poses[i] = pose.x(), pose.y(), pose.theta()
-        covs[i] = marginals.marginalCovariance(pose_key(frame.k))
-    return Smoothed(
-        keys=tuple(frame.k for frame in frames),
-        stamps_ns=np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
-        poses=poses,
-        covs=covs,
-        landmarks={} if factors.known else _landmarks(believed, values, marginals),
-        used=frozenset((k, s.measurement.landmark_id) for k, sightings in believed.items() for s in sightings),
-        factors=graph.size(),
-        error=graph.error(values),
-    )
-
-
 def _landmarks(
     believed: Mapping[int, tuple[Sighting, ...]], values: gtsam.Values, marginals: gtsam.Marginals
 ) -> dict[int, Landmark]:
@@ -172,3 +192,7 @@ def _landmarks(
             place, rotation = np.array([*values.atPoint2(key), 0.0]), np.eye(3)
         landmarks[m.landmark_id] = Landmark(m.landmark_id, place, rotation, 0.0, cov)
     return dict(sorted(landmarks.items()))
+
+
+def _vector(pose: gtsam.Pose2) -> FloatArray:
+    return np.array([pose.x(), pose.y(), pose.theta()])

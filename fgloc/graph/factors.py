@@ -86,9 +86,11 @@ class LandmarkFactors:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None
 
-    def sighting(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> Sighting:
-        """The measurement with its factors at keyframe k; raises what `make` raises."""
-        return Sighting(m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
+    def sighting(
+        self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, raw: LandmarkMeasurement | None = None
+    ) -> Sighting:
+        """The measurement with its factors at keyframe k (and what it was before calibration); raises as `make`."""
+        return Sighting(m, raw or m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
 
     def make(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> list[gtsam.NonlinearFactor]:
         """Factors of one sighting at keyframe k.

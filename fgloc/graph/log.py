@@ -26,6 +26,7 @@ class Sighting:
     """
 
     measurement: LandmarkMeasurement
+    raw: LandmarkMeasurement  # before self-calibration
     cauchy_k: float | None
     factors: tuple[gtsam.NonlinearFactor, ...]
 

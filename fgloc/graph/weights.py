@@ -16,6 +16,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
 from fgloc.graph.log import Belief, Sighting
+from fgloc.selfcal import Calibration
 from fgloc.types import (
     CornerMeasurement,
     Decision,
@@ -52,7 +53,12 @@ class Weights:
         self.refused_in_a_row = 0
 
     def weigh(
-        self, k: int, stamp_ns: int, measurements: Sequence[LandmarkMeasurement], predicted: Belief
+        self,
+        k: int,
+        stamp_ns: int,
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: Belief,
+        calibration: Calibration | None = None,
     ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
         """Sort sightings into believed and refused, with the decision on each.
 
@@ -62,8 +68,9 @@ class Weights:
         believed, refused, decisions = [], [], []
         values = _values(k, predicted.pose)
         for given in measurements:
-            m, weight = self._share_information(given)
-            sighting = self._factors.sighting(k, m, self._cauchy(m))
+            raw, weight = self._share_information(given)
+            m = raw if calibration is None else calibration.apply(raw)
+            sighting = self._factors.sighting(k, m, self._cauchy(m), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
             if reason:
                 refused.append(sighting)
@@ -128,7 +135,7 @@ def joint_nis(
     k: int, sighting: Sighting, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
 ) -> float:
     """Least ``|x ⊖ predicted|²_P + |h(x)|²_R`` over poses x: the NIS without the linearisation at the prediction."""
-    information = np.linalg.inv(predicted.cov)
+    information = np.asarray(np.linalg.inv(predicted.cov), dtype=np.float64)
     m = sighting.measurement
     pose, offset, best = predicted.pose, np.zeros(3), float(residual @ residual)
     for _ in range(_GAUSS_NEWTON_STEPS):

@@ -28,6 +28,12 @@ class LearnedMotion:
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
+    @property
+    def reads_velocity(self) -> bool:
+        """Whether a better velocity changes the prediction: a model of commands alone does not look at it."""
+        card = self.model.card
+        return card.kind == "velocity" or "velocity" in card.inputs
+
     def measure(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
         """Predict the step.
 
