@@ -1,4 +1,4 @@
-"""``python -m datasets.sim``: record simulated runs."""
+"""``python -m datasets.sim``: record simulated runs and draw them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from datasets.sim.record import record as record_run
-from datasets.sim.suite import BUNDLED, load_suite
-from fgloc.errors import ConfigError, FglocError
+from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
+from fgloc.errors import FglocError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -21,19 +21,43 @@ def main() -> None:
 
 @app.command()
 def record(
-    scenario: Annotated[str, typer.Argument(help="a scenario of the bundled suite, or a YAML file with one")],
-    out: Annotated[Path, typer.Option(help="folder: bag/, map.yaml, robot.yaml, scenario.yaml")],
-    seed: Annotated[int, typer.Option(min=0)] = 1,
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|SUITE",
+            help="a scenario of the bundled suite by name, 'suite' for all of it, or a YAML file with either",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="folder: bag/, map.yaml, robot.yaml, scenario.yaml; a suite: one for each")],
+    seed: Annotated[int, typer.Option(min=0, help="of a scenario; a suite brings its own")] = 1,
     camera: Annotated[bool, typer.Option(help="render images")] = True,
+    jobs_: Annotated[int, typer.Option("--jobs", min=1, help="processes, for a suite")] = 1,
+    longest: Annotated[float | None, typer.Option(min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
-    """Record one run of a scenario."""
-    path = Path(scenario)
-    suite = load_suite(path if path.suffix in (".yaml", ".yml") else BUNDLED)
-    entry = suite.entries[0] if path.suffix in (".yaml", ".yml") else suite.find(scenario)
-    if entry is None:
-        names = ", ".join(e.scenario.name for e in suite.entries)
-        raise ConfigError(f"scenario '{scenario}' is not in the bundled suite; it has {names}; or give a YAML file")
-    typer.echo(record_run(entry.scenario, seed, out, camera))
+    """Record one run of a scenario, or all that is missing of a suite."""
+    from_file = Path(what).suffix in (".yaml", ".yml")
+    suite = load_suite(Path(what) if from_file else BUNDLED)
+    todo = jobs(suite, longest)
+    if (from_file and todo) or what == "suite":
+        count = record_suite(todo, out, camera, jobs_)
+        typer.echo(f"{count} recorded, {len(todo) - count} were there: {out}")
+        return
+    scenario = suite.entries[0].scenario if from_file else suite.find(what)
+    if longest is not None:
+        scenario = scenario.model_copy(update={"duration_s": min(longest, scenario.duration_s)})
+    typer.echo(record_run(scenario, seed, out, camera, progress=True))
+
+
+@app.command()
+def figures(
+    run: Annotated[Path, typer.Argument(help="folder of a recorded run")],
+    out: Annotated[Path, typer.Option(help="folder for the pictures")],
+) -> None:
+    """Draw a run: trajectory, controls, slip and, if it has images, a contact sheet with detections."""
+    from datasets.sim.figures import draw
+
+    for path in draw(run, out):
+        typer.echo(path)
 
 
 if __name__ == "__main__":

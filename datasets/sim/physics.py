@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import mujoco
@@ -14,12 +15,18 @@ from datasets.sim.ground import Ground, make_ground
 from datasets.sim.mjcf import build_model, wheel_names
 from datasets.sim.room import make_map
 from datasets.sim.scenario import Robot, Scenario
+from fgloc.errors import FglocError
 from fgloc.frames import yaw_quaternion
 from fgloc.types import FloatArray, LandmarkMap
 
 TICK_S = 0.005
 _SETTLE_S = 0.5
+_DIVERGED = 1e3  # m/s or rad/s
 SLIP_M_S = 0.03  # a wheel slips if its circumference differs from the ground by more than this
+
+
+class SimulationError(FglocError):
+    """A run that cannot be simulated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,54 +63,62 @@ def make_scene(scenario: Scenario, seed: int) -> Scene:
 
 
 def simulate(scene: Scene) -> Log:
-    """Drive through the scenario. The same scene gives the same log, bit for bit, on the same version of MuJoCo."""
-    scenario, model = scene.scenario, scene.model
-    robot = scenario.robot
+    """Drive through the scenario. The same scene gives the same log, bit for bit, on the same version of MuJoCo.
+
+    Raises:
+        SimulationError: the physics diverged.
+    """
+    scenario, model, robot = scene.scenario, scene.model, scene.scenario.robot
+    names = wheel_names(robot)
+    joints = [model.joint(name).id for name in names]
+    q, v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     data = mujoco.MjData(model)
-    data.qpos[:3] = scenario.start[0], scenario.start[1], scene.ground.height_at(*scenario.start[:2], reach_m=0.2)
-    data.qpos[3:7] = np.roll(yaw_quaternion(scenario.start[2]), 1)
-    driver = Driver(scenario, scene.seed)
-    regulator = Regulator(robot)
-    wheels = _Wheels(model, robot)
+    qpos, qvel, force, ctrl, places = data.qpos, data.qvel, data.actuator_force, data.ctrl, data.geom_xpos
+    qpos[:2] = scenario.start[:2]
+    qpos[2] = scene.ground.height_at(*scenario.start[:2], reach_m=0.2)
+    qpos[3:7] = np.roll(yaw_quaternion(scenario.start[2]), 1)
+    tyres = [
+        (model.geom_friction[model.geom(n.removesuffix("_joint")).id], places[model.geom(n.removesuffix("_joint")).id])
+        for n in names
+    ]
+    driver, regulator = Driver(scenario, scene.seed), Regulator(robot)
     substeps = round(TICK_S / robot.contact.timestep_s)
     every_command = round(1.0 / scenario.rates.command / TICK_S)
     every_regulation = round(1.0 / robot.motor.regulator_hz / TICK_S)
     delay = round(robot.command_delay_s / TICK_S)
     n = round(scenario.duration_s / TICK_S) + 1
-    state = np.empty((n, 13))
-    wheel_state = np.empty((n, 3, len(wheels.joints)))
+    all_q, all_v, all_force = np.empty((n, model.nq)), np.empty((n, model.nv)), np.empty((n, model.nu))
     commands: list[tuple[float, float, float]] = []
-    heard: list[tuple[int, float, float]] = []
+    heard: deque[tuple[int, float, float]] = deque()
     set_point = (0.0, 0.0)
     for tick in range(-round(_SETTLE_S / TICK_S), n):
         if tick >= 0:
-            state[tick, :7], state[tick, 7:] = data.qpos[:7], data.qvel[:6]
-            wheel_state[tick] = wheels.read(data)
+            all_q[tick], all_v[tick], all_force[tick] = qpos, qvel, force
             if tick % every_command == 0:
-                v, omega = driver.command(tick * TICK_S, _planar(data.qpos))
-                commands.append((tick * TICK_S, v, omega))
-                heard.append((tick + delay, v, omega))
+                wanted = driver.command(tick * TICK_S, _planar(qpos))
+                commands.append((tick * TICK_S, *wanted))
+                heard.append((tick + delay, *wanted))
             while heard and heard[0][0] <= tick:
-                set_point = heard.pop(0)[1:]
+                set_point = heard.popleft()[1:]
         if tick % every_regulation == 0:
-            volts = regulator.volts(set_point, data.qpos[wheels.q])
-            data.ctrl[: len(volts)] = volts
+            ctrl[: len(names)] = regulator.volts(set_point, qpos[q].tolist())
             if robot.payload is not None:
                 moved = tick * TICK_S > robot.payload.shift_at_s
-                data.ctrl[-1] = math.dist(robot.payload.start, robot.payload.end) if moved else 0.0
-        wheels.lay_friction(model, data, scene.ground)
+                ctrl[-1] = math.dist(robot.payload.start, robot.payload.end) if moved else 0.0
+        for friction, place in tyres:  # that of the floor under each wheel
+            friction[0] = scene.ground.mu_at(place[0], place[1])
         mujoco.mj_step(model, data, nstep=substeps)
-    if not np.isfinite(state).all():
-        raise FloatingPointError(f"{scenario.name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
+    if not (np.isfinite(all_q).all() and np.abs(all_v).max() < _DIVERGED):
+        raise SimulationError(f"{scenario.name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
     return Log(
         stamps_s=np.arange(n) * TICK_S,
-        positions=state[:, :3],
-        quaternions=np.roll(state[:, 3:7], -1, axis=1),
-        velocities=state[:, 7:10],
-        rates=state[:, 10:],
-        wheel_angles=wheel_state[:, 0],
-        wheel_rates=wheel_state[:, 1],
-        torques=wheel_state[:, 2],
+        positions=all_q[:, :3],
+        quaternions=np.roll(all_q[:, 3:7], -1, axis=1),
+        velocities=all_v[:, :3],
+        rates=all_v[:, 3:6],
+        wheel_angles=np.ascontiguousarray(all_q[:, q]),
+        wheel_rates=np.ascontiguousarray(all_v[:, v]),
+        torques=all_force[:, : len(names)],
         commands=np.array(commands),
     )
 
@@ -114,48 +129,37 @@ class Regulator:
     def __init__(self, robot: Robot) -> None:
         """Start at rest."""
         self._robot = robot
-        self._sides = np.array([-1.0 if "left" in name else 1.0 for name in wheel_names(robot)])
+        self._sides = [-1.0 if "left" in name else 1.0 for name in wheel_names(robot)]
         self._dt = 1.0 / robot.motor.regulator_hz
-        self._tick = 2.0 * math.pi / robot.ticks_per_turn
-        self._ticks: NDArray[np.float64] | None = None
-        self._integral = np.zeros(len(self._sides))
+        self._per_rad = robot.ticks_per_turn / (2.0 * math.pi)
+        self._ticks: list[int] | None = None
+        self._integrals = [0.0] * len(self._sides)
         self._v = self._omega = 0.0
 
-    def volts(self, set_point: tuple[float, float], angles: FloatArray) -> FloatArray:
+    def volts(self, set_point: tuple[float, float], angles: list[float]) -> list[float]:
         """Motor voltages for a set point (v, ω) and the wheels' angles [rad] now."""
-        robot, motor = self._robot, self._robot.motor
-        self._v = _slew(self._v, set_point[0], robot.max_acceleration * self._dt)
-        self._omega = _slew(self._omega, set_point[1], robot.max_angular_acceleration * self._dt)
-        wanted = (self._v + self._sides * self._omega * 0.5 * robot.track_m * robot.track_scale) / robot.radius_m
-        ticks = np.floor(angles / self._tick)
-        speeds = np.zeros_like(wanted) if self._ticks is None else (ticks - self._ticks) * self._tick / self._dt
+        robot, motor, dt = self._robot, self._robot.motor, self._dt
+        self._v = _slew(self._v, set_point[0], robot.max_acceleration * dt)
+        self._omega = _slew(self._omega, set_point[1], robot.max_angular_acceleration * dt)
+        arm = 0.5 * robot.track_m * robot.track_scale
+        ticks = [math.floor(a * self._per_rad) for a in angles]
+        before = ticks if self._ticks is None else self._ticks
         self._ticks = ticks
-        error = wanted - speeds
-        limit = motor.supply_v / max(motor.ki, 1e-9)
-        self._integral = np.clip(self._integral + error * self._dt, -limit, limit)
-        return np.clip(motor.kp * error + motor.ki * self._integral, -motor.supply_v, motor.supply_v)
+        supply = motor.supply_v
+        out = []
+        for i, side in enumerate(self._sides):
+            wanted = (self._v + side * self._omega * arm) / robot.radius_m
+            error = wanted - (ticks[i] - before[i]) / self._per_rad / dt
+            self._integrals[i] = _clip(self._integrals[i] + motor.ki * error * dt, supply)
+            out.append(_clip(motor.kp * error + self._integrals[i], supply))
+        return out
 
 
-class _Wheels:
-    """Indices of the wheels in the model."""
-
-    def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
-        names = wheel_names(robot)
-        self.joints = [model.joint(name).id for name in names]
-        self.q = np.array([model.jnt_qposadr[j] for j in self.joints])
-        self._v = np.array([model.jnt_dofadr[j] for j in self.joints])
-        self._geoms = [model.geom(name.removesuffix("_joint")).id for name in names]
-        self._n = len(names)
-
-    def read(self, data: mujoco.MjData) -> FloatArray:
-        """Angles, rates and motor torques, ``(3, wheels)``."""
-        return np.stack([data.qpos[self.q], data.qvel[self._v], data.actuator_force[: self._n]])
-
-    def lay_friction(self, model: mujoco.MjModel, data: mujoco.MjData, ground: Ground) -> None:
-        """Give each wheel the friction of the floor under it."""
-        for geom in self._geoms:
-            x, y = data.geom_xpos[geom, :2]
-            model.geom_friction[geom, 0] = ground.mu_at(x, y)
+def center_of_mass(scene: Scene) -> FloatArray:
+    """Center of mass ``(3,)`` [m] of the whole robot in its base frame, wheels at rest."""
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_forward(scene.model, data)
+    return np.array(data.subtree_com[scene.model.body("base").id])
 
 
 def base_twist(log: Log) -> FloatArray:
@@ -185,6 +189,10 @@ def slipping(log: Log, robot: Robot) -> NDArray[np.bool_]:
 def _planar(qpos: FloatArray) -> tuple[float, float, float]:
     w, x, y, z = qpos[3:7]
     return float(qpos[0]), float(qpos[1]), math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _clip(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
 
 
 def _slew(now: float, wanted: float, step: float) -> float:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import heapq
 import shutil
 import tempfile
 from importlib.metadata import version
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import yaml
+from tqdm import tqdm
 
 from datasets.bag import BagWriter
-from datasets.convert import write_merged, write_robot
+from datasets.convert import write_robot
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import make_scene, simulate
 from datasets.sim.scenario import Scenario
@@ -20,10 +23,11 @@ from datasets.sim.sensors import streams
 from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # written last: a folder that holds it is complete
+_SCRATCH = ".recording-"
 _FILES = ("bag", "map.yaml", "robot.yaml", DONE)
 
 
-def record(scenario: Scenario, seed: int, out: Path, camera: bool = True) -> Path:
+def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progress: bool = False) -> Path:
     """Record one run into ``out``: ``bag/``, ``map.yaml``, ``robot.yaml``, ``scenario.yaml``.
 
     Nothing appears in ``out`` before the run is complete; an earlier recording there is replaced.
@@ -33,17 +37,26 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True) -> Pat
         seed: what is drawn; the same seed and versions give the same messages.
         out: folder.
         camera: render images (if the scenario has a camera); without, no OpenGL is needed.
+        progress: show a bar on a terminal.
 
     Returns:
         The bag's folder.
+
+    Raises:
+        SimulationError: the physics diverged.
+        RenderError: there is no OpenGL.
     """
     scene = make_scene(scenario, seed)
     log = simulate(scene)
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out, prefix=".recording-") as scratch:
+    for left in out.glob(f"{_SCRATCH}*"):  # by a recorder that was killed
+        shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(dir=out, prefix=_SCRATCH) as scratch:
         stage = Path(scratch)
         with BagWriter(stage / "bag", compress=True) as bag:
-            write_merged(*streams(scene, log, bag, camera))
+            merged = heapq.merge(*streams(scene, log, bag, camera), key=itemgetter(0))
+            for _, write in tqdm(merged, unit="msg", disable=None if progress else True, leave=False):
+                write()
         write_map(scene.landmarks, stage / "map.yaml")
         write_robot(stage / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
         (stage / DONE).write_text(describe(scenario, seed, camera), encoding="utf-8")

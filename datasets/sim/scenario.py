@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -43,8 +44,8 @@ class Motor(Section):
     supply_v: Positive = 12.0
     stall_torque_nm: Positive = 0.9
     no_load_rad_s: Positive = 24.0
-    kp: float = 0.6  # V per rad/s
-    ki: float = 3.0  # V per rad
+    kp: float = 1.2  # V per rad/s
+    ki: float = 8.0  # V per rad
     regulator_hz: Positive = 100.0
     armature: float = 0.008  # kg m², of the rotor through the gear
     damping: float = 0.004  # Nm s
@@ -74,7 +75,7 @@ class Robot(Section):
     track_scale: Positive = 1.0  # what regulator and odometry believe over the true track (skid-steer: more than 1)
     wheelbase_m: Positive = 0.24  # skid-steer only
     caster_behind_m: Positive = 0.12  # differential drive only
-    center_of_mass: Vector3 = (-0.02, 0.01, 0.06)
+    center_of_mass: Vector3 = (-0.02, 0.01, 0.045)
     chassis: Vector3 = (0.30, 0.20, 0.08)  # length, width, height
     payload: Payload | None = None
     ticks_per_turn: int = Field(2048, gt=0)
@@ -83,8 +84,8 @@ class Robot(Section):
     command_delay_s: float = Field(0.03, ge=0)  # from the command's stamp to the regulator
     max_v: Positive = 0.6  # m/s
     max_omega: Positive = 1.8  # rad/s
-    max_acceleration: Positive = 2.5  # m/s², of the set point
-    max_angular_acceleration: Positive = 8.0  # rad/s²
+    max_acceleration: Positive = 3.0  # m/s², of the set point
+    max_angular_acceleration: Positive = 15.0  # rad/s²
 
 
 class Imu(Section):
@@ -148,6 +149,16 @@ class Markers(Section):
     size_m: Positive = 0.20  # of the black square
     dictionary: str = "DICT_4X4_50"
     heights_m: Vector2 = (0.22, 0.50)  # of the centers
+
+    @model_validator(mode="after")
+    def _has_enough_ids(self) -> Markers:
+        known = getattr(cv2.aruco, self.dictionary, None)
+        if known is None:
+            raise ValueError(f"dictionary {self.dictionary!r} is not one of OpenCV's (DICT_4X4_50, ...)")
+        ids = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
+        if self.count > ids:
+            raise ValueError(f"{self.count} markers, but {self.dictionary} has {ids}; take fewer or a larger one")
+        return self
 
 
 class Patch(Section):

@@ -1,14 +1,23 @@
-"""Suites: scenarios with their runs, read from YAML."""
+"""Suites: scenarios with their runs, read from YAML and recorded side by side."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import yaml
 from pydantic import Field, ValidationError
+from tqdm import tqdm
 
+from datasets.sim.physics import SimulationError
+from datasets.sim.record import is_recorded, record
 from datasets.sim.scenario import Control, Scenario, Section
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, FglocError
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
 
@@ -16,7 +25,7 @@ BUNDLED = Path(__file__).parent / "suite.yaml"
 class Run(Section):
     """One recording of a scenario: a seed, and what differs from the scenario."""
 
-    split: str = Field(pattern="^(train|validation|test|sample)$")
+    split: Literal["train", "validation", "test"]
     seed: int = Field(ge=0)
     duration_s: float | None = Field(None, gt=0)
     control: Control | None = None
@@ -26,7 +35,7 @@ class Entry(Section):
     """A scenario and its runs."""
 
     scenario: Scenario
-    runs: tuple[Run, ...]
+    runs: tuple[Run, ...] = ()
 
 
 class Suite(Section):
@@ -34,23 +43,85 @@ class Suite(Section):
 
     entries: tuple[Entry, ...]
 
-    def find(self, name: str) -> Entry | None:
-        """The scenario of this name."""
-        return next((e for e in self.entries if e.scenario.name == name), None)
+    def find(self, name: str) -> Scenario:
+        """The scenario of this name.
+
+        Raises:
+            ConfigError: there is none; those that there are are listed.
+        """
+        for entry in self.entries:
+            if entry.scenario.name == name:
+                return entry.scenario
+        names = ", ".join(e.scenario.name for e in self.entries)
+        raise ConfigError(f"scenario '{name}' is not in the suite; it has {names}; or give a YAML file")
 
 
-def resolve(entry: Entry, run: Run) -> Scenario:
-    """The scenario of one run."""
-    changes: dict[str, object] = {}
-    if run.duration_s is not None:
-        changes["duration_s"] = run.duration_s
-    if run.control is not None:
-        changes["control"] = run.control
-    return entry.scenario.model_copy(update=changes)
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run to be recorded."""
+
+    scenario: Scenario
+    seed: int
+    folder: str  # below the suite's
+    split: str
+
+
+def jobs(suite: Suite, longest_s: float | None = None) -> list[Job]:
+    """All runs of a suite, longest first, each cut to ``longest_s``."""
+    out = []
+    for entry in suite.entries:
+        for run in entry.runs:
+            seconds = run.duration_s or entry.scenario.duration_s
+            changes = {
+                "duration_s": seconds if longest_s is None else min(seconds, longest_s),
+                "control": run.control or entry.scenario.control,
+            }
+            scenario = entry.scenario.model_copy(update=changes)
+            out.append(Job(scenario, run.seed, f"{scenario.name}/{run.split}_{run.seed}", run.split))
+    return sorted(out, key=lambda job: -job.scenario.duration_s)
+
+
+def record_suite(
+    todo: list[Job], out: Path, camera: bool, workers: int, said: Callable[[str], None] = lambda _: None
+) -> int:
+    """Record runs in ``workers`` processes. Runs that ``out`` already holds are skipped, so a killed suite resumes.
+
+    Args:
+        todo: what to record.
+        out: a folder for the suite; each run gets its own below it.
+        camera: render images.
+        workers: processes.
+        said: told of each run that was recorded.
+
+    Returns:
+        How many runs were recorded now.
+
+    Raises:
+        SimulationError: runs failed; the others are recorded all the same.
+    """
+    left = [job for job in todo if not is_recorded(job.scenario, job.seed, out / job.folder, camera)]
+    failed: list[str] = []
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's: one core for each worker
+    with (
+        tqdm(total=len(todo), initial=len(todo) - len(left), unit="run", disable=None) as bar,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
+    ):
+        futures = {pool.submit(record, j.scenario, j.seed, out / j.folder, camera): j for j in left}
+        for future in as_completed(futures):
+            folder = futures[future].folder
+            try:
+                future.result()
+                said(folder)
+            except FglocError as error:
+                failed.append(f"  {folder}: {error}")
+            bar.update()
+    if failed:
+        raise SimulationError(f"{len(failed)} of {len(left)} runs failed:\n" + "\n".join(failed))
+    return len(left)
 
 
 def load_suite(path: Path) -> Suite:
-    """Read a suite, or a single scenario as a suite of one without runs.
+    """Read a suite, or a single scenario as a suite of one. A key ``parts`` holds what is only referred to.
 
     Raises:
         ConfigError: no such file, no YAML, an unknown key or a value out of range; all are named.
@@ -61,11 +132,11 @@ def load_suite(path: Path) -> Suite:
         raise ConfigError(f"{path}: cannot be read as YAML: {error}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected a mapping with 'entries' (a suite) or the keys of a scenario")
-    data.pop("anchors", None)
+    data.pop("parts", None)
     try:
         if "entries" in data:
             return Suite.model_validate(data)
-        return Suite(entries=(Entry(scenario=Scenario.model_validate(data), runs=()),))
+        return Suite(entries=(Entry(scenario=Scenario.model_validate(data)),))
     except ValidationError as error:
         lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
         raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error
