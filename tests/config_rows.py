@@ -1,4 +1,6 @@
-"""The rows of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` prints them."""
+"""The tables of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` rewrites them."""
+
+from pathlib import Path
 
 from pydantic import BaseModel
 
@@ -29,10 +31,19 @@ def _default(value):
     return f"`{list(value) if isinstance(value, tuple) else value}`"
 
 
-if __name__ == "__main__":
+def tables():
+    """All tables, as they stand in the document."""
+    parts = []
     for name, model in sections():
-        lines = list(rows(model))
-        if lines:
-            meaning = model.__doc__.strip().splitlines()[0]
-            print(f"### {name}\n\n{meaning}\n\n| key | default | meaning |\n|---|---|---|")
-            print("\n".join(lines) + "\n")
+        if lines := list(rows(model)):
+            head = (
+                f"### {name}\n\n{model.__doc__.strip().splitlines()[0]}\n\n| key | default | meaning |\n|---|---|---|"
+            )
+            parts.append("\n".join([head, *lines]) + "\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    page = Path(__file__).parent.parent / "docs" / "configuration.md"
+    start = page.read_text(encoding="utf-8").partition("\n### ")[0]
+    page.write_text(f"{start}\n{tables()}", encoding="utf-8")
