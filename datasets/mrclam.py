@@ -51,6 +51,10 @@ _LANDMARKS = range(6, 21)  # subjects; 1 to 5 are the robots
 _FRAME_NS = 20_000_000  # sightings of one image are stamped up to 1 ms apart, images 230 ms
 _URL = "ftp://asrl3.utias.utoronto.ca/MRCLAM/MRCLAM{}.zip"  # the owner serves the archives by FTP only
 _LONGEST_COMMAND_GAP_S = 1.1  # the robots kept moving through every gap of their command logs, 1.005 s at most
+_CORRELATION_S = 10.0  # bearing and depth errors of one landmark are still correlated by 0.1 to 0.3 after 8-16 s
+_SHARED_IN_FRAME = 1.3  # bearings of one image share half of their error; two or three are seen at a time
+_SCALE_SPREAD = 0.02  # of the range scale from robot to robot
+_BIAS_SPREAD_RAD = 0.01  # of the bearing offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,8 +213,10 @@ def robot_settings(c: Calibration) -> dict[str, Any]:
             "bearing_bias_rad": c.bearing_bias_rad,
             "range_sigma_m": c.range_sigma_m,
             "range_sigma_per_m": c.range_sigma_per_m,
-            "bearing_sigma_rad": c.bearing_sigma_rad,
-            "repeat_s": 2.0,
+            "range_scale_sigma": _SCALE_SPREAD,
+            "bearing_bias_sigma_rad": _BIAS_SPREAD_RAD,
+            "bearing_sigma_rad": round(_SHARED_IN_FRAME * c.bearing_sigma_rad, 5),
+            "repeat_s": _CORRELATION_S,
         },
     }
 

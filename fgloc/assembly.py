@@ -17,7 +17,7 @@ from fgloc.motion import load_model
 from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import camera_from_info, load_camera, rescaled
-from fgloc.sensors.images import decode
+from fgloc.sensors.images import ImageError, decode
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
@@ -50,6 +50,7 @@ class Assembly:
     landmark_map: LandmarkMap | None
     gate: Gate
     detector: MarkerDetector | None
+    detections: Gate  # what the detector found has the stamps of its images, which the gate has seen
     stepper: Stepper
     wheels: WheelMotion
     landmarks: LandmarkSensor
@@ -71,16 +72,17 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
             f"{recording.path}: no odometry, joint states or commands; a run needs one of them. Topics: "
             f"{', '.join(f'{t.name} ({t.message_type})' for t in recording.topics) or 'none'}"
         )
-    landmark_map = load_map(map_path) if map_path is not None else None
+    landmark_map = load_map(map_path, config.markers.default_size_m) if map_path is not None else None
     notes = list(landmark_map.notes) if landmark_map is not None else []
     first = _first_events(recording)
     camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
+    notes += camera.notes if camera is not None else ()
     T_base_sensor = None if camera is not None else _sensor_pose(recording, config, first, notes)
     if landmark_map is None and config.estimator.kind != "isam2":
         config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
         notes.append(
-            "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is the "
-            "map's origin; for long runs build the map once with `fgloc map`."
+            "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
+            "the map's origin; for long runs build the map once with `fgloc map`."
         )
     detector = None
     if "image" in recording.roles:
@@ -97,11 +99,13 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         joint = model.joint if config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
+    known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     return Assembly(
         config=config,
         landmark_map=landmark_map,
-        gate=Gate(config.gate, None if landmark_map is None else set(landmark_map.landmarks)),
+        gate=Gate(config.gate, known_ids),
         detector=detector,
+        detections=Gate(config.gate, known_ids),
         stepper=Stepper(config.keyframes, config.gate, config.estimator.lag_s),
         wheels=wheels,
         landmarks=landmarks,
@@ -147,16 +151,27 @@ def _camera(recording: Recording, config: Config, first: dict[type[Event], Event
             f"{recording.path}: images or marker corners, but no sensor_msgs/CameraInfo; "
             "set camera.file to a calibration YAML in --config"
         )
-    if isinstance(image, ImageEvent):
-        height, width = decode(image).shape
-        if (width, height) != (camera.width, camera.height):
-            if not config.camera.rescale:
-                raise CameraError(
-                    f"{recording.path}: images are {width}x{height}, the calibration is for "
-                    f"{camera.width}x{camera.height}; calibrate at this size, or set camera.rescale: true"
-                )
-            camera = rescaled(camera, width, height)
-    return camera
+    size = _image_size(recording)
+    if size is None or not camera.width or size == (camera.width, camera.height):
+        return camera
+    if not config.camera.rescale:
+        raise CameraError(
+            f"{recording.path}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
+            "calibrate at this size, or set camera.rescale: true"
+        )
+    return rescaled(camera, *size)
+
+
+def _image_size(recording: Recording) -> tuple[int, int] | None:
+    """Width and height of the first image that can be decoded; None if there is none near the beginning."""
+    for _, event in zip(range(_SCAN_EVENTS), recording.events(), strict=False):
+        if isinstance(event, ImageEvent):
+            try:
+                height, width = decode(event).shape
+            except ImageError:
+                continue
+            return width, height
+    return None
 
 
 def given_pose(config: Config, default_axes: str) -> FloatArray | None:
@@ -183,12 +198,12 @@ def _sensor_pose(
     base = _base_frame(recording, config, first)
     T = np.eye(4)
     if event.frame_id in recording.frames and base in recording.frames:
-        T = recording.frames.lookup(base, event.frame_id)
+        T = recording.frames.lookup(base, event.frame_id).copy()
     else:
         notes.append(
             f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at "
             "the base; set recording.sightings_pose otherwise."
         )
-        if config.recording.sightings_axes == "optical":
-            T[:3, :3] = _OPTICAL_TO_BODY
+    if config.recording.sightings_axes == "optical":  # although the frame that the header names has x forward
+        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
     return T

@@ -12,7 +12,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble
-from fgloc.config import Config
+from fgloc.config import Config, TruthConfig
 from fgloc.errors import EstimatorError
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
@@ -95,7 +95,7 @@ def run(
         notes=tuple(dict.fromkeys(notes)),
         step_ms=np.array(replay.step_ms),
         wall_s=time.perf_counter() - began,
-        truth=replay.truth(parts.config.truth.yaw_offset_rad),
+        truth=replay.truth(parts.config.truth),
         landmarks=landmarks,
         spans=replay.spans(),
         source=recording_path,
@@ -146,6 +146,7 @@ class _Replay:
         parts = self._parts
         total = Counter(parts.gate.rejections)
         sources = [
+            parts.detections.rejections,
             parts.stepper.rejections,
             parts.wheels.rejections,
             parts.landmarks.rejections,
@@ -158,10 +159,11 @@ class _Replay:
             total.update(source)
         return total
 
-    def truth(self, yaw_offset_rad: float) -> Trajectory | None:
-        """The truth as a planar trajectory with increasing stamps; None if there is none."""
+    def truth(self, config: TruthConfig) -> Trajectory | None:
+        """The truth of the base as a planar trajectory with increasing stamps; None if there is none."""
+        T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
         rows = {
-            e.stamp_ns: (e.position[0], e.position[1], se2.wrap(quaternion_yaw(e.orientation) - yaw_offset_rad))
+            e.stamp_ns: se2.compose((e.position[0], e.position[1], quaternion_yaw(e.orientation)), T_body_base)
             for e in self._truth
         }
         if len(rows) < 2:
@@ -195,7 +197,7 @@ class _Replay:
         for event in events:
             if isinstance(event, ImageEvent):
                 continue
-            passed = self._parts.gate.check(event) if isinstance(event, CornersEvent) else event
+            passed = self._parts.detections.check(event) if isinstance(event, CornersEvent) else event
             if passed is not None:
                 yield passed
 
