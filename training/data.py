@@ -5,7 +5,7 @@ Source: paper eq. 1, 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -115,20 +115,6 @@ def make_run(
         valid=_heard(t_truth, times, config),
         commands=tuple(commands),
         track=CommandTrack(tuple(commands), first),
-    )
-
-
-def mirrored(run: Run) -> Run:
-    """The same run in a mirror: what a robot that is alike on both sides would have done to mirrored commands."""
-    flip = np.array([1.0, -1.0, -1.0])
-    commands = tuple(replace(c, omega=-c.omega) for c in run.commands)
-    return replace(
-        run,
-        name=f"{run.name} mirrored",
-        poses=run.poses * flip,
-        velocities=run.velocities * flip,
-        commands=commands,
-        track=CommandTrack(commands, run.origin_ns),
     )
 
 

@@ -1,0 +1,206 @@
+"""Parts of identification: samples from recordings, geometry, losses, calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
+
+from datasets.bag import BagWriter
+from fgloc import se2
+from fgloc.config import NoiseDensity
+from fgloc.errors import RecordingError
+from fgloc.motion.card import Kinematics
+from fgloc.types import CommandEvent
+from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, nis, noise_covs
+from training.config import CalibrationConfig, DataConfig, OptimizationConfig
+from training.data import Run, load_run, make_run
+from training.losses import composed_nll, end_errors, rollout_loss
+from training.models import integrate, relative
+from training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, Run]:
+    return {f"run{seed}": synthetic(seed) for seed in range(5)}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+# --- data -------------------------------------------------------------------------------------------------------------
+
+
+def test_body_velocities_come_from_smoothed_truth() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 30, 1 / 60)
+    v, omega = 0.2 + 0.05 * np.sin(t), 0.3 * np.cos(0.7 * t)
+    yaw = np.concatenate([[0.0], np.cumsum(omega[:-1]) / 60])
+    xy = np.cumsum(np.column_stack([v * np.cos(yaw), v * np.sin(yaw)]), axis=0) / 60
+    noisy = np.column_stack([xy, yaw]) + rng.normal(size=(len(t), 3)) * [0.001, 0.001, 0.002]
+    noisy[:, 2] = se2.wrap_array(noisy[:, 2])
+    commands = [CommandEvent(T0 + i * SECOND, 0, "c", 0.0, 0.0) for i in range(-3, 31)]
+    run = make_run("r", commands, T0 + np.round(t * SECOND).astype(np.int64), noisy, 0.1, 1.0, DataConfig())
+    at = run.times + (run.origin_ns - T0) * 1e-9
+    raw = np.diff(noisy[:, 0]) * 60
+    assert np.abs(run.velocities[:, 0] - np.interp(at, t, v)).std() < 0.1 * raw.std()
+    np.testing.assert_allclose(run.velocities[:, 0], np.interp(at, t, v), atol=0.015)
+    np.testing.assert_allclose(run.velocities[:, 1], 0.0, atol=0.015)
+    np.testing.assert_allclose(run.velocities[:, 2], np.interp(at, t, omega), atol=0.03)
+
+
+def test_samples_are_cut_at_gaps_of_the_truth() -> None:
+    commands, stamps, poses = drive(np.random.default_rng(0), 30.0)
+    silent = (stamps > T0 + 10 * SECOND) & (stamps < T0 + 11 * SECOND)
+    run = make_run("r", commands, stamps[~silent], poses[~silent], 0.1, 2.0, DataConfig())
+    at = run.times + (run.origin_ns - T0) * 1e-9
+    np.testing.assert_array_equal(run.valid, ~((at > 9.73) & (at < 11.26)))
+    starts = run.starts(20)
+    assert len(starts)
+    assert not any(9.73 < t < 11.26 for k in starts for t in at[k : k + 21])
+
+
+def test_bag_equals_memory(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", 4, 20.0)
+    from_bag = load_run(tmp_path / "bag", "b", 0.1, 2.0, DataConfig())
+    commands, stamps, poses = drive(np.random.default_rng(4), 20.0)
+    direct = make_run("b", commands, stamps[::2], poses[::2], 0.1, 2.0, DataConfig())
+    np.testing.assert_allclose(from_bag.poses, direct.poses, atol=1e-9)
+    limits = np.arange(0.0, 10.0, 0.1)
+    np.testing.assert_allclose(from_bag.track.means(limits), direct.track.means(limits), atol=1e-12)
+
+
+def test_recordings_that_cannot_identify_a_robot(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "silent") as bag:
+        bag.command("/cmd_vel", T0, 0.1, 0.0)
+        bag.command("/cmd_vel", T0 + SECOND, 0.1, 0.0)
+    with pytest.raises(RecordingError, match="0 messages of truth"):
+        load_run(tmp_path / "silent", "silent", 0.1, 2.0, DataConfig())
+    commands, stamps, poses = drive(np.random.default_rng(0), 20.0)
+    with pytest.raises(RecordingError, match=r"overlap for 0.0 s"):
+        make_run("r", commands, stamps + 3600 * SECOND, poses, 0.1, 2.0, DataConfig())
+
+
+# --- models and losses ------------------------------------------------------------------------------------------------
+
+
+def test_torch_geometry_equals_se2() -> None:
+    rng = np.random.default_rng(1)
+    twists = rng.normal(size=(4, 12, 3)) * [0.1, 0.02, 0.4]
+    twists[0, 3] = 0.0
+    poses = integrate(torch.tensor(twists)).numpy()
+    for row, result in zip(twists, poses, strict=True):
+        pose = np.zeros(3)
+        for twist, got in zip(row, result, strict=True):
+            pose = se2.compose(pose, se2.exp(twist))
+            np.testing.assert_allclose([*got[:2], se2.wrap(got[2])], pose, atol=1e-12)
+    truth = torch.tensor(np.concatenate([np.zeros((4, 1, 3)), poses + rng.normal(size=poses.shape) * 0.05], axis=1))
+    error, ads = end_errors(torch.tensor(poses), truth)
+    for i in range(4):
+        start, end = poses[i, -1], truth[i, -1].numpy()
+        np.testing.assert_allclose(error[i], se2.log(se2.between(start, end)), atol=1e-6)
+        for k in range(12):
+            back = se2.between(poses[i, -1], poses[i, k])
+            np.testing.assert_allclose(ads[i, k], se2.adjoint(back), atol=1e-6)
+
+
+def test_array_geometry_equals_se2() -> None:
+    poses = np.random.default_rng(2).normal(size=(30, 3))
+    poses[0] = 0.0
+    for i, pose in enumerate(poses):
+        np.testing.assert_allclose(logs(poses)[i], se2.log(pose), atol=1e-12)
+        np.testing.assert_allclose(inverses(poses)[i], se2.inverse(pose), atol=1e-12)
+        np.testing.assert_allclose(adjoints(poses)[i], se2.adjoint(pose), atol=1e-12)
+
+
+def test_losses_are_least_at_the_truth() -> None:
+    config = OptimizationConfig()
+    poses = integrate(torch.full((2, 10, 3), 0.02, dtype=torch.float64))
+    truth = torch.cat([torch.zeros(2, 1, 3), poses], dim=1)
+    moved = relative(torch.tensor([1.0, 2.0, 0.5]), torch.zeros(3))  # seen from elsewhere: the loss must not care
+    c, s = torch.cos(moved[2]), torch.sin(moved[2])
+    x, y, yaw = truth.unbind(dim=-1)
+    elsewhere = torch.stack([moved[0] + c * x - s * y, moved[1] + s * x + c * y, moved[2] + yaw], dim=-1)
+    best = rollout_loss(poses.float(), elsewhere, 0.1, config)
+    assert best < 0.03
+    for axis in range(3):
+        wrong = poses.float().clone()
+        wrong[..., axis] += 0.01
+        assert rollout_loss(wrong, elsewhere, 0.1, config) > best + 0.1
+    rng = torch.Generator().manual_seed(0)
+    error = 0.3 * torch.randn(4000, 3, generator=rng)
+    eye = torch.eye(3).expand(4000, 5, 3, 3)
+    losses = {
+        sigma: float(composed_nll(error, eye, torch.full((4000, 5, 3), 2 * np.log(sigma)), 0.2))
+        for sigma in (0.2, 0.3, 0.45)
+    }
+    assert min(losses, key=losses.__getitem__) == 0.3
+
+
+# --- calibration ------------------------------------------------------------------------------------------------------
+
+
+def test_kinematics_are_recovered() -> None:
+    commands, stamps, _ = drive(np.random.default_rng(3), 60.0)
+    track = make_run("r", commands, stamps, np.zeros((len(stamps), 3)), 0.1, 2.0, DataConfig()).track
+    t = (stamps - T0) * 1e-9 + (T0 - commands[0].stamp_ns) * 1e-9
+    offset = (commands[0].stamp_ns - track.origin_ns) * 1e-9
+    told = track.means(np.append(t, t[-1] + 0.01) - 0.2 + offset)
+    pose, poses = np.zeros(3), []
+    for v, omega in told:
+        poses.append(pose)
+        pose = se2.compose(pose, se2.exp((0.9 * v * 0.01, 0.0, (1.1 * omega - 0.05 * 0.9 * v) * 0.01)))
+    fitted = fit_kinematics([make_run("r", commands, stamps, np.array(poses), 0.1, 2.0, DataConfig())])
+    assert fitted.scale_v == pytest.approx(0.9, abs=0.01)
+    assert fitted.scale_omega == pytest.approx(1.1, abs=0.01)
+    assert fitted.yaw_per_m == pytest.approx(-0.05, abs=0.01)
+    assert fitted.delay_s == pytest.approx(0.2, abs=0.02)
+
+
+def test_lag_is_recovered(runs: dict[str, Run]) -> None:
+    fitted = fit_lag(list(runs.values()), fit_kinematics(list(runs.values())))
+    assert fitted.delay_s == pytest.approx(DELAY, abs=0.03)
+    assert fitted.lag_s[1] == pytest.approx(TAU, abs=0.04)
+
+
+def noisy_rollouts(runs: dict[str, Run], noise: NoiseDensity, seed: int) -> list[Rollout]:
+    """Rollouts whose steps differ from the truth by noise of known density."""
+    rng, out = np.random.default_rng(seed), []
+    for run in runs.values():
+        exact = roll_kinematics(Kinematics(), run, 0.2)
+        covs = noise_covs(exact, noise)
+        track = [np.zeros(3)]
+        for motion, cov in zip(exact.motions, covs, strict=True):
+            error = np.linalg.cholesky(cov) @ rng.normal(size=3)
+            pose = se2.compose(track[-1], se2.compose(motion, se2.exp(error)))
+            track.append(pose)
+        out.append(
+            Rollout(run, 0.2, exact.motions, covs, exact.track, np.array(track), np.ones(len(track), dtype=bool))
+        )
+    return out
+
+
+NOISE = NoiseDensity(x_per_sqrt_m=0.05, y_per_sqrt_m=0.02, yaw_per_sqrt_m=0.05, yaw_per_sqrt_rad=0.1)
+
+
+def test_noise_densities_hold_at_every_horizon(runs: dict[str, Run]) -> None:
+    rollouts = [r for seed in range(4) for r in noisy_rollouts(runs, NOISE, seed)]
+    fitted = fit_noise(rollouts, CalibrationConfig(horizons_s=(2.0, 5.0)))
+    for horizon in (1.0, 5.0, 10.0):
+        values = np.concatenate([nis(r.errors(horizon), r.composed(noise_covs(r, fitted), horizon)) for r in rollouts])
+        assert values.mean() / 3 == pytest.approx(1.0, abs=0.15)
+    assert fitted.x_per_sqrt_m == pytest.approx(0.05, rel=0.2)
+
+
+def test_joint_errors_are_estimated(runs: dict[str, Run]) -> None:
+    shared, own = noisy_rollouts(runs, NOISE, 0), noisy_rollouts(runs, NOISE, 1)
+    config = CalibrationConfig(window_s=2.0)
+    same, other = fit_joint(shared, shared, config), fit_joint(shared, own, config)
+    np.testing.assert_allclose(same.C, same.W, atol=1e-9)
+    assert np.abs(other.C).max() < 0.35
+    np.testing.assert_allclose(np.diag(other.W), 1.0, atol=0.35)
