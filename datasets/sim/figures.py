@@ -120,7 +120,7 @@ def _control(c: _Channels) -> Figure:
         ax.step(c.commands[:, 0], c.commands[:, 1 + i], where="post", color="k", lw=0.9, label="command")
         ax.plot(c.truth[:, 0], true[:, i], color="tab:blue", lw=1, label="truth")
         ax.set_ylabel(name)
-    axes[0].legend(loc="upper right", ncols=2)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
     axes[1].set_xlabel("time [s]")
     return figure
 
@@ -140,7 +140,7 @@ def _slip(c: _Channels) -> Figure:
         light.step(c.light[:, 0], c.light[:, 1], where="post", color="tab:olive", lw=1)
         light.set(ylabel="light [lux]", ylim=(0, None))
         light.grid(False)
-    axes[0].legend(loc="upper right", ncols=2)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
     axes[1].set_xlabel("time [s]; shaded: slipping")
     return figure
 
