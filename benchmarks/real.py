@@ -1,0 +1,158 @@
+"""Real recordings and the bundled sample, through the same program: ``python -m benchmarks.real``.
+
+MRCLAM 6: robot k is localized with a motion model trained on the other four and constants fitted on the other four
+(`datasets.mrclam`); shared settings (correlation time of the sightings, priors of the self-calibration) are one set for
+all five. Values are means over the robots, spreads their standard deviation.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import stills
+from benchmarks.common import Row, main, not_run
+from datasets import mrclam, pioneer, turtlebot3
+from fgloc import se2
+from fgloc.config import Config, load_config
+from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.recording.reader import open_recording
+from fgloc.runner import find_beside, run
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.maps import load_map
+from fgloc.types import RangeBearingEvent, RangeBearingMeasurement, RunResult
+
+_ROOT = Path(__file__).resolve().parent.parent
+_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
+_MODELS = _ROOT / "fgloc" / "motion" / "models" / "mrclam"
+_SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
+_MRCLAM_UNITS = {"ate_mean_m": "m", "yaw_mae_deg": "deg", "nees_over_3": "", "real_time_factor": "x"}
+_BAD_SPEED = 2.0  # m/s: twice the gate's bound on this robot; a keyframe that moves faster is an accepted spike
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """Yield every row; a quick run takes one robot of MRCLAM."""
+    yield from _with_data("mrclam6", _mrclam_ids(), lambda folder: _mrclam(folder, (3,) if quick else range(1, 6)))
+    names = ("duarte", "pinto1")
+    yield from _with_data("pioneer_aruco", [f"pioneer.{n}.ate_rmse_m" for n in names], lambda f: _pioneer(f, names))
+    yield from _with_data("turtlebot3", ["turtlebot3.residual_median_m"], _turtlebot3)
+    yield from stills.measure(quick)
+    yield from _sample()
+
+
+def _with_data(name: str, ids: list[str], rows: Callable[[Path], Iterable[Row]]) -> Iterable[Row]:
+    folder = _DATA / name
+    return rows(folder) if folder.is_dir() else not_run(ids, f"no {folder}; set FGLOC_REAL_DATA")
+
+
+def _mrclam_ids() -> list[str]:
+    return [f"mrclam.{mode}.{key}" for mode in ("batch", "online") for key in _MRCLAM_UNITS]
+
+
+def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
+    found: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for robot in robots:
+            bag = mrclam.convert(folder, robot, Path(scratch) / f"robot{robot}")
+            config = _configured(bag, {"motion": {"model": _MODELS / f"without_robot{robot}.safetensors"}})
+            for mode in ("batch", "online"):
+                metrics = compute_metrics(run(bag, find_beside(bag, "map.yaml"), config, mode), config)  # type: ignore[arg-type]
+                for key in _MRCLAM_UNITS:
+                    found.setdefault(f"mrclam.{mode}.{key}", []).append(getattr(metrics, key))
+    for name, values in found.items():
+        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), _MRCLAM_UNITS[name.split(".")[-1]])
+
+
+def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
+    """Against the mocap target as it is, and as it sits on the robot (its place found without our estimate)."""
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in names:
+            bag = pioneer.convert(folder / f"{name}.bag", Path(scratch) / name)
+            seated = _configured(bag, {})
+            plain = _configured(bag, {"truth": {"offset_m": (0.0, 0.0)}})
+            blind = {"recording": {"topics": {"sightings": "none"}}}
+            for label, config in (("", plain), (".seated", seated)):
+                smoothed = compute_metrics(run(bag, None, config, "batch"), config)
+                odometry = _metrics_of(bag, _configured(bag, blind, config))
+                yield Row(f"pioneer.{name}{label}.ate_rmse_m", smoothed.ate_rmse_m, unit="m")
+                yield Row(f"pioneer.{name}{label}.odometry.ate_rmse_m", odometry.ate_rmse_m, unit="m")
+
+
+def _metrics_of(bag: Path, config: Config) -> Metrics:
+    return compute_metrics(run(bag, None, config, "online"), config)
+
+
+def _turtlebot3(folder: Path) -> Iterator[Row]:
+    with tempfile.TemporaryDirectory() as scratch:
+        bag = turtlebot3.convert(folder / "rosbag2_2025_11_25-15_11_34", Path(scratch))
+        config, map_path = _configured(bag, {}), find_beside(bag, "map.yaml")
+        result = run(bag, map_path, config, "batch")
+        medians = _residual_medians(bag, config, map_path, result)
+    yield Row(
+        "turtlebot3.residual_median_m", max(medians.values()), float(np.std(list(medians.values()))), len(medians), "m"
+    )
+    poses, seconds = result.trajectory.poses, np.diff(result.trajectory.stamps_ns) * 1e-9
+    speeds = np.hypot(*np.diff(poses[:, :2], axis=0).T) / seconds
+    wrong = int((~np.isfinite(poses).all(axis=1)).sum() + (speeds > _BAD_SPEED).sum())
+    yield Row("turtlebot3.accepted_spikes", wrong, n=len(poses))
+
+
+def _residual_medians(bag: Path, config: Config, map_path: Path | None, result: RunResult) -> dict[int, float]:
+    """Median distance [m] between where each landmark is and where the smoothed robot's sightings put it."""
+    if map_path is None:
+        raise FileNotFoundError("the converter wrote no map.yaml")
+    landmark_map = load_map(map_path)
+    x, y, z, _, _, yaw = config.recording.sightings_pose or (0.0,) * 6
+    T_base_sensor = np.eye(4)
+    T_base_sensor[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T_base_sensor[:3, 3] = x, y, z
+    sensor = LandmarkSensor(config, landmark_map, None, T_base_sensor)
+    distances: dict[int, list[float]] = {}
+    with open_recording(bag, config.recording) as recording:
+        events = [e for e in recording.events() if isinstance(e, RangeBearingEvent)]
+    stamps = result.trajectory.stamps_ns
+    for event in events:
+        if not stamps[0] <= event.stamp_ns <= stamps[-1]:
+            continue
+        (pose,) = se2.interpolate(stamps, result.trajectory.poses, np.array([event.stamp_ns]))
+        for m in sensor.measure(event):
+            if isinstance(m, RangeBearingMeasurement):
+                local = (m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0)
+                away = se2.compose(pose, local)[:2] - landmark_map.landmarks[m.landmark_id].position[:2]
+                distances.setdefault(m.landmark_id, []).append(float(np.hypot(*away)))
+    return {landmark: float(np.median(values)) for landmark, values in distances.items()}
+
+
+def _sample() -> Iterator[Row]:
+    bag = _SAMPLE / "bag"
+    config = _configured(bag, {})
+    for mode in ("batch", "online"):
+        metrics = compute_metrics(run(bag, find_beside(bag, "map.yaml"), config, mode), config)  # type: ignore[arg-type]
+        yield Row(f"sample.{mode}.ate_mean_m", metrics.ate_mean_m, unit="m")
+        yield Row(f"sample.{mode}.nees_over_3", metrics.nees_over_3)
+
+
+def _configured(bag: Path, changes: dict[str, dict[str, object]], base: Config | None = None) -> Config:
+    """The configuration beside the bag (or another) with some values changed."""
+    path = find_beside(bag, "robot.yaml")
+    if base is None and path is None:
+        raise FileNotFoundError(f"no robot.yaml beside {bag}")
+    settings = (base or load_config(path)).model_dump()  # type: ignore[arg-type]
+    _merge(settings, changes)
+    return Config.model_validate(settings)
+
+
+def _merge(settings: dict, changes: dict) -> None:  # type: ignore[type-arg]
+    for key, value in changes.items():
+        if isinstance(value, dict):
+            _merge(settings[key], value)
+        else:
+            settings[key] = value
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")
