@@ -19,7 +19,7 @@ from benchmarks.common import Row, main, not_run
 from datasets import mrclam, pioneer, turtlebot3
 from fgloc import se2
 from fgloc.config import Config, load_config
-from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
 from fgloc.runner import find_beside, run
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -68,22 +68,26 @@ def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
 
 
 def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
-    """Against the mocap target as it is, and as it sits on the robot (its place found without our estimate)."""
+    """Ours beside wheel odometry, both against the mocap target.
+
+    Plain: the recording as it is, mocap at its time of receipt and the target taken for the robot's base, as the
+    figures to beat were measured. Seated: mocap bursts dated back and the target where it sits on the robot (its place found
+    without our estimate), which is what the two trajectories are really off by.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         for name in names:
-            bag = pioneer.convert(folder / f"{name}.bag", Path(scratch) / name)
-            seated = _configured(bag, {})
-            plain = _configured(bag, {"truth": {"offset_m": (0.0, 0.0)}})
+            converted = pioneer.convert(folder / f"{name}.bag", Path(scratch) / name)
+            seated = _configured(converted, {})
+            offsets = {role: s for role, s in seated.recording.stamp_offset_s.items() if role != "truth"}
+            as_recorded = {"truth": {"offset_m": (0.0, 0.0)}, "recording": {"stamp_offset_s": offsets}}
+            plain = _configured(converted, as_recorded)
             blind = {"recording": {"topics": {"sightings": "none"}}}
-            for label, config in (("", plain), (".seated", seated)):
-                smoothed = compute_metrics(run(bag, None, config, "batch"), config)
-                odometry = _metrics_of(bag, _configured(bag, blind, config))
-                yield Row(f"pioneer.{name}{label}.ate_rmse_m", smoothed.ate_rmse_m, unit="m")
-                yield Row(f"pioneer.{name}{label}.odometry.ate_rmse_m", odometry.ate_rmse_m, unit="m")
-
-
-def _metrics_of(bag: Path, config: Config) -> Metrics:
-    return compute_metrics(run(bag, None, config, "online"), config)
+            for label, bag, config in (("", folder / f"{name}.bag", plain), (".seated", converted, seated)):
+                ours = compute_metrics(run(bag, None, config, "batch"), config)
+                odometry = _configured(converted, blind, config)
+                wheels = compute_metrics(run(bag, None, odometry, "online"), odometry)
+                yield Row(f"pioneer.{name}{label}.ate_rmse_m", ours.ate_rmse_m, unit="m")
+                yield Row(f"pioneer.{name}{label}.odometry.ate_rmse_m", wheels.ate_rmse_m, unit="m")
 
 
 def _turtlebot3(folder: Path) -> Iterator[Row]:
@@ -148,7 +152,7 @@ def _configured(bag: Path, changes: dict[str, dict[str, object]], base: Config |
 
 def _merge(settings: dict, changes: dict) -> None:  # type: ignore[type-arg]
     for key, value in changes.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and key != "stamp_offset_s":  # that one is replaced whole
             _merge(settings[key], value)
         else:
             settings[key] = value

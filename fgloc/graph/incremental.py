@@ -39,7 +39,7 @@ class _FixedLag:
     """``IncrementalFixedLagSmoother`` over poses."""
 
     def __init__(self, config: EstimatorConfig) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, _isam2_params(config))
+        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config))
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> None:
         self._smoother.update(graph, values, dict.fromkeys(values.keys(), elapsed_s))
@@ -55,7 +55,7 @@ class _Full:
     """``ISAM2`` over the whole run: landmarks may be variables; the cost grows with the run."""
 
     def __init__(self, config: EstimatorConfig) -> None:
-        self._isam2 = gtsam.ISAM2(_isam2_params(config))
+        self._isam2 = gtsam.ISAM2(isam2_params(config))
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> None:
         self._isam2.update(graph, values)
@@ -226,7 +226,8 @@ def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
     return se2.compose(first.motion, se2.exp(cov @ pull)), 0.5 * (cov + cov.T)
 
 
-def _isam2_params(config: EstimatorConfig) -> gtsam.ISAM2Params:
+def isam2_params(config: EstimatorConfig) -> gtsam.ISAM2Params:
+    """iSAM2 settings that every backend shares; see gtsam's defaults for the rest."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")  # Cholesky fails on long stretches without fixes
     params.setRelinearizeThreshold(config.relinearize_threshold)
