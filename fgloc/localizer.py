@@ -132,7 +132,7 @@ class Localizer:
         if given is not None and last is None:
             self._prior = Belief(np.array(given), np.diag(np.square(self.config.estimator.initial_sigmas)))
         elif not self.factors.known:
-            self._prior = Belief(np.zeros(3), _ORIGIN) if last is None else Belief(last.pose, last.cov + _ANYWHERE)
+            self._prior = Belief(np.zeros(3), _ORIGIN) if last is None else Belief(last.pose, _ANYWHERE.copy())
         else:
             self._prior = None
 
