@@ -71,7 +71,7 @@ def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
     """Ours beside wheel odometry, both against the mocap target.
 
     Plain: the recording as it is, mocap at its time of receipt and the target taken for the robot's base, as the
-    figures to beat were measured. Seated: mocap bursts dated back and the target where it sits on the robot (its place found
+    figures to beat were measured. Seated: mocap bursts dated back and the target where it sits on the robot (found
     without our estimate), which is what the two trajectories are really off by.
     """
     with tempfile.TemporaryDirectory() as scratch:
