@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -104,7 +105,7 @@ def record_suite(
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's: one core for each worker
     with (
         tqdm(total=len(todo), initial=len(todo) - len(left), unit="run", disable=None) as bar,
-        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool,
     ):
         futures = {pool.submit(record, j.scenario, j.seed, out / j.folder, camera): j for j in left}
         for future in as_completed(futures):
@@ -118,6 +119,18 @@ def record_suite(
     if failed:
         raise SimulationError(f"{len(failed)} of {len(left)} runs failed:\n" + "\n".join(failed))
     return len(left)
+
+
+def _end_with_parent() -> None:
+    """Let a worker end when its parent is killed, so that none writes into a suite that is being resumed."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def load_suite(path: Path) -> Suite:
