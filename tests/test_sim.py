@@ -90,4 +90,4 @@ def test_recording_without_camera_reads_back(tmp_path: Path) -> None:
 
 def test_scenario_refuses_what_it_does_not_know() -> None:
     with pytest.raises(ValueError, match="Extra inputs"):
-        Camera(focal_mm=3.0)  # type: ignore[call-arg]
+        Camera(focal_mm=3.0)
