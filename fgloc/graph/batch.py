@@ -12,10 +12,11 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
-from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
+from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
 from fgloc.graph.log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.weights import chi2_bound
 from fgloc.types import (
+    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
@@ -58,15 +59,27 @@ class BatchSmoother:
             raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
         self._factors = factors
         self._config = config
-        self.believed = {frame.k: (*frame.sightings, *frame.refused) for frame in self.frames}
+        self.believed = {
+            frame.k: tuple(s for s in (*frame.sightings, *frame.refused) if self._in_front(s, frame.belief.pose))
+            for frame in self.frames
+        }
         self._values = _initial(self.frames, self.believed, factors)
-        self._graph = self._optimize()
+        try:
+            self._graph = self._optimize()
+        except RuntimeError:  # a trial step took the camera past a marker that the online gate had refused, rightly
+            self.believed = {frame.k: frame.sightings for frame in self.frames}
+            self._values = _initial(self.frames, self.believed, factors)
+            self._graph = self._optimize()
         bound = gate_probability
         self.believed = {
             k: tuple(s for s in sightings if _nis(s, self._values) <= chi2_bound(bound, _dof(s)))
             for k, sightings in self.believed.items()
         }
         self._graph = self._optimize()
+
+    def _in_front(self, sighting: Sighting, pose: FloatArray) -> bool:
+        m = sighting.measurement
+        return not isinstance(m, CornerMeasurement) or self._factors.depth(m, pose) > MIN_DEPTH_M
 
     def poses(self) -> FloatArray:
         """Smoothed poses ``(n, 3)``."""
