@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 
@@ -13,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import IncrementalEstimator, fuse
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import Weights
+from fgloc.graph.weights import Fit, Weights
 from fgloc.initializer import Initializer
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
@@ -172,12 +173,20 @@ class Localizer:
         k = self.estimator.k + 1
         if not motions:
             motions = [self._unknown_motion(step)]
-        # 2. Weigh: sightings against the prediction
+        # 2. Weigh: sightings against the prediction, and the motion against sightings that agree it is wrong
         with self.stopwatch("weigh"):
             predicted = self.estimator.predict(motions)
             believed, refused, decisions = self.weights.weigh(
                 k, step.stamp_ns, sightings, predicted, self._calibration()
             )
+            fit = None if believed else self.weights.overruled(refused, decisions, predicted)
+            if fit is not None:
+                motions = [doubted(m, predicted, fit) for m in motions]
+                self.rejections["motion.overruled"] += 1
+                predicted = self.estimator.predict(motions)
+                believed, refused, decisions = self.weights.weigh(
+                    k, step.stamp_ns, sightings, predicted, self._calibration()
+                )
         # 3. Fuse
         with self.stopwatch("fuse"):
             rebuilt = self.estimator.rebuilt
@@ -192,7 +201,8 @@ class Localizer:
         if believed:
             self._last_fix_s = self._clock_s
         self._watch_for_loss(believed)
-        decisions = [*motion_decisions(k, motions), *decisions]
+        reason = "overruled by sightings" if fit is not None else ""
+        decisions = [*motion_decisions(k, motions, reason), *decisions]
         return self._estimate(step, belief, decisions)
 
     def _unknown_motion(self, step: Step) -> MotionMeasurement:
@@ -227,12 +237,21 @@ class Localizer:
         self.counts.update(d.kind for d in decisions if not d.reason)
 
 
-def motion_decisions(k: int, motions: Sequence[MotionMeasurement]) -> list[Decision]:
-    """Rows of ``steps.csv`` for motion factors: the residual is that against the first of them (the wheels)."""
+def doubted(m: MotionMeasurement, predicted: Belief, fit: Fit) -> MotionMeasurement:
+    """The motion with room in its covariance for the place that the sightings agree on."""
+    miss = se2.log(se2.between(predicted.pose, fit.pose))
+    return dataclasses.replace(m, cov=m.cov + np.diag(miss**2))
+
+
+def motion_decisions(k: int, motions: Sequence[MotionMeasurement], reason: str) -> list[Decision]:
+    """Rows of ``steps.csv`` for motion factors: the residual is that against the first of them (the wheels).
+
+    A reason says why their covariance was inflated; their weight is then 0, as they no longer hold the pose.
+    """
     rows = []
     first = motions[0]
     for m in motions:
         difference: FloatArray = se2.log(se2.between(first.motion, m.motion))
         nis = float(difference @ np.linalg.solve(first.cov + m.cov, difference))
-        rows.append(Decision(k, m.stamp_ns, m.source, -1, nis**0.5, nis, 3, 1.0, ""))
+        rows.append(Decision(k, m.stamp_ns, m.source, -1, nis**0.5, nis, 3, 0.0 if reason else 1.0, reason))
     return rows

@@ -97,6 +97,23 @@ class Weights:
             self.refused_in_a_row += len(refused)
         return believed, refused, decisions
 
+    def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
+        """The place that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
+
+        Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
+        is taken back.
+        """
+        gated = [s for s, d in zip(refused, decisions, strict=True) if d.reason == "gate"]
+        if len({s.measurement.landmark_id for s in gated}) < 2:
+            return None
+        fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
+        if fit is None or fit.cost > chi2_bound(self._config.estimator.gate_probability, fit.dof):
+            return None
+        self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
+        self.rejections += Counter()  # drops the zeros
+        self.refused_in_a_row -= len(refused)
+        return fit
+
     def _judge(self, k: int, sighting: Sighting, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:
         """NIS, its degrees of freedom, and why the sighting is refused ("" if it is believed)."""
         m = sighting.measurement
