@@ -293,6 +293,29 @@ def test_fault_67_an_exception_in_gtsam_rebuilds_the_window_without_the_offender
     assert after.pose[0] == pytest.approx(7.1, abs=1e-6)
 
 
+def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
+    """What is left after a rebuild is as sure as if nothing had happened."""
+    behind = Landmark(11, np.array([-3.0, 0.0, 0.3]), WALL, 0.2)
+    landmarks = LandmarkMap({**wall_map().landmarks, 11: behind})
+    walls = LandmarkFactors(landmarks)
+    motion = MotionMeasurement("wheels", 0, 1, np.array([0.02, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
+    offender = walls.sighting(31, corner_sighting(np.array([-6.0, 0.0, 0.0]), behind), 3.0)
+
+    def filtered(offend: bool) -> Belief:
+        estimator = IncrementalEstimator(EstimatorConfig(lag_s=1.0), walls)
+        estimator.start(0, Belief(np.zeros(3), np.eye(3) * 1e-2))
+        for k in range(1, 31):
+            seen = point_sighting(np.array([0.02 * k, 0.0, 0.0]), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
+            estimator.update(k * 10**8, 0.1, [motion], [walls.sighting(k, seen, None)])
+        belief = estimator.update(31 * 10**8, 0.1, [motion], [offender] if offend else [])
+        assert estimator.rebuilt == offend
+        return belief
+
+    usual, rebuilt = filtered(False), filtered(True)
+    assert np.allclose(rebuilt.pose, usual.pose, atol=1e-6)
+    assert np.allclose(rebuilt.cov, usual.cov, rtol=1e-3)
+
+
 def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
     landmarks = wall_map()
     factors = LandmarkFactors(landmarks)

@@ -6,6 +6,7 @@ without the sightings of the step, and the caller is told.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Protocol
@@ -198,8 +199,10 @@ class IncrementalEstimator:
         self._backend = self._new_backend()
         self._landmarks.clear()
         for i, held in enumerate([*frames, frame]):
-            prior = held.belief if i == 0 else held.prior
-            start = initial if held is frame else held.belief.pose
+            prior = held.prior
+            if i == 0 and prior is None:  # its belief holds its sightings already
+                prior, held = held.belief, dataclasses.replace(held, sightings=())
+            start = initial if held.k == frame.k else held.belief.pose
             graph, values = self._graph_of(held, start, prior)
             self._backend.update(graph, values, held.k, held.elapsed_s)
         frame.belief = Belief(self._backend.pose(frame.k), self._backend.covariance(frame.k))
