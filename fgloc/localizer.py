@@ -127,6 +127,8 @@ class Localizer:
     def _begin_segment(self, step: Step) -> None:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         self._segment = step.segment
+        self._lost = False
+        self.weights.refused_in_a_row = 0
         self._initializer.reset()
         given = self.config.estimator.initial_pose
         last = self.estimator.belief
@@ -142,8 +144,9 @@ class Localizer:
     ) -> Estimate | None:
         """Collect steps until the first pose is clear, then run them all through the estimator."""
         if self._prior is not None:
+            prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
             self._initializer.waiting = False
-            return self._start(step, self._prior, sightings)
+            return self._start(step, prior, sightings)
         started = self._initializer.collect(step, motions, sightings)
         if started is None:
             return self._advance(step, motions, ()) if self._lost else None

@@ -1,0 +1,92 @@
+"""After the robot got lost: it is looked for on the whole map, and nothing believed before stands in the way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.localizer import Localizer
+from fgloc.types import (
+    Estimate,
+    Landmark,
+    LandmarkMap,
+    Mode,
+    MotionMeasurement,
+    RangeBearing,
+    RangeBearingEvent,
+    RangeBearingMeasurement,
+    Step,
+)
+
+STEP_NS = 100_000_000
+PLACES = ((4.0, 3.0), (-3.0, 4.0), (-4.0, -2.0), (3.0, -4.0), (9.0, 2.0))
+MAP = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(PLACES)})
+MOTION = np.array([0.02, 0.0, 0.0])
+
+
+class Wheels:
+    """Exact motion of a robot that drives straight on."""
+
+    def measure(self, step: Step) -> MotionMeasurement:
+        return MotionMeasurement("wheels", step.start_ns, step.stamp_ns, MOTION, np.diag([1e-6, 1e-6, 1e-6]))
+
+
+class Beacons:
+    """Exact ranges and bearings."""
+
+    def measure(self, event: RangeBearingEvent) -> tuple[RangeBearingMeasurement, ...]:
+        cov = np.diag([1e-4, 1e-3])
+        return tuple(
+            RangeBearingMeasurement(event.stamp_ns, s.landmark_id, s.range_m, s.bearing_rad, cov)
+            for s in event.sightings
+        )
+
+
+def localizer(**estimator) -> Localizer:
+    return Localizer(Config.model_validate({"estimator": estimator}), MAP, Wheels(), Beacons())
+
+
+def step(index: int, truth, ids: tuple[int, ...], segment: int = 0, shift_ns: int = 0) -> Step:
+    """The robot at ``truth`` sees these beacons."""
+    stamp = 10**18 + index * STEP_NS + shift_ns
+    seen = []
+    for i in ids:
+        x, y, _ = se2.between(truth, (*PLACES[i], 0.0))
+        seen.append(RangeBearing(i, math.hypot(x, y), math.atan2(y, x)))
+    event = RangeBearingEvent(stamp, stamp, "/landmarks", "base_link", tuple(seen))
+    return Step(index, segment, stamp - STEP_NS, stamp, sightings=(event,) if seen else ())
+
+
+def drive(run: Localizer, start, first: int, n: int) -> list[tuple[np.ndarray, Estimate | None]]:
+    """Truth and estimate of n steps from a place, one beacon a step."""
+    found = []
+    truth = np.array(start, dtype=float)
+    for k in range(first, first + n):
+        truth = se2.compose(truth, MOTION)
+        found.append((truth, run.update(step(k, truth, (k % len(PLACES),)))))
+    return found
+
+
+def test_a_lost_robot_is_not_put_back_to_the_initial_pose():
+    run = localizer(initial_pose=(0.0, 0.0, 0.0))
+    assert all(e is not None and e.mode is Mode.OK for _, e in drive(run, (0.0, 0.0, 0.0), 0, 20))
+    after = drive(run, (2.0, 1.0, 2.0), 20, 80)  # somebody carried it away
+    modes = [e.mode for _, e in after if e is not None]
+    assert Mode.LOST in modes
+    truth, estimate = after[-1]
+    assert estimate is not None
+    assert estimate.mode is Mode.OK
+    assert np.abs(se2.between(truth, estimate.pose)).max() < 0.05
+
+
+def test_a_new_segment_does_not_go_on_from_where_the_robot_was_lost():
+    run = localizer(initial_pose=(0.0, 0.0, 0.0), lost_after=5)
+    drive(run, (0.0, 0.0, 0.0), 0, 20)
+    (*_, (_, lost)) = drive(run, (2.0, 1.0, 2.0), 20, 6)
+    assert lost is not None
+    assert lost.mode is Mode.LOST
+    jumped = step(26, (0.0, 0.0, 0.0), (), segment=1, shift_ns=3600 * 10**9)
+    assert run.update(jumped) is None
