@@ -35,6 +35,8 @@ from fgloc.types import (
 RunMode = Literal["batch", "online"]
 Progress = Callable[[float, float], None]
 """Called with seconds of the recording done, and its length."""
+EventFilter = Callable[[Iterator[Event]], Iterator[Event]]
+"""Changes, drops, adds or delays events; what comes after it does not know."""
 
 
 def find_beside(bag: Path, name: str) -> Path | None:
@@ -51,6 +53,8 @@ def run(
     progress: Progress | None = None,
     pace: float | None = None,
     on_step: Callable[[Step, Estimate | None], None] | None = None,
+    events: EventFilter | None = None,
+    sightings: EventFilter | None = None,
 ) -> RunResult:
     """Localise one recording.
 
@@ -62,6 +66,8 @@ def run(
         progress: called now and then.
         pace: replay at this multiple of real time; None: as fast as possible.
         on_step: called after each step (online displays, benchmarks).
+        events: filter of the recorded events (ablations).
+        sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
 
     Raises:
         FglocError: the input cannot be used, or no pose was ever found.
@@ -69,8 +75,8 @@ def run(
     began = time.perf_counter()
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, keep_all=mode == "batch" or map_path is None)
-        replay = _Replay(parts, recording.duration_s, progress, pace, mode == "batch")
-        for step in replay.steps(recording.events()):
+        replay = _Replay(parts, recording.duration_s, progress, pace, mode == "batch", sightings)
+        for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
             replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
@@ -106,12 +112,19 @@ class _Replay:
     """Events of one recording on their way to steps, and what is noted on the way."""
 
     def __init__(
-        self, parts: Assembly, duration_s: float, progress: Progress | None, pace: float | None, keep_steps: bool
+        self,
+        parts: Assembly,
+        duration_s: float,
+        progress: Progress | None,
+        pace: float | None,
+        keep_steps: bool,
+        sightings: EventFilter | None,
     ) -> None:
         self._parts = parts
         self._duration_s = duration_s
         self._progress = progress
         self._pace = pace
+        self._sightings = sightings if sightings is not None else iter
         self._image_rejections: Counter[str] = Counter()
         self._truth: list[TruthEvent] = []
         self._heard: dict[str, list[int]] = {}
@@ -124,9 +137,11 @@ class _Replay:
 
     def steps(self, events: Iterator[Event]) -> Iterator[Step]:
         """Gate, detect and cut into steps."""
-        gated = self._gated(events)
-        if self._parts.detector is not None:
-            gated = self._regated(detect_stream(gated, self._parts.detector, self._image_rejections))
+        if self._parts.detector is None:
+            gated = self._gated(self._sightings(events))
+        else:
+            found = detect_stream(self._gated(events), self._parts.detector, self._image_rejections)
+            gated = self._regated(self._sightings(found))
         for event in gated:
             self._heard.setdefault(event.topic, []).append(event.stamp_ns)
             yield from self._parts.stepper.push(event)
