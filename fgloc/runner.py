@@ -15,6 +15,7 @@ from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config, TruthConfig
 from fgloc.errors import EstimatorError
 from fgloc.frames import quaternion_yaw
+from fgloc.hints import image_hints
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.markers import detect_stream
 from fgloc.smoothing import smooth_run
@@ -82,11 +83,14 @@ def run(
             replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
             if on_step is not None:
                 on_step(step, estimate)
-        notes = (*recording.notes, *parts.notes, *parts.gate.notes, *parts.stepper.notes, *parts.wheels.notes)
+        hints: tuple[str, ...] = ()
+        if parts.detector is not None and not parts.localizer.counts["corners"]:
+            hints = image_hints(recording, parts.detector)
+        notes = (*hints, *recording.notes, *parts.notes, *parts.gate.notes, *parts.stepper.notes, *parts.wheels.notes)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
     if not replay.estimates:
-        raise EstimatorError(_never_found(replay, rejections))
+        raise EstimatorError(" ".join([_never_found(replay, rejections), *hints]))
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
     if mode == "batch":
@@ -230,5 +234,5 @@ def _never_found(replay: _Replay, rejections: Counter[str]) -> str:
     why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
     return (
         f"the first pose was never found in {len(replay.step_ms)} steps. Heard: {heard}. Rejected: {why}. "
-        "Check the map's ids and sizes, or give estimator.initial_pose"
+        "Check the map's ids and sizes, or give estimator.initial_pose."
     )

@@ -44,6 +44,7 @@ class MarkerDetector:
             ConfigError: there is no such dictionary; the names that there are are listed.
         """
         self._config = config
+        self.dictionary = dictionary
         self._dictionary = load_dictionary(dictionary)
         self._cells = int(self._dictionary.markerSize) + 2
         self._turn = 2 if turned_by_180(dictionary) else 0

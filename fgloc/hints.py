@@ -1,0 +1,37 @@
+"""What may be wrong with a camera in whose images no marker of the map is found."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from fgloc.recording.reader import Recording
+from fgloc.sensors.images import GrayImage, ImageError, decode
+from fgloc.sensors.markers import MarkerDetector, suggest_dictionary
+from fgloc.types import ImageEvent
+
+_IMAGES = 5  # looked at, spread over the recording
+_SCANNED = 200
+
+
+def image_hints(recording: Recording, detector: MarkerDetector) -> tuple[str, ...]:
+    """One sentence for each thing that would explain it: another dictionary, mirrored images, inverted prints."""
+    images = _some_images(recording)
+    hints = list(dict.fromkeys(hint for image in images for hint in detector.diagnose(image)))
+    if not any(detector.find(image) for image in images):
+        fitting = suggest_dictionary(images)
+        if fitting is not None and fitting != detector.dictionary:
+            hints.append(
+                f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary, or the map's."
+            )
+    return tuple(hints)
+
+
+def _some_images(recording: Recording) -> list[GrayImage]:
+    events = list(islice((e for e in recording.events() if isinstance(e, ImageEvent)), _SCANNED))
+    images = []
+    for event in events[:: max(1, len(events) // _IMAGES)]:
+        try:
+            images.append(decode(event))
+        except ImageError:
+            continue
+    return images

@@ -1,0 +1,56 @@
+"""A run in which no marker of the map is found says what may be wrong with the camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets.bag import BagWriter
+from fgloc.config import Config, RecordingConfig
+from fgloc.errors import EstimatorError
+from fgloc.recording.reader import open_recording
+from fgloc.runner import run
+from fgloc.sensors.images import decode
+from fgloc.types import ImageEvent
+
+SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Ten images of the sample, its camera and its map."""
+    with open_recording(SAMPLE / "bag", RecordingConfig()) as recording:
+        events = [e for e in recording.events() if isinstance(e, ImageEvent)]
+    return [decode(e) for e in events[::30]]
+
+
+def short_bag(folder: Path, pictures, change) -> Path:
+    path = folder / "bag"
+    with BagWriter(path) as bag:
+        K = [[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]]
+        bag.static_transform(10**18, "base_link", "camera_optical", [0, 0, 0.2], [-0.5, 0.5, -0.5, 0.5])
+        for i, image in enumerate(pictures):
+            stamp = 10**18 + i * 10**8
+            bag.camera_info("/camera/camera_info", stamp, 640, 480, K, [0, 0, 0, 0, 0])
+            bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (0.0, 0.0))
+            coded = cv2.imencode(".png", np.ascontiguousarray(change(image)))[1].tobytes()
+            bag.compressed_image("/camera/image/compressed", stamp, coded, "png")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "expected"),
+    [
+        (lambda image: image, {"markers": {"dictionary": "DICT_6X6_50"}}, "DICT_4X4_50"),
+        (lambda image: 255 - image, {}, "inverted"),
+        (lambda image: image[:, ::-1], {}, "mirrored"),
+    ],
+    ids=["fault_42_wrong_dictionary", "fault_47_inverted_print", "fault_45_mirrored_image"],
+)
+def test_what_hides_the_markers_is_named(tmp_path, pictures, change, settings, expected):
+    bag = short_bag(tmp_path, pictures, change)
+    with pytest.raises(EstimatorError, match=expected):
+        run(bag, SAMPLE / "map.yaml", Config.model_validate(settings), "online")
