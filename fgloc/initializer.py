@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import fuse
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import joint_fit
+from fgloc.graph.weights import Fit, joint_fit
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     CornerMeasurement,
@@ -32,6 +32,10 @@ _MAX_COST_PER_DOF = 4.0
 _MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
 _MAX_STEPS = 400
+# Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
+_MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
+_MAX_PLACES = 4  # that are fitted to the end
+_ITERATIONS, _ROUGH_ITERATIONS = 16, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,24 +99,34 @@ class Initializer:
         return Start(steps, Belief(se2.compose(newest.pose, back), _WEAK_PRIOR.copy()), newest)
 
     def _solve(self) -> Belief | None:
-        here = list(self._carried())
-        attempts = [joint_fit(candidate, here, self._factors, self._config) for candidate in self._candidates(here)]
+        here = _spread(list(self._carried()), _MAX_FITTED)
+        few = _spread(here, _MAX_ROUGH)
+        rough = [fit for c in self._candidates(here) if (fit := self._fit(c, few, _ROUGH_ITERATIONS)) is not None]
+        places: list[FloatArray] = []
+        for fit in sorted(rough, key=lambda fit: fit.cost):
+            if len(places) < _MAX_PLACES and all(_apart(fit.pose, other) for other in places):
+                places.append(fit.pose)
+        attempts = [self._fit(place, here, _ITERATIONS) for place in places]
         fits = sorted((fit for fit in attempts if fit is not None), key=lambda fit: fit.cost)
         if not fits:
             return None
         best = fits[0]
-        rivals = [f for f in fits[1:] if (abs(se2.log(se2.between(best.pose, f.pose))) > _SAME_PLACE).any()]
+        rivals = [fit for fit in fits[1:] if _apart(best.pose, fit.pose)]
         if best.dof < 4 or best.cost > _MAX_COST_PER_DOF * best.dof:
             return None
         if rivals and rivals[0].cost < best.cost + _MARGIN:
             return None
         return Belief(best.pose, best.cov)
 
+    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
+        return joint_fit(start, sightings, self._factors, self._config, iterations)
+
     def _candidates(self, sightings: Sequence[LandmarkMeasurement]) -> Iterator[FloatArray]:
         if self._map is None:
             return
         points = []
-        for m in sightings:
+        whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
+        for m in [*_spread(whole, _MAX_SEEDS), *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
             landmark = self._map.landmarks[m.landmark_id]
             if isinstance(m, CornerMeasurement):
                 yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
@@ -142,3 +156,13 @@ class Initializer:
             if collected.motions:
                 travelled = se2.compose(travelled, fuse(collected.motions)[0])
         return travelled
+
+
+def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:
+    """All of them or, of too many, every second, third and so on."""
+    return sightings[:: max(1, -(-len(sightings) // most))]
+
+
+def _apart(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two poses are two places."""
+    return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())

@@ -6,13 +6,18 @@ import math
 
 import numpy as np
 
+import fgloc.initializer
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.weights import joint_fit
+from fgloc.initializer import Initializer
 from fgloc.localizer import Localizer
 from fgloc.types import (
     Estimate,
     Landmark,
     LandmarkMap,
+    MarkerPoseMeasurement,
     Mode,
     MotionMeasurement,
     RangeBearing,
@@ -24,6 +29,7 @@ from fgloc.types import (
 STEP_NS = 100_000_000
 PLACES = ((4.0, 3.0), (-3.0, 4.0), (-4.0, -2.0), (3.0, -4.0), (9.0, 2.0))
 MAP = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(PLACES)})
+_WALL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker that faces -x
 MOTION = np.array([0.02, 0.0, 0.0])
 
 
@@ -90,3 +96,22 @@ def test_a_new_segment_does_not_go_on_from_where_the_robot_was_lost():
     assert lost.mode is Mode.LOST
     jumped = step(26, (0.0, 0.0, 0.0), (), segment=1, shift_ns=3600 * 10**9)
     assert run.update(jumped) is None
+
+
+def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
+    """On a wrong map no place ever explains the sightings; the search must not fall behind for it."""
+    rng = np.random.default_rng(0)
+    standing = LandmarkMap({i: Landmark(i, np.array([*p, 0.5]), _WALL, 0.2) for i, p in enumerate(PLACES)})
+    config = Config()
+    initializer = Initializer(config, standing, LandmarkFactors(standing))
+    fits = []
+    monkeypatch.setattr(fgloc.initializer, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
+    for k in range(40):
+        at = step(k, np.zeros(3), ())
+        seen = [
+            MarkerPoseMeasurement(at.stamp_ns, i, rng.uniform(-3.0, 3.0, 3), np.diag([1e-4, 1e-4, 1e-3]))
+            for i in range(len(PLACES))
+        ]
+        fits.clear()
+        assert initializer.collect(at, [Wheels().measure(at)], seen) is None
+    assert sum(fits) < 500  # sightings looked at in all fits of the last step; one fit for each of them would be 40000

@@ -176,19 +176,25 @@ class Fit:
 
 
 def joint_fit(
-    start: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
+    start: FloatArray,
+    sightings: Sequence[LandmarkMeasurement],
+    factors: LandmarkFactors,
+    config: Config,
+    iterations: int = 4 * _GAUSS_NEWTON_STEPS,
 ) -> Fit | None:
     """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
 
     Gauss–Newton with Cauchy weights, so that one wrong sighting does not spoil the place.
     """
+    made = [(m, factors.make(0, m, None)) for m in sightings]
     pose, previous = start, math.inf
-    for _ in range(4 * _GAUSS_NEWTON_STEPS):
+    for _ in range(iterations):
         normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
-        for m in sightings:
+        values = _values(0, pose)
+        for m, unary in made:
             if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
                 return None
-            r, J = whitened(factors.make(0, m, None), _values(0, pose), None)
+            r, J = whitened(unary, values, None)
             k2 = (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k ** 2
             square = float(r @ r) / len(r) * 2.0  # as if of one two-dimensional sighting
             weight = k2 / (k2 + square)
