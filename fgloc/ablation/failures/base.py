@@ -1,0 +1,169 @@
+"""What all failures share: when they are active, what they may know, and how they pass events on."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fgloc.config import Config, Section
+from fgloc.types import (
+    CommandEvent,
+    CornersEvent,
+    Event,
+    ImageEvent,
+    ImuEvent,
+    JointsEvent,
+    LandmarkMap,
+    MarkerPosesEvent,
+    OdometryEvent,
+    RangeBearingEvent,
+)
+
+Sensor = Literal["camera", "wheels", "command", "imu"]
+EVENTS: dict[str, tuple[type[Event], ...]] = {
+    "camera": (ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent),
+    "wheels": (OdometryEvent, JointsEvent),
+    "command": (CommandEvent,),
+    "imu": (ImuEvent,),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What a failure may know of the run that it spoils.
+
+    Attributes:
+        start_ns: receive time of the recording's first message.
+        duration_s: length of the recording [s].
+        config: of the run; slip needs the wheels' geometry.
+        landmark_ids: ids of the map, ascending.
+        rng: the failure's own generator.
+        touched: events that each failure changed, dropped or added, by its kind.
+    """
+
+    start_ns: int
+    duration_s: float
+    config: Config
+    landmark_ids: tuple[int, ...]
+    rng: np.random.Generator
+    touched: Counter[str] = field(default_factory=Counter)
+
+    def seconds(self, event: Event) -> float:
+        """Receive time of an event [s from the recording's first message]."""
+        return (event.received_ns - self.start_ns) * 1e-9
+
+
+class When(Section):
+    """When a failure is active, in seconds of receive time from the recording's first message.
+
+    Without intervals and bursts it is active throughout. Bursts are placed at random: for one seed their centers stay
+    where they are when their length is varied.
+    """
+
+    intervals: tuple[tuple[float, float], ...] = Field((), description="from and until [s]")
+    bursts: int = Field(0, ge=0, description="further intervals, placed at random")
+    burst_s: float = Field(5.0, gt=0, description="length of each [s]")
+    after_s: float = Field(0.0, ge=0, description="no burst begins before this [s]")
+    share: float = Field(1.0, ge=0, le=1, description="of the messages inside, chosen at random one by one")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> When:
+        for start, end in self.intervals:
+            if not start < end:
+                raise ValueError(f"interval {start:g} to {end:g} s is empty; expected its start before its end")
+        return self
+
+    def schedule(self, scene: Scene) -> Schedule:
+        """Draw the times of one run."""
+        intervals = list(self.intervals)
+        if self.bursts:
+            half = 0.5 * self.burst_s
+            room = max(0.0, scene.duration_s - self.after_s - self.burst_s)
+            centers = self.after_s + half + room * scene.rng.uniform(size=self.bursts)
+            intervals += [(float(c) - half, float(c) + half) for c in centers]
+        elif not intervals:
+            intervals = [(-np.inf, np.inf)]
+        return Schedule(tuple(intervals), self.share, scene)
+
+
+class Schedule:
+    """The times at which a failure is active in one run."""
+
+    def __init__(self, intervals: tuple[tuple[float, float], ...], share: float, scene: Scene) -> None:
+        self.intervals = intervals
+        self._share = share
+        self._scene = scene
+
+    def inside(self, event: Event) -> tuple[float, float] | None:
+        """The interval that holds the event, whether or not chance picks it."""
+        seconds = self._scene.seconds(event)
+        return next(((a, b) for a, b in self.intervals if a <= seconds < b), None)
+
+    def hits(self, event: Event) -> bool:
+        """Whether the failure takes this event. Draws once for every event inside an interval: ask once."""
+        return self.inside(event) is not None and (self._share >= 1.0 or self._scene.rng.uniform() < self._share)
+
+
+Change = Callable[[Event], Event | None]
+
+
+class Failure(Section):
+    """One way in which sensors fail: a filter of events, drawn anew for each run from the scene's generator.
+
+    Failures of stage "sightings" act once markers are found: after detection, or on recorded sightings. No failure
+    touches the truth or the transforms, save that a truncated recording ends for all.
+    """
+
+    stage: ClassVar[Literal["recorded", "sightings"]] = "recorded"
+    timed: ClassVar[bool] = True  # False: lasts the whole run, `when` is refused
+    kind: str
+    when: When = When()
+
+    @model_validator(mode="after")
+    def _lasting(self) -> Failure:
+        if not self.timed and self.when != When():
+            raise ValueError(f"{self.kind} lasts the whole run; leave out its 'when'")
+        return self
+
+    @abstractmethod
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The spoiled events, in order of receive time."""
+
+    def spoil_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
+        """The map that the run is given; few failures change it."""
+        return landmark_map
+
+    def touch(self, scene: Scene) -> None:
+        """Note that one more event was touched."""
+        scene.touched[self.kind] += 1
+
+
+class EventFailure(Failure):
+    """A failure that changes or drops events one by one and leaves their order alone."""
+
+    @abstractmethod
+    def targets(self) -> tuple[type[Event], ...]:
+        """Kinds of events that it takes."""
+
+    @abstractmethod
+    def begin(self, scene: Scene) -> Change:
+        """What it does to one event (None: drops it), with the state of one run."""
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The spoiled events, in order of receive time."""
+        schedule, change, targets = self.when.schedule(scene), self.begin(scene), self.targets()
+        for event in events:
+            if not isinstance(event, targets) or not schedule.hits(event):
+                yield event
+                continue
+            changed = change(event)
+            if changed is not event:
+                self.touch(scene)
+            if changed is not None:
+                yield changed

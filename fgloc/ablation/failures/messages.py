@@ -1,0 +1,148 @@
+"""Failures of the content of motion messages: frozen, reset, rolled over, not a number, wrong covariance, bias."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from fgloc import se2
+from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene
+from fgloc.frames import quaternion_yaw, yaw_quaternion
+from fgloc.types import Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
+
+
+class EncoderFrozen(Failure):
+    """Odometry and joints go on with new stamps but repeat what they said last; then they jump to the present."""
+
+    kind: Literal["encoder_frozen"] = "encoder_frozen"
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The spoiled events, in order of receive time."""
+        schedule = self.when.schedule(scene)
+        last: dict[str, Event] = {}
+        for event in events:
+            if not isinstance(event, EVENTS["wheels"]):
+                yield event
+            elif schedule.hits(event) and event.topic in last:
+                self.touch(scene)
+                yield replace(last[event.topic], stamp_ns=event.stamp_ns, received_ns=event.received_ns)
+            else:
+                last[event.topic] = event
+                yield event
+
+
+class EncoderRollover(EventFailure):
+    """Joint angles are counted modulo ``range_rad``: they fall back to 0 when they reach it."""
+
+    kind: Literal["encoder_rollover"] = "encoder_rollover"
+    range_rad: float = Field(6.283185307179586, gt=0, description="rad")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Joint states."""
+        return (JointsEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Wrap the angles."""
+
+        def wrap(event: Event) -> Event:
+            assert isinstance(event, JointsEvent)
+            return replace(event, position=np.mod(event.position, self.range_rad))
+
+        return wrap
+
+
+class OdometryReset(Failure):
+    """At the start of each interval odometry and wheel angles begin again at zero; after it they jump back."""
+
+    kind: Literal["odometry_reset"] = "odometry_reset"
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The spoiled events, in order of receive time."""
+        schedule = self.when.schedule(scene)
+        origins: dict[tuple[str, float], FloatArray] = {}
+        for event in events:
+            interval = schedule.inside(event)
+            if interval is None or not isinstance(event, OdometryEvent | JointsEvent) or not schedule.hits(event):
+                yield event
+                continue
+            self.touch(scene)
+            key = (event.topic, interval[0])
+            if isinstance(event, JointsEvent):
+                origin = origins.setdefault(key, event.position)
+                same = len(origin) == len(event.position)
+                yield replace(event, position=event.position - origin) if same else event
+                continue
+            pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+            x, y, yaw = se2.between(origins.setdefault(key, pose), pose)
+            yield replace(event, position=np.array([x, y, event.position[2]]), orientation=yaw_quaternion(float(yaw)))
+
+
+class WheelNan(EventFailure):
+    """Odometry's pose and twist, joints' angles and rates are not a number."""
+
+    kind: Literal["wheel_nan"] = "wheel_nan"
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Odometry and joints."""
+        return EVENTS["wheels"]
+
+    def begin(self, scene: Scene) -> Change:
+        """Fill with NaN."""
+
+        def spoil(event: Event) -> Event:
+            pose = ("position", "orientation", "linear", "angular")
+            names = pose if isinstance(event, OdometryEvent) else ("position", "velocity")
+            changes: dict[str, Any] = {name: np.full_like(getattr(event, name), np.nan) for name in names}
+            return replace(event, **changes)
+
+        return spoil
+
+
+class WrongCovariance(EventFailure):
+    """Odometry's covariances are ``factor`` times what they were: 0 says nothing, a negative one is nonsense."""
+
+    kind: Literal["wrong_covariance"] = "wrong_covariance"
+    factor: float = Field(0.01, description="of variances")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Odometry."""
+        return (OdometryEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Multiply."""
+
+        def scale(event: Event) -> Event:
+            assert isinstance(event, OdometryEvent)
+            return replace(event, pose_cov=event.pose_cov * self.factor, twist_cov=event.twist_cov * self.factor)
+
+        return scale
+
+
+class ImuBias(EventFailure):
+    """The gyroscope's yaw rate is off by ``yaw_rate`` and the accelerometer by ``acceleration``."""
+
+    kind: Literal["imu_bias"] = "imu_bias"
+    yaw_rate: float = Field(0.05, description="rad/s, about z")
+    acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """IMU messages."""
+        return (ImuEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Add."""
+        rates, accelerations = np.array([0.0, 0.0, self.yaw_rate]), np.array(self.acceleration)
+
+        def bias(event: Event) -> Event:
+            assert isinstance(event, ImuEvent)
+            return replace(
+                event,
+                angular_velocity=event.angular_velocity + rates,
+                linear_acceleration=event.linear_acceleration + accelerations,
+            )
+
+        return bias

@@ -1,0 +1,252 @@
+"""Failures of the wheels that change how far they seem to roll: slip, dead encoders, coarse ticks, wrong scale."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from fgloc import se2
+from fgloc.ablation.failures.base import Failure, Scene
+from fgloc.config import WheelsConfig
+from fgloc.frames import quaternion_yaw, yaw_quaternion
+from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
+
+
+@dataclass(frozen=True, slots=True)
+class Roll:
+    """How one source says that the wheels rolled up to one message."""
+
+    source: str  # a topic's positions or rates: each is spoiled with a memory of its own
+    speeds: FloatArray  # (2,) left, right: surface speeds [m/s]
+    dt: float  # s since the message before
+    seconds: float  # s since the recording's first message
+    phase: float  # 0 to 1 through the active interval; 0 if it has no end
+
+
+Distort = Callable[[Roll], FloatArray]
+
+
+class WheelFailure(Failure):
+    """A failure of the wheels' surface speeds, told alike to odometry (twist and pose) and to joints.
+
+    Odometry is split to wheels by the configured track, else by ``track_m``; joints are changed only where the
+    configuration gives the wheels' radii. What was wrongly counted stays counted when the failure is over.
+    """
+
+    track_m: float = Field(0.3, gt=0, description="m, where the configuration gives none")
+
+    @abstractmethod
+    def distort(self, scene: Scene) -> Distort:
+        """What the wheels are said to do, with the state of one run."""
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The spoiled events, in order of receive time."""
+        schedule, distort = self.when.schedule(scene), self.distort(scene)
+        wheels = scene.config.wheels
+        track = wheels.track or self.track_m
+        odometers: dict[str, _Odometer] = {}
+        encoders: dict[str, _Encoders] = {}
+        for event in events:
+            if not isinstance(event, OdometryEvent | JointsEvent):
+                yield event
+                continue
+            interval = schedule.inside(event)
+            active = schedule.hits(event)
+            seconds = scene.seconds(event)
+            phase = 0.0
+            if interval is not None and math.isfinite(interval[1] - interval[0]):
+                phase = (seconds - interval[0]) / (interval[1] - interval[0])
+
+            def spoil(
+                source: str,
+                speeds: FloatArray,
+                dt: float,
+                active: bool = active,
+                seconds: float = seconds,
+                phase: float = phase,
+            ) -> FloatArray:
+                return distort(Roll(source, speeds, dt, seconds, phase)) if active else speeds
+
+            changed: Event
+            if isinstance(event, OdometryEvent):
+                changed = odometers.setdefault(event.topic, _Odometer(track)).rewrite(event, spoil)
+            else:
+                changed = encoders.setdefault(event.topic, _Encoders(wheels)).rewrite(event, spoil)
+            if changed is not event and active:
+                self.touch(scene)
+            yield changed
+
+
+class WheelSlip(WheelFailure):
+    """The wheels turn more than the robot moves: an added motion of a stated profile.
+
+    Added are a forward ``speed`` and a ``yaw_rate``, both times the profile, and ``share`` of what the wheels report.
+    """
+
+    kind: Literal["wheel_slip"] = "wheel_slip"
+    speed: float = Field(0.0, description="m/s, forward")
+    yaw_rate: float = Field(0.0, description="rad/s, counter-clockwise")
+    share: float = Field(0.0, ge=-1, description="of the reported speeds; -0.5: the robot is pushed at double speed")
+    profile: Literal["step", "ramp", "pulse"] = Field(
+        "step", description="1 throughout; 0 to 1 over the interval; half a sine over the interval"
+    )
+
+    def distort(self, scene: Scene) -> Distort:
+        """Add the motion."""
+        half = 0.5 * (scene.config.wheels.track or self.track_m)
+        added = np.array([self.speed - half * self.yaw_rate, self.speed + half * self.yaw_rate])
+        shapes: dict[str, Callable[[float], float]] = {
+            "step": lambda phase: 1.0,
+            "ramp": lambda phase: phase,
+            "pulse": lambda phase: math.sin(math.pi * phase),
+        }
+        shape = shapes[self.profile]
+        return lambda roll: np.asarray(roll.speeds + shape(roll.phase) * (added + self.share * roll.speeds))
+
+
+class EncoderDead(WheelFailure):
+    """The encoder of one wheel, or of both, counts nothing: the wheel seems to stand still."""
+
+    kind: Literal["encoder_dead"] = "encoder_dead"
+    wheel: Literal["left", "right", "both"] = "both"
+
+    def distort(self, scene: Scene) -> Distort:
+        """Zero the speed."""
+        alive = {"left": [0.0, 1.0], "right": [1.0, 0.0], "both": [0.0, 0.0]}[self.wheel]
+        return lambda roll: np.asarray(roll.speeds * alive)
+
+
+class EncoderQuantized(WheelFailure):
+    """Wheels are counted in whole ticks of ``tick_m`` of the wheel's surface; what is left over counts later."""
+
+    kind: Literal["encoder_quantized"] = "encoder_quantized"
+    tick_m: float = Field(0.01, gt=0, description="m")
+
+    def distort(self, scene: Scene) -> Distort:
+        """Round down the distance since the start, and give its difference."""
+        totals: dict[str, FloatArray] = {}
+        ticks: dict[str, FloatArray] = {}
+
+        def quantize(roll: Roll) -> FloatArray:
+            total = totals.get(roll.source, np.zeros(2)) + roll.speeds * roll.dt
+            whole = np.floor(total / self.tick_m + 1e-9)
+            new = whole - ticks.get(roll.source, np.zeros(2))
+            totals[roll.source], ticks[roll.source] = total, whole
+            return np.asarray(new * self.tick_m / roll.dt)
+
+        return quantize
+
+
+class WheelScaleDrift(WheelFailure):
+    """The wheels seem to grow: reported speeds change by these shares per minute since the recording's start."""
+
+    kind: Literal["wheel_scale_drift"] = "wheel_scale_drift"
+    left_per_min: float = Field(0.01, description="share per minute")
+    right_per_min: float = Field(0.01, description="share per minute")
+
+    def distort(self, scene: Scene) -> Distort:
+        """Scale by the time."""
+        rate = np.array([self.left_per_min, self.right_per_min])
+        return lambda roll: np.asarray(roll.speeds * (1.0 + rate * roll.seconds / 60.0))
+
+
+Spoil = Callable[[str, FloatArray, float], FloatArray]
+
+
+class _Odometer:
+    """Rewrites one odometry topic: its twist, and its pose from the spoiled increments."""
+
+    def __init__(self, track: float) -> None:
+        self._track = track
+        self._before: tuple[int, FloatArray] | None = None  # stamp and pose as recorded
+        self._told: FloatArray | None = None  # pose as told; None while it is the recorded one
+
+    def rewrite(self, event: OdometryEvent, spoil: Spoil) -> OdometryEvent:
+        pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+        before, self._before = self._before, (event.stamp_ns, pose)
+        dt = 0.0 if before is None else (event.stamp_ns - before[0]) * 1e-9
+        if before is None or dt <= 0.0:
+            return event if self._told is None else self._with_pose(event, self._told)
+        twist = np.array([event.linear[0], event.angular[2]])
+        spoiled = self._spoiled(f"{event.topic} rates", twist, dt, spoil)
+        changed = event
+        if not np.array_equal(spoiled, twist, equal_nan=True):
+            linear, angular = event.linear.copy(), event.angular.copy()
+            linear[0], angular[2] = spoiled
+            changed = replace(event, linear=linear, angular=angular)
+        moved = se2.log(se2.between(before[1], pose))
+        rates = np.array([moved[0], moved[2]]) / dt
+        told = self._spoiled(f"{event.topic} positions", rates, dt, spoil)
+        if self._told is None and np.array_equal(told, rates, equal_nan=True):
+            return changed
+        start = before[1] if self._told is None else self._told
+        self._told = se2.compose(start, se2.exp((told[0] * dt, moved[1], told[1] * dt)))
+        return self._with_pose(changed, self._told)
+
+    def _spoiled(self, source: str, rates: FloatArray, dt: float, spoil: Spoil) -> FloatArray:
+        """Forward speed and yaw rate ``(2,)`` by way of the wheels."""
+        v, omega = rates
+        half = 0.5 * self._track
+        speeds = np.array([v - half * omega, v + half * omega])
+        left_right = spoil(source, speeds, dt)
+        if left_right is speeds:
+            return rates
+        left, right = left_right
+        return np.array([0.5 * (left + right), (right - left) / self._track])
+
+    @staticmethod
+    def _with_pose(event: OdometryEvent, pose: FloatArray) -> OdometryEvent:
+        position = np.array([pose[0], pose[1], event.position[2]])
+        return replace(event, position=position, orientation=yaw_quaternion(float(pose[2])))
+
+
+class _Encoders:
+    """Rewrites one topic of joint states: the angles and rates of the two wheels."""
+
+    def __init__(self, wheels: WheelsConfig) -> None:
+        radii = (wheels.left_radius, wheels.right_radius)
+        self._radii = None if None in radii else np.array(radii, dtype=float)
+        self._wanted = (wheels.left_joint, wheels.right_joint)
+        self._before: tuple[int, FloatArray] | None = None  # stamp and angles as recorded
+        self._offset = np.zeros(2)  # told minus recorded angles
+
+    def rewrite(self, event: JointsEvent, spoil: Spoil) -> JointsEvent:
+        pair = self._indices(event)
+        if self._radii is None or pair is None:
+            return event
+        radii, changed = self._radii, event
+        angles = event.position[pair] if len(event.position) else np.zeros(2)
+        before, self._before = self._before, (event.stamp_ns, angles)
+        dt = 0.0 if before is None else (event.stamp_ns - before[0]) * 1e-9
+        if before is not None and dt > 0.0:
+            speeds = (angles - before[1]) / dt * radii
+            if len(event.position):
+                told = spoil(f"{event.topic} positions", speeds, dt)
+                if told is not speeds:
+                    self._offset = self._offset + (told - speeds) * dt / radii
+            if len(event.velocity):
+                rates = event.velocity[pair] * radii
+                told = spoil(f"{event.topic} rates", rates, dt)
+                if told is not rates:
+                    velocity = event.velocity.copy()
+                    velocity[pair] = told / radii
+                    changed = replace(changed, velocity=velocity)
+        if len(event.position) and self._offset.any():
+            position = event.position.copy()
+            position[pair] += self._offset
+            changed = replace(changed, position=position)
+        return changed
+
+    def _indices(self, event: JointsEvent) -> list[int] | None:
+        """Places of the left and of the right wheel in the message; None if it does not hold both."""
+        found = []
+        for name, side in zip(self._wanted, ("left", "right"), strict=True):
+            fits = [i for i, n in enumerate(event.names) if (n == name if name else side in n.lower())]
+            found += fits[:1]
+        return found if len(found) == 2 else None
