@@ -17,7 +17,7 @@ from fgloc.motion.card import Kinematics
 from fgloc.types import CommandEvent
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig
-from training.data import Run, load_run, make_run
+from training.data import Run, cut, load_run, make_run
 from training.losses import composed_nll, end_errors, rollout_loss
 from training.models import integrate, relative
 from training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
@@ -63,6 +63,17 @@ def test_samples_are_cut_at_gaps_of_the_truth() -> None:
     starts = run.starts(20)
     assert len(starts)
     assert not any(9.73 < t < 11.26 for k in starts for t in at[k : k + 21])
+
+
+def test_part_of_a_run_equals_the_run() -> None:
+    whole = synthetic(1)
+    part = cut(whole, "part", 100, 300)
+    assert part.name == "part"
+    np.testing.assert_array_equal(part.poses, whole.poses[100:300])
+    limits = np.arange(-1.0, 19.0, 0.1)  # the past is known to the part as well
+    np.testing.assert_allclose(part.track.means(limits), whole.track.means(limits + 100 * whole.dt_s), atol=1e-9)
+    predicted = roll_kinematics(Kinematics(), part, 0.2).motions
+    np.testing.assert_allclose(predicted, roll_kinematics(Kinematics(), whole, 0.2).motions[50:149], atol=1e-9)
 
 
 def test_bag_equals_memory(tmp_path: Path) -> None:

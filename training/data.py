@@ -5,7 +5,7 @@ Source: paper eq. 1, 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +115,19 @@ def make_run(
         valid=_heard(t_truth, times, config),
         commands=tuple(commands),
         track=CommandTrack(tuple(commands), first),
+    )
+
+
+def cut(run: Run, name: str, first: int, last: int) -> Run:
+    """The samples ``[first, last)`` of a run, as a run of their own; commands before them stay known."""
+    return replace(
+        run,
+        name=name,
+        origin_ns=run.origin_ns + round(first * run.dt_s * 1e9),
+        poses=run.poses[first:last],
+        velocities=run.velocities[first:last],
+        valid=run.valid[first:last],
+        track=CommandTrack(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
     )
 
 

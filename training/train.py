@@ -29,7 +29,7 @@ from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, re
 from training.rollouts import Rollout, roll_kinematics, roll_model
 
 _VALIDATION_S = (10.0, 30.0)
-_HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
+HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
 
 
 def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str) -> ModelCard:
@@ -231,7 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = load_train_config(options.config)
         made_by = f"python -m training.train {options.config.as_posix()}; {config.model_dump_json()}"
         runs = {
-            name: load_run(options.data / bag, name, config.network.dt_s, _HISTORY_S, config.data)
+            name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data)
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
         if config.split is not None:

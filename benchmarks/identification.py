@@ -1,0 +1,191 @@
+"""Motion models trained and judged: ``python -m benchmarks.identification``.
+
+Every model is trained here, by the default configuration, once per seed; values are means over the seeds, spreads their
+standard deviation. Drift is the summed end error over the summed distance, windows start every second and are pooled
+over the robots. ``loro`` leaves one robot out of training, early stopping and calibration, and tests on it. ``seen``
+trains on the first 60 % of each robot's run, stops and calibrates on the next 10 %, tests on the last 30 %. Coverage at
+one step is that of a step of 0.2 s. ``selftruth`` trains as ``loro`` does, once on Vicon's poses and once on what
+``fgloc smooth`` makes of the same runs without a learned model; both are tested against Vicon.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.common import Row, main, not_run
+from datasets import mrclam
+from fgloc.config import load_config
+from fgloc.motion import MotionModel, load_model
+from fgloc.motion.card import Kinematics, Split
+from fgloc.runner import find_beside, run
+from fgloc.types import CommandEvent, FloatArray
+from training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from training.data import Run, cut, make_run
+from training.evaluate import STEP_S, Figures, evaluate
+from training.rollouts import Rollout, roll_kinematics, roll_model
+from training.train import HISTORY_S, leave_one_out, train
+
+_ROOT = Path(__file__).resolve().parent.parent
+_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
+_MODEL = _ROOT / "fgloc" / "motion" / "models" / "mrclam" / "all.safetensors"
+_HORIZONS_S = (10.0, 30.0, 60.0)
+_SHARES = (0.6, 0.7)  # of a run: what trains ends, what validates ends
+_SMOOTHED = DataConfig(max_truth_gap_s=0.35)  # keyframes may be 0.2 s apart
+_QUICK = OptimizationConfig(iterations=60, validate_every=30, variance_iterations=20)
+_COVERAGE = [f"cov{when}{i}" for when in ("", "10s_") for i in (1, 2, 3)]
+_STEPS = 4000
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """Yield every row; a quick run has one seed, few iterations and leaves out the smoothing."""
+    torch.set_num_threads(1)
+    seeds = range(1) if quick else range(3)
+    optimization = _QUICK if quick else OptimizationConfig()
+    with tempfile.TemporaryDirectory() as scratch:
+        yield from _mrclam(Path(scratch), seeds, optimization, quick)
+    yield from not_run(["husky.end_m", "husky.end_rad"], "training cannot yet cut recordings into windows of 2 s")
+    sim = ("mu02", "mu01", "radii", "patches", "patches_plain")
+    yield from not_run([f"sim.{name}_ratio" for name in sim], "models cannot yet read gyro, wheel speed or effort")
+    yield from _inference(load_model(_MODEL), quick)
+    yield from not_run(["infer.ensemble5_us"], "there is no ensemble yet")
+
+
+def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig, quick: bool) -> Iterator[Row]:
+    source = _DATA / "mrclam6"
+    if not source.is_dir():
+        names = [f"drift_{h:.0f}s" for h in _HORIZONS_S] + _COVERAGE
+        ids = [f"{on}.{name}" for on in ("loro", "seen") for name in names]
+        ids += ["seen.yaw_10s_deg", "selftruth.drift_ratio", "train.minutes"]
+        yield from not_run(ids, f"no {source}; set FGLOC_REAL_DATA")
+        return
+    runs = {f"robot{k}": _run(mrclam.read(source, k), f"robot{k}") for k in mrclam.ROBOTS}
+    commands = [roll_kinematics(Kinematics(), r, STEP_S) for r in runs.values()]
+    for horizon in _HORIZONS_S:
+        yield Row(f"commands.drift_{horizon:.0f}s", evaluate(commands, horizon).drift_percent, unit="%")
+    trainer = _Trainer(scratch, optimization)
+    loro = [trainer.leave_one_out(seed, runs, runs) for seed in seeds]
+    yield from _figures("loro", loro)
+    parts, split = _parts(runs)
+    seen = [trainer.rollouts(seed, split, parts, parts) for seed in seeds]
+    yield from _figures("seen", seen)
+    yield _row("seen.yaw_10s_deg", [evaluate(r, 10.0).yaw_end_deg for r in seen], "deg")
+    yield _row("train.minutes", trainer.minutes, "min")
+    if quick:
+        yield from not_run(["selftruth.drift_ratio"], "left out of a quick run")
+        return
+    smoothed = {name: _smoothed(source, k, runs[name], scratch) for k, name in enumerate(runs, 1)}
+    own = [trainer.leave_one_out(seed, smoothed, runs) for seed in seeds]
+    ratios = [evaluate(o, 30.0).drift_percent / evaluate(v, 30.0).drift_percent for o, v in zip(own, loro, strict=True)]
+    yield _row("selftruth.drift_ratio", ratios)
+
+
+class _Trainer:
+    """Trains into a scratch folder and keeps the time that each model took."""
+
+    def __init__(self, scratch: Path, optimization: OptimizationConfig) -> None:
+        self.minutes: list[float] = []
+        self._path = scratch / "model.safetensors"
+        self._optimization = optimization
+
+    def leave_one_out(self, seed: int, training: dict[str, Run], testing: dict[str, Run]) -> list[Rollout]:
+        """Each run predicted by a model that has not seen it."""
+        splits = leave_one_out(list(training))
+        return [rollout for split in splits for rollout in self.rollouts(seed, split, training, testing)]
+
+    def rollouts(self, seed: int, split: Split, training: dict[str, Run], testing: dict[str, Run]) -> list[Rollout]:
+        """The split's test runs, predicted by a model of its training runs."""
+        config = TrainConfig(
+            robot="benchmark",
+            recordings={name: Path(name) for name in training},
+            split=split,
+            optimization=self._optimization.model_copy(update={"seed": seed}),
+        )
+        began = time.perf_counter()
+        train(config, split, training, self._path, "benchmarks.identification")
+        self.minutes.append((time.perf_counter() - began) / 60.0)
+        model = load_model(self._path)
+        return [roll_model(model, testing[name], STEP_S) for name in split.test]
+
+
+def _run(recorded: mrclam.Run, name: str) -> Run:
+    pairs = zip(recorded.commands_ns.tolist(), recorded.commands.tolist(), strict=True)
+    commands = [CommandEvent(stamp, stamp, "/cmd_vel", v, omega) for stamp, (v, omega) in pairs]
+    return _sampled(name, commands, recorded.truth_ns, recorded.truth, DataConfig())
+
+
+def _sampled(name: str, commands: list[CommandEvent], stamps: FloatArray, poses: FloatArray, data: DataConfig) -> Run:
+    return make_run(name, commands, stamps, poses, NetworkConfig().dt_s, HISTORY_S, data)
+
+
+def _smoothed(source: Path, robot: int, recorded: Run, scratch: Path) -> Run:
+    """The run with the estimate of our own batch smoothing in place of its truth."""
+    bag = mrclam.convert(source, robot, scratch / f"robot{robot}")
+    robot_yaml = find_beside(bag, "robot.yaml")
+    if robot_yaml is None:
+        raise FileNotFoundError(f"the converter wrote no robot.yaml beside {bag}")
+    trajectory = run(bag, find_beside(bag, "map.yaml"), load_config(robot_yaml), "batch").trajectory
+    return _sampled(recorded.name, list(recorded.commands), trajectory.stamps_ns, trajectory.poses, _SMOOTHED)
+
+
+def _parts(runs: dict[str, Run]) -> tuple[dict[str, Run], Split]:
+    """Beginning, middle and end of each run, and the split that they make."""
+    parts: dict[str, Run] = {}
+    roles = ("train", "validation", "test")
+    for name, whole in runs.items():
+        n = len(whole.poses)
+        limits = [0, *(round(share * n) for share in _SHARES), n]
+        for role, first, last in zip(roles, limits, limits[1:], strict=False):
+            parts[f"{name}.{role}"] = cut(whole, f"{name}.{role}", first, last)
+    train_names, validation, test = (tuple(p for p in parts if p.endswith(role)) for role in roles)
+    return parts, Split(train=train_names, validation=validation, test=test)
+
+
+def _figures(on: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
+    """Drifts and coverage, the windows of all robots pooled."""
+    for horizon in _HORIZONS_S:
+        yield _row(f"{on}.drift_{horizon:.0f}s", [evaluate(r, horizon).drift_percent for r in per_seed], "%")
+    for label, horizon in (("cov", STEP_S), ("cov10s_", 10.0)):
+        shares = np.array([_coverage(evaluate(r, horizon)) for r in per_seed])
+        for i, column in enumerate(shares.T, 1):
+            yield _row(f"{on}.{label}{i}", column.tolist())
+
+
+def _coverage(figures: Figures) -> tuple[float, float, float]:
+    if figures.coverage is None:
+        raise ValueError("the model gave no covariance")
+    return figures.coverage
+
+
+def _row(name: str, values: list[float], unit: str = "") -> Row:
+    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+
+
+def _inference(model: MotionModel, quick: bool) -> Iterator[Row]:
+    """Median time of one prediction over 0.2 s with commands at 20 Hz, as the localizer asks for them."""
+    period = 50_000_000
+    rng = np.random.default_rng(0)
+    told = rng.uniform([0.0, -0.5], [0.1, 0.5], (4 * _STEPS + 100, 2)).tolist()
+    events = [CommandEvent(i * period, i * period, "/cmd_vel", v, omega) for i, (v, omega) in enumerate(told)]
+
+    def median_us() -> float:
+        times = []
+        for k in range(_STEPS // 10 if quick else _STEPS):
+            i = 40 + 4 * k
+            commands = tuple(events[i - 30 : i + 5])
+            began = time.perf_counter_ns()
+            model.predict(commands, i * period, (i + 4) * period, None)
+            times.append(time.perf_counter_ns() - began)
+        return float(np.median(times)) * 1e-3
+
+    yield _row("infer.step_us", [median_us() for _ in range(3)], "us")
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")
