@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +38,7 @@ from fgloc.types import (
 _OPTICAL_TO_BODY = np.array(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 )  # optical axes in body axes (REP 103)
-_SCAN_EVENTS = 20_000  # how far into a recording the first message of a kind is looked for
+_SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded is looked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +76,7 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
     first = _first_events(recording)
     camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
-    T_base_sensor = None if camera is not None else _sensor_pose(recording, config, first, notes)
+    T_base_sensor = _sensor_pose(recording, config, first, notes)
     if landmark_map is None and config.estimator.kind != "isam2":
         config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
         notes.append(
@@ -116,11 +115,14 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
 
 
 def _first_events(recording: Recording) -> dict[type[Event], Event]:
-    """The first event of each kind, near the beginning."""
+    """The first event of each kind, from as far into the recording as it takes for every topic to speak."""
     found: dict[type[Event], Event] = {}
-    events: Iterator[Event] = recording.events()
-    for _, event in zip(range(_SCAN_EVENTS), events, strict=False):
+    silent = set(recording.roles.values())
+    for event in recording.events():
         found.setdefault(type(event), event)
+        silent.discard(event.topic)
+        if not silent:
+            break
     return found
 
 
@@ -190,7 +192,7 @@ def given_pose(config: Config, default_axes: str) -> FloatArray | None:
 def _sensor_pose(
     recording: Recording, config: Config, first: dict[type[Event], Event], notes: list[str]
 ) -> FloatArray | None:
-    """Place of a sensor that reports landmarks, without images: as configured, or from tf, or at the base."""
+    """Place of a sensor that reports ranges or marker poses: as configured, or from tf, or at the base."""
     given = given_pose(config, default_axes="body")
     event = first.get(RangeBearingEvent) or first.get(MarkerPosesEvent)
     if given is not None or not isinstance(event, RangeBearingEvent | MarkerPosesEvent):
@@ -199,7 +201,7 @@ def _sensor_pose(
     T = np.eye(4)
     if event.frame_id in recording.frames and base in recording.frames:
         T = recording.frames.lookup(base, event.frame_id).copy()
-    else:
+    elif event.frame_id.lstrip("/") != base.lstrip("/"):
         notes.append(
             f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at "
             "the base; set recording.sightings_pose otherwise."
