@@ -46,7 +46,7 @@ def select(*topics: tuple[str, str], empty: tuple[tuple[str, str], ...] = (), **
             [("/camera/depth/image_raw", IMAGE), ("/camera/color/image_raw", IMAGE)],
             {"image": "/camera/color/image_raw"},
         ),
-        ([("/direct/image", IMAGE), ("/tags", TAGS)], {"image": "/direct/image", "sightings": "/tags"}),
+        ([("/direct/image", IMAGE), ("/tags", TAGS)], {"sightings": "/tags"}),
         (
             [("/left/image_raw/compressed", COMPRESSED), ("/left/camera_info", INFO), ("/right/camera_info", INFO)],
             {"image": "/left/image_raw/compressed", "camera_info": "/left/camera_info"},
@@ -132,3 +132,17 @@ def test_truth_may_be_any_odometry_if_given(tmp_path):
     with open_recording(write_drive(tmp_path / "run", n=3), config) as recording:
         kinds = {type(e).__name__ for e in recording.events() if e.topic == "/odom"}
         assert kinds == {"TruthEvent"}
+
+
+def test_markers_are_not_taken_twice_from_images_and_from_their_detections():
+    topics = ("/camera/image_raw", IMAGE), ("/camera/camera_info", INFO), ("/tags", TAGS)
+    found = select(*topics)
+    assert found.roles == {"camera_info": "/camera/camera_info", "sightings": "/tags"}
+    assert not found.problems
+    assert found.notes == (
+        "/camera/image_raw is not used as image, because /tags tells of the markers already "
+        "(to use both: name both in recording.topics; to use it alone: recording.topics.sightings: none).",
+    )
+    assert "sightings" not in select(*topics, image="/camera/image_raw").roles
+    assert select(*topics, sightings="none").roles["image"] == "/camera/image_raw"
+    assert len(select(*topics, image="/camera/image_raw", sightings="/tags").roles) == 3

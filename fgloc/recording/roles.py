@@ -99,6 +99,14 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
                     f"No {role}: {', '.join(by_type)} would fit by type but not by name "
                     f"(to use it all the same: recording.topics.{role}: {by_type[0]})."
                 )
+    if {"image", "sightings"} <= roles.keys() and None in (config.image, config.sightings):
+        # Most often the sightings were found in these very images: nothing may be counted twice.
+        spare: Role = "image" if config.image is None else "sightings"
+        kept: Role = "sightings" if spare == "image" else "image"
+        notes.append(
+            f"{roles.pop(spare)} is not used as {spare}, because {roles[kept]} tells of the markers already "
+            f"(to use both: name both in recording.topics; to use it alone: recording.topics.{kept}: none)."
+        )
     return Selection(roles, tuple(notes), tuple(problems))
 
 
