@@ -16,13 +16,18 @@ from fgloc.types import (
 )
 
 
-def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
+def carry(
+    m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray, size_m: float = 0.0, together: int = 1
+) -> LandmarkMeasurement:
     """Move a sighting to the keyframe.
 
     Args:
         m: the sighting, as made from the base at its own time.
         motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
         cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+        size_m: side of the marker whose corners were seen.
+        together: markers carried by the same motion, which share its error; only corners, which have one sigma for
+            all, take account of it.
     """
     if isinstance(m, CornerMeasurement):
         x, y, yaw = motion
@@ -30,7 +35,8 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
         T[:2, 3] = x, y
         camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
-        return dataclasses.replace(m, camera=camera)
+        spread = _corner_variance(m, cov, size_m) * 4 * together  # four corners share it: taken for independent later
+        return dataclasses.replace(m, camera=camera, sigma_px=math.sqrt(m.sigma_px**2 + spread))
     if isinstance(m, MarkerPoseMeasurement):
         pose = se2.compose(motion, m.pose)
         return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov))
@@ -51,3 +57,12 @@ def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r
     J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
     J = J_polar @ J_point
     return np.asarray(J @ cov @ J.T)
+
+
+def _corner_variance(m: CornerMeasurement, cov: FloatArray, size_m: float) -> float:
+    """Variance [px²] that an uncertain motion adds to a corner: by its yaw, and by its translation at the depth."""
+    focal = max(m.camera.K[0, 0], m.camera.K[1, 1])
+    sides = m.corners_px - np.roll(m.corners_px, 1, axis=0)
+    longest_px = math.sqrt(float((sides**2).sum(axis=1).max()))  # the least foreshortened: focal * size / depth
+    by_translation = 0.0 if size_m <= 0.0 else (longest_px / size_m) ** 2 * max(cov[0, 0], cov[1, 1])
+    return float(focal**2 * cov[2, 2] + by_translation)

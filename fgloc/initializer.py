@@ -142,7 +142,8 @@ class Initializer:
         for index in range(len(self._steps) - 1, -1, -1):
             collected = self._steps[index]
             for m in collected.sightings:
-                yield carry(m, motion, cov)
+                size_m = self._map.landmarks[m.landmark_id].size_m if self._map is not None else 0.0
+                yield carry(m, motion, cov, size_m, len(collected.sightings))
             if collected.motions and index > 0:
                 step, step_cov = fuse(collected.motions)
                 back = se2.inverse(step)

@@ -34,6 +34,7 @@ from fgloc.types import (
 )
 
 _ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
+_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
@@ -80,6 +81,8 @@ class Localizer:
         self._learned = learned
         self._joint = joint
         self._landmarks = landmarks
+        known = landmark_map.landmarks.values() if landmark_map is not None else ()
+        self._sizes = {landmark.landmark_id: landmark.size_m for landmark in known}
         self.calibrator: Calibrator | None = None
         if landmark_map is not None and config.landmarks.self_calibrating:
             self.calibrator = Calibrator(config.landmarks, landmark_map)
@@ -88,6 +91,7 @@ class Localizer:
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
         self._last_fix_s = 0.0
         self._clock_s = 0.0
+        self._silent_s = 0.0  # how long no motion source has spoken
         self._lost = False
 
     def update(self, step: Step) -> Estimate | None:
@@ -120,7 +124,7 @@ class Localizer:
             found = self._landmarks.measure(event)
             if found and event.stamp_ns != step.stamp_ns:
                 motion, cov = self._wheels.carry(step, step.stamp_ns, event.stamp_ns)
-                found = tuple(carry(m, motion, cov) for m in found)
+                found = tuple(carry(m, motion, cov, self._sizes.get(m.landmark_id, 0.0), len(found)) for m in found)
             measured.extend(found)
         return measured
 
@@ -128,6 +132,7 @@ class Localizer:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         self._segment = step.segment
         self._lost = False
+        self._silent_s = 0.0
         self.weights.refused_in_a_row = 0
         self._initializer.reset()
         given = self.config.estimator.initial_pose
@@ -174,7 +179,9 @@ class Localizer:
         self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
     ) -> Estimate:
         k = self.estimator.k + 1
-        if not motions:
+        if motions:
+            self._silent_s = 0.0
+        else:
             motions = [self._unknown_motion(step)]
         # 2. Weigh: sightings against the prediction, and the motion against sightings that agree it is wrong
         with self.stopwatch("weigh"):
@@ -197,6 +204,7 @@ class Localizer:
         if self.estimator.rebuilt > rebuilt:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
+            decisions = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in decisions]
         if self.calibrator is not None:
             self.calibrator.step(*fuse(motions), [s.raw for s in believed])
         self.counts.update(m.source for m in motions)
@@ -209,10 +217,11 @@ class Localizer:
         return self._estimate(step, belief, decisions)
 
     def _unknown_motion(self, step: Step) -> MotionMeasurement:
-        """Nothing spoke: the robot may have gone anywhere within its speed limits."""
+        """Nothing spoke: sigma grows with the time of silence, however many steps it is cut into."""
         self.rejections["motion.silent"] += 1
-        spread = np.array([self.config.gate.max_speed, self.config.gate.max_speed, self.config.gate.max_yaw_rate])
-        cov = np.diag((0.2 * spread * max(step.dt, 0.01)) ** 2)
+        before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
+        speed, turn = _LIKELY * self.config.gate.max_speed, _LIKELY * self.config.gate.max_yaw_rate
+        cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
 
     def _watch_for_loss(self, believed: Sequence[object]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -76,12 +77,15 @@ def _measure_again(
 ) -> dict[int, tuple[MotionMeasurement, ...]]:
     """Evaluate the learned motion at the velocities of the smoothed trajectory."""
     stamps = np.array([frame.stamp_ns for frame in solver.frames], dtype=np.int64)
-    velocities = smoothed_velocities(stamps, solver.poses())
+    poses = solver.poses()
+    starts = [i for i, frame in enumerate(solver.frames) if frame.prior is not None]
     again = {}
-    for frame, velocity in zip(solver.frames, velocities, strict=True):
-        step = steps.get(frame.stamp_ns)
-        if frame.prior is None and step is not None and (motions := parts.localizer.measure_motion(step, velocity)):
-            again[frame.k] = tuple(motions)
+    for start, end in pairwise([*starts, len(stamps)]):  # no motion leads from one stretch to the next
+        velocities = smoothed_velocities(stamps[start:end], poses[start:end])
+        for frame, velocity in zip(solver.frames[start + 1 : end], velocities[1:], strict=True):
+            step = steps.get(frame.stamp_ns)
+            if step is not None and (motions := parts.localizer.measure_motion(step, velocity)):
+                again[frame.k] = tuple(motions)
     return again
 
 
