@@ -176,7 +176,7 @@ def test_corners_without_a_map_give_range_and_bearing() -> None:
     assert 0.01 < np.sqrt(m.cov[1, 1]) < 0.08
 
 
-def test_corners_without_a_map_give_a_pose_where_it_is_clear() -> None:
+def test_corners_without_a_map_give_a_pose_whose_yaw_counts_where_it_is_clear() -> None:
     sensor = LandmarkSensor(single_view(0.2, 0.05), None, CAMERA, None)
     near = standing(9, (1.0, 0.1, 0.4), np.pi + 0.7)
     [m] = sensor.measure(corners_event((9, project(CAMERA, np.zeros(3), near.corners()))))
@@ -185,7 +185,9 @@ def test_corners_without_a_map_give_a_pose_where_it_is_clear() -> None:
     assert m.cov[2, 2] >= 0.05**2
     far = standing(9, (4.0, 0.1, 0.4), np.pi + 0.1)
     [m] = sensor.measure(corners_event((9, project(CAMERA, np.zeros(3), far.corners()))))
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, MarkerPoseMeasurement)  # a landmark that is a variable is of one kind for the whole run
+    assert np.hypot(*(m.pose[:2] - far.planar[:2])) < 1e-3
+    assert m.cov[2, 2] >= 1.0
 
 
 # --- ranges and bearings ---

@@ -34,6 +34,7 @@ from fgloc.types import (
 
 _MIN_RANGE_M = 1e-3
 _CLEAR_RATIO = 2.0  # a marker's pose is believed if the mirrored one explains its corners this much worse
+_MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
 _MIN_COS_ALONG_AXIS = math.cos(math.radians(80.0))  # beyond it a distance along the axis says nothing of the range
 _S = TypeVar("_S", MarkerCorners, MarkerPose, RangeBearing)
 
@@ -155,9 +156,10 @@ class LandmarkSensor:
         cov_xy = (R @ cov[:3, :3] @ R.T)[:2, :2]
         clear = len(candidates) == 1 or candidates[1][1] > _CLEAR_RATIO * max(rms, sigma_px)
         floor = self._config.landmarks.yaw_sigma_rad
-        if floor is None or not clear or landmark is not None:
+        if floor is None or landmark is not None:
             return self._polar(event.stamp_ns, seen.marker_id, in_base[:2, 3], cov_xy)
-        yaw_var = max(floor**2, float((R @ cov[3:, 3:] @ R.T)[2, 2]))
+        # Of a marker that may be mirrored the yaw says little; without it, it would be another kind of variable.
+        yaw_var = max(floor if clear else _MIRRORED_SIGMA, math.sqrt((R @ cov[3:, 3:] @ R.T)[2, 2])) ** 2
         yaw = _planar_yaw(in_base[:3, :3], None)
         return _planar(event.stamp_ns, seen.marker_id, in_base[:2, 3], cov_xy, yaw, yaw_var)
 
