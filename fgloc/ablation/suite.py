@@ -1,0 +1,193 @@
+"""What a suite file says: recordings × failures × severities × variants × seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from fgloc.ablation.failures import AnyFailure
+from fgloc.config import Config, Section, load_config
+from fgloc.errors import ConfigError
+from fgloc.runner import RunMode, find_beside
+
+
+class RecordingEntry(Section):
+    """One recording. Paths are relative to the suite file; map and config default to those beside the bag."""
+
+    name: str
+    bag: Path
+    map: Path | None = None
+    config: Path | None = None
+
+
+class Variant(Section):
+    """One way to run the localizer."""
+
+    name: str
+    config: dict[str, Any] = Field({}, description="what differs from the recording's configuration")
+    mode: RunMode | None = Field(None, description="None: the suite's")
+    start: Literal["configured", "truth"] = Field(
+        "configured", description="truth: the run starts at the truth's first pose; for dead reckoning"
+    )
+
+
+class Severity(Section):
+    """A number of a failure that is varied."""
+
+    field: str = Field(description="of the chain's first failure; a dot leads into 'when', such as when.burst_s")
+    values: tuple[float, ...] = Field(min_length=1)
+    unit: str = ""
+
+
+class FailureEntry(Section):
+    """A named chain of failures."""
+
+    name: str
+    chain: tuple[AnyFailure, ...] = Field(min_length=1)
+    severity: Severity | None = None
+
+    @model_validator(mode="after")
+    def _severities_fit(self) -> FailureEntry:
+        for _ in self.severities():
+            pass
+        return self
+
+    def severities(self) -> Iterator[tuple[float | None, tuple[AnyFailure, ...]]]:
+        """Each severity with its chain; a failure without any gives one, None."""
+        if self.severity is None:
+            yield None, self.chain
+            return
+        first, rest = self.chain[0], self.chain[1:]
+        for value in self.severity.values:
+            content = first.model_dump()
+            target: dict[str, Any] = content
+            path = self.severity.field.split(".")
+            for name in path[:-1]:
+                inner = target.get(name)
+                target = inner if isinstance(inner, dict) else {}
+            if path[-1] not in target:
+                raise ValueError(f"{first.kind} has no number '{self.severity.field}' to be varied")
+            whole = isinstance(target[path[-1]], int) and value == int(value)
+            target[path[-1]] = int(value) if whole else value
+            yield value, (type(first).model_validate(content), *rest)
+
+
+class Suite(Section):
+    """An ablation."""
+
+    title: str
+    mode: RunMode = "online"
+    seeds: tuple[int, ...] = Field((0,), min_length=1, description="of random failures")
+    recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
+    variants: tuple[Variant, ...] = Field((Variant(name="full"),), min_length=1)
+    failures: tuple[FailureEntry, ...] = ()
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Suite:
+        for entries in (self.recordings, self.variants, self.failures):
+            names = [entry.name for entry in entries]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"the name '{twice[0]}' is used twice")
+        if NOTHING in {entry.name for entry in self.failures}:
+            raise ValueError(f"'{NOTHING}' is run without being listed")
+        return self
+
+
+NOTHING = "none"
+"""The failure that is none: every recording and variant is run without failure too, to compare with."""
+
+
+class Cell(Section):
+    """One run of a suite, with all that it needs, and its place in the report."""
+
+    recording: str
+    variant: str
+    failure: str
+    severity: float | None
+    seed: int
+    bag: Path
+    map: Path | None
+    config: Config
+    mode: RunMode
+    start: Literal["configured", "truth"]
+    chain: tuple[AnyFailure, ...]
+
+
+def load_suite(path: Path) -> Suite:
+    """Read a suite file.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or has an unknown key or a wrong value; all are named.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give a suite file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not YAML: {error}") from error
+    try:
+        return Suite.model_validate(data)
+    except ValidationError as error:
+        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()]
+        raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error
+
+
+def expand(suite: Suite, folder: Path) -> list[Cell]:
+    """All runs of a suite. Without failure there is nothing to draw: then the first seed stands for all.
+
+    Args:
+        suite: from `load_suite`.
+        folder: that relative paths refer to, the suite file's.
+
+    Raises:
+        ConfigError: a recording, map or configuration is missing, or a variant's configuration is wrong.
+    """
+    cells = []
+    for entry, variant in product(suite.recordings, suite.variants):
+        bag = folder / entry.bag
+        if not bag.exists():
+            raise ConfigError(f"{bag}: recording '{entry.name}' is missing; make it, or take it out of the suite")
+        map_file = folder / entry.map if entry.map is not None else find_beside(bag, "map.yaml")
+        config_file = folder / entry.config if entry.config is not None else find_beside(bag, "robot.yaml")
+        base = Config() if config_file is None else load_config(config_file)
+        common = dict(
+            recording=entry.name,
+            variant=variant.name,
+            bag=bag,
+            map=map_file,
+            config=_varied(base, variant, folder),
+            mode=variant.mode or suite.mode,
+            start=variant.start,
+        )
+        cells.append(Cell(**common, failure=NOTHING, severity=None, seed=suite.seeds[0], chain=()))
+        for failure, seed in product(suite.failures, suite.seeds):
+            for severity, chain in failure.severities():
+                cells.append(Cell(**common, failure=failure.name, severity=severity, seed=seed, chain=chain))
+    return cells
+
+
+def _varied(base: Config, variant: Variant, folder: Path) -> Config:
+    content = _merged(base.model_dump(), variant.config)
+    for section, key in (("camera", "file"), ("motion", "model")):
+        value = variant.config.get(section, {}).get(key)
+        if isinstance(value, str):
+            content[section][key] = folder / value
+    try:
+        return Config.model_validate(content)
+    except ValidationError as error:
+        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()]
+        raise ConfigError(f"variant '{variant.name}': wrong configuration\n" + "\n".join(lines)) from error
+
+
+def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in change.items():
+        old = out.get(key)
+        out[key] = _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return out

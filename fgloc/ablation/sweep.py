@@ -1,0 +1,115 @@
+"""Many jobs on many cores: a Dask cluster, local or elsewhere, that may be killed at any time and goes on later."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fgloc.ablation.jobs import Cost, Job, Record, execute, read_record, record_path, write_record
+from fgloc.errors import ConfigError
+
+Progress = Callable[[int, int], None]
+"""Called with the number of jobs done and their total."""
+
+_DEATHS = 3  # of workers, while they ran one job, after which the job is quarantined
+
+
+def sweep(
+    jobs: Sequence[Job],
+    out: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    retry: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Record]:
+    """Run all jobs that have no record yet; return all records by key.
+
+    A job whose record exists is not run again: a sweep that was killed goes on where it was. A job that fails, or that
+    kills its worker again and again, gets a record that says so, and is left alone afterwards.
+
+    Args:
+        jobs: from `make_jobs`.
+        out: folder for the records; on a cluster all workers must see it, and the recordings, under the same paths.
+        workers: processes of the local cluster; None: one per core.
+        scheduler: address of a running Dask scheduler (``tcp://host:8786``) instead of a local cluster.
+        retry: run jobs that failed once more.
+        progress: called after each job.
+
+    Raises:
+        ConfigError: Dask is not installed or the scheduler cannot be reached.
+        OutputError: a record cannot be written.
+    """
+    unique = {job.key: job for job in jobs}
+    records = {key: record for key in unique if (record := read_record(out, key)) is not None}
+    if retry:
+        for key in [key for key, record in records.items() if record.outcome != "done"]:
+            record_path(out, key).unlink()
+            del records[key]
+    todo = [job for key, job in unique.items() if key not in records]
+    if progress is not None:
+        progress(len(records), len(unique))
+    if not todo:
+        return records
+    out = out.resolve()
+    with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
+        for key, error in _finished(client, todo, out):
+            if error is not None and not record_path(out, key).exists():
+                write_record(out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, peak_mb=0.0)))
+            record = read_record(out, key)
+            assert record is not None
+            records[key] = record
+            if progress is not None:
+                progress(len(records), len(unique))
+    return records
+
+
+def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str, str | None]]:
+    """Keys of finished jobs, with an error if their workers died."""
+    import distributed
+
+    futures = client.map(execute, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
+    key_of = {future: job.key for future, job in zip(futures, todo, strict=True)}
+    for future in distributed.as_completed(futures):
+        error = future.exception() if future.status == "error" else None
+        if error is not None and not isinstance(error, distributed.KilledWorker):
+            raise error
+        said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
+        yield key_of[future], said
+        future.release()
+
+
+@contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    """A client of the given scheduler, or of a local cluster that ends with it."""
+    try:
+        import dask
+        import distributed
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error.name} is not installed, and sweeps run on it: pip install 'fgloc[sweep]'") from error
+    settings = {"distributed.scheduler.worker-saturation": 1.0, "distributed.scheduler.allowed-failures": _DEATHS}
+    with dask.config.set(settings):
+        if scheduler is not None:
+            try:
+                client = distributed.Client(scheduler, timeout=20)
+            except (OSError, TimeoutError, ValueError) as error:
+                raise ConfigError(
+                    f"{scheduler}: no Dask scheduler answers ({error}); start `dask scheduler`"
+                ) from error
+            with client:
+                yield client
+            return
+        with (
+            distributed.LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,  # GTSAM holds Python's lock
+                processes=True,
+                dashboard_address=None,
+                memory_limit=None,
+                silence_logs="ERROR",
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            yield client

@@ -1,0 +1,213 @@
+"""A sweep: jobs named by their inputs, run once, whole records, nothing lost when processes die."""
+
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from datasets.bag import BagWriter
+from fgloc import se2
+from fgloc.ablation.jobs import attempts, execute, make_jobs, read_record, record_path
+from fgloc.ablation.suite import expand, load_suite
+from fgloc.ablation.sweep import sweep
+from fgloc.errors import ConfigError
+
+START_NS = 1_700_000_000_000_000_000
+BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
+SUITE = {
+    "title": "short",
+    "recordings": [{"name": "circle", "bag": "bag"}],
+    "variants": [
+        {"name": "full"},
+        {"name": "wheels alone", "config": {"recording": {"topics": {"sightings": "none"}}}, "start": "truth"},
+    ],
+    "failures": [
+        {
+            "name": "blind",
+            "chain": [{"kind": "dropout", "sensor": "camera", "when": {"bursts": 1, "after_s": 1.0}}],
+            "severity": {"field": "when.burst_s", "values": [1, 3], "unit": "s"},
+        },
+        {"name": "dead", "chain": [{"kind": "encoder_dead", "when": {"intervals": [[2, 4]]}}]},
+    ],
+}
+
+
+def write_circle(folder, seconds=6.0):
+    """A robot on a circle that sees four beacons, with truth; ``map.yaml`` beside the bag."""
+    rng = np.random.default_rng(3)
+    pose, odometry = np.array([1.0, 0.0, math.pi / 2]), np.zeros(3)
+    with BagWriter(folder / "bag") as bag:
+        for k in range(round(seconds * 20)):
+            stamp = START_NS + k * 50_000_000
+            bag.odometry("/odom", stamp, odometry, (0.4, 0.4))
+            bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
+            if k % 5 == 0:
+                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in BEACONS])
+            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
+            wobble = rng.normal(0.0, 0.001, 2)
+            odometry = se2.compose(odometry, se2.exp((0.02 + wobble[0], 0.0, 0.02 + wobble[1])))
+    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
+    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
+
+
+def sight(rng, pose, i):
+    dx, dy = BEACONS[i][0] - pose[0], BEACONS[i][1] - pose[1]
+    distance = math.hypot(dx, dy) + rng.normal(0.0, 0.05)
+    return i, distance, se2.wrap(math.atan2(dy, dx) - pose[2] + rng.normal(0.0, 0.02))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A bag, its map and a suite."""
+    path = tmp_path_factory.mktemp("suite")
+    write_circle(path)
+    (path / "suite.yaml").write_text(yaml.safe_dump(SUITE))
+    return path
+
+
+def jobs_of(folder, **changes):
+    path = folder / f"changed{abs(hash(str(changes)))}.yaml"
+    path.write_text(yaml.safe_dump(SUITE | changes))
+    return make_jobs(expand(load_suite(path), folder))
+
+
+@pytest.fixture(scope="module")
+def swept(folder, tmp_path_factory):
+    """All records of the suite, swept undisturbed by two workers."""
+    out = tmp_path_factory.mktemp("swept")
+    said = []
+    records = sweep(jobs_of(folder), out, workers=2, progress=lambda done, total: said.append((done, total)))
+    assert said == [(k, 8) for k in range(9)]
+    return out, records
+
+
+def comparable(record):
+    return record.model_dump(exclude={"cost"})
+
+
+def test_sweep_answers_what_a_failure_costs(folder, swept):
+    _, records = swept
+    by_cell = {(j.cell.variant, j.cell.failure, j.cell.severity): records[j.key] for j in jobs_of(folder)}
+    assert all(r.outcome == "done" for r in records.values())
+    assert by_cell["full", "none", None].figures["ate_mean_m"] < 0.1
+    assert by_cell["full", "blind", 3.0].touched == {"dropout": 12}
+    assert by_cell["full", "blind", 3.0].modes["DEAD_RECKONING"] > 0.0
+    assert by_cell["full", "dead", None].figures["ate_mean_m"] > by_cell["full", "none", None].figures["ate_mean_m"]
+    alone = by_cell["wheels alone", "none", None]
+    assert alone.figures["factors"] == {"prior": 1, "wheels": alone.figures["keyframes"] - 1}
+    assert by_cell["wheels alone", "blind", 1.0].touched == {}  # it is blind anyway: the report says so
+    assert len(alone.track.estimate) == len(alone.track.truth) > 20
+
+
+def test_key_follows_the_inputs_and_nothing_else(folder, tmp_path):
+    keys = {job.key for job in jobs_of(folder)}
+    assert len(keys) == 8
+    renamed = [{"name": "other name", **{k: v for k, v in SUITE["failures"][0].items() if k != "name"}}]
+    assert {job.key for job in jobs_of(folder, failures=renamed)} < keys
+    copy = shutil.copytree(folder, tmp_path / "elsewhere")
+    assert {job.key for job in jobs_of(copy)} == keys
+    assert not {j.key for j in jobs_of(folder, mode="batch")} & keys
+    seeded = {job.key for job in jobs_of(folder, seeds=[7])}
+    assert len(seeded & keys) == 2  # without failure nothing is drawn
+    with (copy / "map.yaml").open("a") as file:
+        file.write("  - {id: 9, position: [9, 9]}\n")
+    assert not {job.key for job in jobs_of(copy)} & keys
+
+
+def test_same_jobs_again_give_the_same_records(folder, swept, tmp_path):
+    _, records = swept
+    for job in jobs_of(folder)[1:3]:
+        execute(job, tmp_path)
+        assert comparable(read_record(tmp_path, job.key)) == comparable(records[job.key])
+
+
+def test_second_sweep_runs_nothing(folder, swept):
+    out, records = swept
+    before = attempts(out)
+    assert sweep(jobs_of(folder), out) == records
+    assert attempts(out) == before
+    assert len(before) == 8
+
+
+def _sweep_in_child(folder, out):
+    sweep(jobs_of(folder), out, workers=1)
+
+
+def test_fault_70_killed_sweep_resumes_and_runs_nothing_twice(folder, swept, tmp_path):
+    _, undisturbed = swept
+    child = multiprocessing.get_context("spawn").Process(target=_sweep_in_child, args=(folder, tmp_path))
+    child.start()
+    while not any((tmp_path / "jobs").glob("*.json")) and child.is_alive():
+        time.sleep(0.02)
+    os.kill(child.pid, signal.SIGKILL)
+    child.join()
+    finished = {path: path.stat().st_mtime_ns for path in (tmp_path / "jobs").glob("*.json")}
+    assert 1 <= len(finished) < 8
+    records = sweep(jobs_of(folder), tmp_path, workers=2)
+    assert {k: comparable(r) for k, r in records.items()} == {k: comparable(r) for k, r in undisturbed.items()}
+    assert all(path.stat().st_mtime_ns == before for path, before in finished.items())
+    started = [key for key, _ in attempts(tmp_path)]
+    assert all(started.count(path.stem) == 1 for path in finished)
+
+
+def test_job_that_cannot_run_is_quarantined_and_listed(folder, tmp_path):
+    variants = [{"name": "no start", "config": {"recording": {"topics": {"sightings": "none"}}}}]
+    jobs = jobs_of(folder, variants=variants, failures=[])
+    (record,) = sweep(jobs, tmp_path, workers=1).values()
+    assert record.outcome == "refused"
+    assert "the first pose was never found" in record.error
+    sweep(jobs, tmp_path, workers=1)
+    assert len(attempts(tmp_path)) == 1  # left alone
+    sweep(jobs, tmp_path, workers=1, retry=True)
+    assert len(attempts(tmp_path)) == 2
+
+
+def test_half_written_record_does_not_count(folder, tmp_path):
+    job = jobs_of(folder)[0]
+    path = record_path(tmp_path, job.key)
+    path.parent.mkdir(parents=True)
+    path.with_name(f".{path.name}.1.partial").write_text('{"key"')
+    execute(job, tmp_path)
+    assert read_record(tmp_path, job.key).outcome == "done"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"recordings": [{"name": "a", "bag": "nowhere"}]}, "recording 'a' is missing"),
+        ({"variants": [{"name": "a", "config": {"wheels": {"sorce": "twist"}}}]}, "variant 'a'.*\n.*sorce"),
+        ({"variants": [{"name": "a"}, {"name": "a"}]}, "used twice"),
+        ({"failures": [{"name": "none", "chain": [{"kind": "darkness"}]}]}, "without being listed"),
+        ({"failures": [{"name": "a", "chain": [{"kind": "darknes"}]}]}, "darknes"),
+        (
+            {"failures": [{"name": "a", "chain": [{"kind": "darkness"}], "severity": {"field": "x", "values": [1]}}]},
+            "darkness has no number 'x'",
+        ),
+    ],
+)
+def test_wrong_suite_is_refused_with_its_reason(folder, change, said):
+    with pytest.raises(ConfigError, match=said):
+        jobs_of(folder, **change)
+
+
+def test_error_names_the_extra_and_the_scheduler(folder, tmp_path):
+    with pytest.raises(ConfigError, match="start `dask scheduler`"):
+        sweep(jobs_of(folder), tmp_path, scheduler="nonsense://127.0.0.1:1")
+    code = (
+        "import sys; sys.modules['dask'] = None\n"
+        "from pathlib import Path\n"
+        "from fgloc.ablation import sweep\n"
+        "try:\n    sweep._client(1, None).__enter__()\n"
+        "except Exception as error: print(type(error).__name__, error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("ConfigError")
+    assert "pip install 'fgloc[sweep]'" in done.stdout
