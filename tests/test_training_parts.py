@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
-from fgloc.motion.card import Kinematics
+from fgloc.motion.card import ErrorMemory, Kinematics
 from fgloc.types import CommandEvent
-from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, nis, noise_covs
+from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig
 from training.data import Run, cut, load_run, make_run
 from training.losses import composed_nll, end_errors, rollout_loss
@@ -179,15 +181,22 @@ def test_lag_is_recovered(runs: dict[str, Run]) -> None:
     assert fitted.lag_s[1] == pytest.approx(TAU, abs=0.04)
 
 
-def noisy_rollouts(runs: dict[str, Run], noise: NoiseDensity, seed: int) -> list[Rollout]:
-    """Rollouts whose steps differ from the truth by noise of known density."""
+def noisy_rollouts(
+    runs: dict[str, Run], noise: NoiseDensity, seed: int, memory: ErrorMemory | None = None
+) -> list[Rollout]:
+    """Rollouts whose steps differ from the truth by noise of known density over long windows, and known memory."""
     rng, out = np.random.default_rng(seed), []
     for run in runs.values():
         exact = roll_kinematics(Kinematics(), run, 0.2)
         covs = noise_covs(exact, noise)
+        white = rng.normal(size=(len(covs), 3))
+        if memory is not None:
+            keep, share = np.exp(-0.2 / memory.time_s), np.array(memory.share)
+            slow = lfilter([1.0 - keep], [1.0, -keep], rng.normal(size=white.shape), axis=0)  # long sums as white's
+            white = np.sqrt(1.0 - share) * white + np.sqrt(share) * slow
         track = [np.zeros(3)]
-        for motion, cov in zip(exact.motions, covs, strict=True):
-            error = np.linalg.cholesky(cov) @ rng.normal(size=3)
+        for motion, cov, unit in zip(exact.motions, covs, white, strict=True):
+            error = np.linalg.cholesky(cov) @ unit
             pose = se2.compose(track[-1], se2.compose(motion, se2.exp(error)))
             track.append(pose)
         out.append(
@@ -206,6 +215,23 @@ def test_noise_densities_hold_at_every_horizon(runs: dict[str, Run]) -> None:
         values = np.concatenate([nis(r.errors(horizon), r.composed(noise_covs(r, fitted), horizon)) for r in rollouts])
         assert values.mean() / 3 == pytest.approx(1.0, abs=0.15)
     assert fitted.x_per_sqrt_m == pytest.approx(0.05, rel=0.2)
+
+
+def test_variance_holds_over_short_and_long_windows_though_errors_last(runs: dict[str, Run]) -> None:
+    memory = ErrorMemory(time_s=1.0, share=(0.8, 0.5, 0.7))
+    steady = NoiseDensity(xy_per_sqrt_s=0.01, yaw_per_sqrt_s=0.02)
+    rollouts = [r for seed in range(8) for r in noisy_rollouts(runs, steady, seed, memory)]
+    doubted = [replace(r, covs=4.0 * r.covs) for r in rollouts]
+    scale, found = fit_variance(doubted, CalibrationConfig())
+    np.testing.assert_allclose(scale, 0.25, rtol=0.3)
+    assert found.time_s in (0.5, 1.0, 2.0)
+    factors = np.sqrt(scale)
+    held = [replace(r, covs=r.covs * np.outer(factors, factors), memory=found) for r in doubted]
+    for horizon in (0.2, 1.0, 5.0, 10.0):
+        values = np.concatenate([nis(r.errors(horizon), r.end_covs(horizon)) for r in held])
+        assert values.mean() / 3 == pytest.approx(1.0, abs=0.25)
+    as_white = np.concatenate([nis(r.errors(0.2), replace(r, memory=None).end_covs(0.2)) for r in held])
+    assert as_white.mean() / 3 < 0.6
 
 
 def test_joint_errors_are_estimated(runs: dict[str, Run]) -> None:

@@ -9,14 +9,15 @@ from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
 from fgloc.config import NoiseDensity
-from fgloc.motion.card import JointErrors, Kinematics, Lag
+from fgloc.motion.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, Row
 from fgloc.motion.forms import calibrated
 from fgloc.types import FloatArray
 from training.config import CalibrationConfig
 from training.data import Run
 from training.rollouts import Rollout
 
-Bases = Callable[[Rollout], list[FloatArray]]
+Bases = Callable[[Rollout, float], list[FloatArray]]
+_ALMOST_ONE = 0.999
 _FIELDS = tuple(NoiseDensity.model_fields)
 _MIN_STEP_VARIANCE = 1e-12  # keeps a covariance definite where the robot rests
 _MIN_DENSITY = 1e-4
@@ -75,21 +76,31 @@ def fit_lag(runs: list[Run], kinematics: Kinematics) -> Lag:
 
 def fit_noise(rollouts: list[Rollout], config: CalibrationConfig) -> NoiseDensity:
     """Noise densities under which the errors over the calibration's horizons are most likely."""
-    variances = _most_likely(rollouts, _noise_bases, np.full(len(_FIELDS), 1e-4), config)
+    start = np.full(len(_FIELDS), 1e-4)
+    variances, _ = _most_likely(rollouts, lambda rollout, _: _noise_bases(rollout), start, config.horizons_s)
     return NoiseDensity(**{n: max(_MIN_DENSITY, float(np.sqrt(v))) for n, v in zip(_FIELDS, variances, strict=True)})
 
 
-def fit_variance_scale(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[float, float, float]:
-    """Factors on the predicted variances of x, y and yaw under which the errors are most likely.
+def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Row, ErrorMemory]:
+    """Factors on the predicted variances of x, y and yaw, and the memory under which the errors are most likely.
 
+    White and slow variance add up, so for a given time constant the likelihood has two coefficients for each axis.
     The rollouts' steps must be single sub-steps, whose covariance is diagonal.
     """
 
-    def bases(rollout: Rollout) -> list[FloatArray]:
-        return [_diagonal(rollout.covs[:, i, i], [i]) for i in range(3)]
+    def fitted(time_s: float) -> tuple[FloatArray, float]:
+        slow = ErrorMemory(time_s=time_s, share=(_ALMOST_ONE,) * 3)
 
-    x, y, yaw = _most_likely(rollouts, bases, np.ones(3), config)
-    return float(x), float(y), float(yaw)
+        def bases(rollout: Rollout, horizon_s: float) -> list[FloatArray]:
+            white = [_diagonal(rollout.covs[:, i, i], [i]) for i in range(3)]
+            return white + [g * basis for g, basis in zip(slow.growth(horizon_s), white, strict=True)]
+
+        return _most_likely(rollouts, bases, np.full(6, 0.5), (config.short_s, *config.horizons_s))
+
+    time_s = min(config.memory_s, key=lambda time_s: fitted(time_s)[1])
+    white, slow = fitted(time_s)[0].reshape(2, 3)
+    share = np.minimum(slow / (white + slow), _ALMOST_ONE)
+    return _row(white + slow), ErrorMemory(time_s=time_s, share=_row(share))
 
 
 def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: CalibrationConfig) -> JointErrors:
@@ -104,7 +115,7 @@ def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: Calibration
     for parts in (learned, wheels):
         white = []
         for rollout in parts:
-            root = np.linalg.cholesky(rollout.composed(rollout.covs, config.window_s))
+            root = np.linalg.cholesky(rollout.end_covs(config.window_s))
             white.append(np.linalg.solve(root, rollout.errors(config.window_s)[..., None])[..., 0])
         whitened.append(np.concatenate(white))
     n, w = whitened
@@ -124,12 +135,17 @@ def nis(errors: FloatArray, covs: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mi,mi->m", errors, np.linalg.solve(covs, errors[..., None])[..., 0]))
 
 
-def _most_likely(rollouts: list[Rollout], bases: Bases, start: FloatArray, config: CalibrationConfig) -> FloatArray:
-    """Non-negative coefficients of the bases' covariances that maximize the likelihood of the windows' errors."""
+def _most_likely(
+    rollouts: list[Rollout], bases: Bases, start: FloatArray, horizons_s: tuple[float, ...]
+) -> tuple[FloatArray, float]:
+    """Non-negative coefficients of the bases' covariances that maximize the likelihood of the windows' errors.
+
+    Also the negative log-likelihood.
+    """
     errors, parts = [], []
     for rollout in rollouts:
-        step_bases = bases(rollout)
-        for horizon in config.horizons_s:
+        for horizon in horizons_s:
+            step_bases = bases(rollout, horizon)
             errors.append(rollout.errors(horizon))
             parts.append(np.stack([rollout.composed(b, horizon) for b in step_bases], axis=1))
     e, basis = np.concatenate(errors), np.concatenate(parts)
@@ -145,7 +161,7 @@ def _most_likely(rollouts: list[Rollout], bases: Bases, start: FloatArray, confi
         return float(value), gradient
 
     result = minimize(loss, np.log(start), jac=True, method="L-BFGS-B", bounds=[(-30.0, 10.0)] * len(start))
-    return np.asarray(np.exp(result.x))
+    return np.asarray(np.exp(result.x)), float(result.fun)
 
 
 def _noise_bases(rollout: Rollout) -> list[FloatArray]:
@@ -164,5 +180,11 @@ def _diagonal(values: FloatArray, axes: list[int]) -> FloatArray:
     return out
 
 
-def _rows(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(v) for v in row) for row in matrix)
+def _rows(matrix: FloatArray) -> Matrix:
+    x, y, yaw = (_row(row) for row in matrix)
+    return x, y, yaw
+
+
+def _row(values: FloatArray) -> Row:
+    x, y, yaw = (float(v) for v in values)
+    return x, y, yaw

@@ -25,7 +25,7 @@ class NetworkConfig(Section):
     """Form and size of the model."""
 
     kind: Literal["velocity", "displacement"] = "displacement"
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = (64, 64)
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
         (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
@@ -50,7 +50,7 @@ class OptimizationConfig(Section):
     position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")
     yaw_sigma_rad: float = Field(0.05, gt=0, description="yaw errors weigh in this unit")
     variance_horizon_s: float = Field(
-        5.0, gt=0, description="length of the rollouts whose likelihood sets the variance"
+        1.0, gt=0, description="length of the rollouts whose likelihood sets the variance"
     )
     variance_iterations: int = Field(300, ge=0)
 
@@ -59,6 +59,10 @@ class CalibrationConfig(Section):
     """Scaling of the covariances on the held-out recording."""
 
     horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
+    short_s: float = Field(
+        1.0, gt=0, description="windows that, beside the horizons', tell slow errors from white ones"
+    )
+    memory_s: tuple[float, ...] = Field((0.5, 1.0, 2.0), description="time constants tried for slow errors")
     window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
 
 

@@ -64,7 +64,7 @@ def evaluate(rollouts: list[Rollout], horizon_s: float) -> Figures:
         travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(rollout.truth[:, :2], axis=0).T))])
         distances.append(travelled[k + n] - travelled[k])
         if rollout.covs.any():
-            all_nis.append(nis(rollout.errors(horizon_s), rollout.composed(rollout.covs, horizon_s)))
+            all_nis.append(nis(rollout.errors(horizon_s), rollout.end_covs(horizon_s)))
     if not end_errors:
         raise ValueError(f"no window of {horizon_s:.0f} s with truth throughout")
     values = np.concatenate(all_nis) if all_nis else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.errors import ModelError
-from fgloc.motion.card import Kinematics
+from fgloc.motion.card import ErrorMemory, Kinematics
 from fgloc.motion.forms import MotionModel, calibrated
 from fgloc.types import FloatArray
 from training.data import Run
@@ -29,6 +29,7 @@ class Rollout:
     track: FloatArray  # (n + 1, 3) composed motions from the origin, yaw not wrapped
     truth: FloatArray  # (n + 1, 3)
     valid: NDArray[np.bool_]  # (n + 1,)
+    memory: ErrorMemory | None = None  # of the errors from step to step
 
     def starts(self, horizon_s: float, every_s: float = 1.0) -> tuple[NDArray[np.int64], int]:
         """Indices at which windows of this length start with the truth heard throughout, and their steps."""
@@ -42,6 +43,13 @@ class Rollout:
         k, n = self.starts(horizon_s)
         predicted, actual = relative(self.track[k], self.track[k + n]), relative(self.truth[k], self.truth[k + n])
         return logs(relative(predicted, actual))
+
+    def end_covs(self, horizon_s: float) -> FloatArray:
+        """Predicted covariances ``(m, 3, 3)`` at the ends of the windows, the memory of errors accounted for."""
+        if self.memory is None:
+            return self.composed(self.covs, horizon_s)
+        factors = np.sqrt(self.memory.growth(horizon_s))
+        return self.composed(self.covs * np.outer(factors, factors), horizon_s)
 
     def composed(self, step_covs: FloatArray, horizon_s: float) -> FloatArray:
         """Covariances ``(m, 3, 3)`` at the ends of the windows for covariances ``(n, 3, 3)`` of the steps."""
@@ -73,7 +81,7 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
         velocity = prediction.velocity
         return prediction.motion, prediction.cov
 
-    return _roll(run, step_s, step)
+    return replace(_roll(run, step_s, step), memory=model.card.memory)
 
 
 def roll_kinematics(kinematics: Kinematics, run: Run, step_s: float) -> Rollout:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import copy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +20,14 @@ from tqdm import tqdm
 from fgloc.errors import FglocError
 from fgloc.motion.card import ModelCard, Split
 from fgloc.motion.load import load_model, read_model, save_model
-from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance_scale, noise_covs
+from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from training.config import NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
 from training.losses import composed_nll, end_errors, rollout_loss
 from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, relative
-from training.rollouts import Rollout, roll_kinematics, roll_model
+from training.rollouts import roll_kinematics, roll_model
 
 _VALIDATION_S = (10.0, 30.0)
 HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
@@ -162,15 +163,15 @@ def calibrate(path: Path, card: ModelCard, runs: list[Run], config: TrainConfig)
     if card.kind == "velocity":
         noise = fit_noise(rollouts, calibration)
         card = card.model_copy(update={"noise": noise})
-        rollouts = [_with_covs(r, noise_covs(r, noise)) for r in rollouts]
+        rollouts = [replace(r, covs=noise_covs(r, noise)) for r in rollouts]
     else:
-        scale = fit_variance_scale(rollouts, calibration)
-        card = card.model_copy(update={"variance_scale": scale})
+        scale, memory = fit_variance(rollouts, calibration)
+        card = card.model_copy(update={"variance_scale": scale, "memory": memory})
         factors = np.sqrt(scale)
-        rollouts = [_with_covs(r, r.covs * np.outer(factors, factors)) for r in rollouts]
+        rollouts = [replace(r, covs=r.covs * np.outer(factors, factors), memory=memory) for r in rollouts]
     wheels = [roll_kinematics(card.kinematics, run, card.dt_s) for run in runs]
     wheels_noise = fit_noise(wheels, calibration)
-    wheels = [_with_covs(r, noise_covs(r, wheels_noise)) for r in wheels]
+    wheels = [replace(r, covs=noise_covs(r, wheels_noise)) for r in wheels]
     return card.model_copy(update={"wheels_noise": wheels_noise, "joint": fit_joint(rollouts, wheels, calibration)})
 
 
@@ -191,10 +192,6 @@ def window_starts(runs: list[Run], steps: int, stride: int = 1) -> Tensor:
     return torch.from_numpy(np.concatenate(parts))
 
 
-def _with_covs(rollout: Rollout, covs: np.ndarray) -> Rollout:
-    return Rollout(rollout.run, rollout.step_s, rollout.motions, covs, rollout.track, rollout.truth, rollout.valid)
-
-
 def _from_all(config: TrainConfig, runs: dict[str, Run], folds: list[ModelCard], path: Path, made_by: str) -> ModelCard:
     """A model from every recording, calibrated and judged by the models that left one out."""
     split = Split(train=tuple(runs), validation=())
@@ -204,7 +201,7 @@ def _from_all(config: TrainConfig, runs: dict[str, Run], folds: list[ModelCard],
         "variance_scale": tuple(float(s) for s in scale),
         "figures": {k: round(float(np.mean([c.figures[k] for c in folds])), 4) for k in folds[0].figures},
     }
-    for name in ("noise", "wheels_noise", "joint"):
+    for name in ("noise", "wheels_noise", "memory", "joint"):
         parts = [getattr(c, name) for c in folds]
         if parts[0] is not None:
             update[name] = type(parts[0]).model_validate(_mean([p.model_dump() for p in parts]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -15,6 +16,7 @@ VERSION = 1
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix = tuple[Row, Row, Row]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 
 
 def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
@@ -40,6 +42,24 @@ class Lag(Section):
 
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)]
     lag_s: tuple[Positive, Positive] = Field(description="time constants of v and ω")
+
+
+class ErrorMemory(Section):
+    """Errors of neighboring steps go together: of the variance density of each axis a share is slow, the rest white.
+
+    The model's densities are those of long windows, because a chain of steps composes them as if independent. The slow
+    share is an Ornstein-Uhlenbeck rate; over a window shorter than its time constant less of it has shown.
+    """
+
+    time_s: Positive = Field(description="time constant of the slow share")
+    share: tuple[Share, Share, Share] = Field(description="of x, y and yaw")
+
+    def growth(self, window_s: float) -> Row:
+        """Factors on the densities of x, y and yaw with which the covariance composed over such a window holds."""
+        u = window_s / self.time_s
+        hidden = -math.expm1(-u) / u
+        x, y, yaw = (1.0 - share * hidden for share in self.share)
+        return x, y, yaw
 
 
 class JointErrors(Section):
@@ -90,6 +110,7 @@ class ModelCard(Section):
     variance_scale: tuple[Positive, Positive, Positive] = Field(
         (1.0, 1.0, 1.0), description="displacement: calibration of the predicted variance densities"
     )
+    memory: ErrorMemory | None = Field(None, description="displacement: how long errors last; None: not at all")
     joint: JointErrors | None = None
     wheels_noise: NoiseDensity | None = Field(None, description="of the calibrated kinematics as wheel odometry")
     split: Split
