@@ -102,7 +102,7 @@ def run(
         decisions=tuple(replay.decisions),
         counts=dict(parts.localizer.counts),
         rejections=dict(sorted(rejections.items())),
-        notes=tuple(dict.fromkeys(notes)),
+        notes=tuple(dict.fromkeys(map(_sentence, notes))),
         step_ms=np.array(replay.step_ms),
         wall_s=time.perf_counter() - began,
         truth=replay.truth(parts.config.truth),
@@ -219,6 +219,12 @@ class _Replay:
             passed = self._parts.detections.check(event) if isinstance(event, CornersEvent) else event
             if passed is not None:
                 yield passed
+
+
+def _sentence(note: str) -> str:
+    """With a capital, unless it begins with a name (of a topic, a file), and with a full stop."""
+    first = note.split(maxsplit=1)[0]
+    return (note[0].upper() + note[1:] if first.isalpha() else note) + ("" if note.endswith((".", "?", "!")) else ".")
 
 
 def _trajectory(estimates: list[Estimate]) -> Trajectory:

@@ -43,7 +43,8 @@ def write_circle(folder, seconds=10.0, kidnapped_at=None, truth=True):
             if truth:
                 bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
             if k % 5 == 0:
-                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in BEACONS])
+                seen = BEACONS if kidnapped_at is None else [list(BEACONS)[k // 5 % 4]]  # several would agree at once
+                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in seen])
             pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
             wobble = rng.normal(0.0, 0.001, 2)
             odometry = se2.compose(odometry, se2.exp((0.02 + wobble[0], 0.0, 0.02 + wobble[1])))
@@ -116,7 +117,7 @@ def test_without_truth_the_run_is_still_done(tmp_path):
 
 
 def test_lost_robot_exits_with_3_after_writing(tmp_path):
-    code, _, stderr = fgloc("online", write_circle(tmp_path, kidnapped_at=5.0), "--out", tmp_path / "out")
+    code, _, stderr = fgloc("online", write_circle(tmp_path, seconds=15.0, kidnapped_at=5.0), "--out", tmp_path / "out")
     assert code == 3
     assert "LOST for" in stderr
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
@@ -253,3 +254,10 @@ def test_bundled_sample_is_localised(tmp_path):
         metrics = json.loads((tmp_path / mode / "metrics.json").read_text())
         assert metrics["ate_mean_m"] < 0.02
         assert metrics["factors"]["corners"] > 500
+
+
+def test_notes_are_sentences(bag, tmp_path):
+    _, stdout, _ = fgloc("smooth", bag, "--out", tmp_path / "out")
+    notes = [line.removeprefix("note: ") for line in stdout.splitlines() if line.startswith("note: ")]
+    assert len(notes) > 1
+    assert all(note.endswith(".") and (note.startswith("/") or note[0].isupper()) for note in notes), notes

@@ -71,9 +71,10 @@ class WheelMotion:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
-        notes = [f"wheel motion from {_SAYS[self._chosen]}"] if self._chosen else []
-        for track in self._all:
-            notes += track.notes.values()
+        said = [note for track in self._all for note in track.notes.values()]
+        explained = any(track.kind == self._chosen and "source" in track.notes for track in self._all)
+        notes = [f"wheel motion comes from {_SAYS[self._chosen]}"] if self._chosen and not explained else []
+        notes += said
         if self._silent_steps:
             notes.append(f"no wheel motion was known for {self._silent_s:.1f} s in {self._silent_steps} steps")
         return tuple(notes)
