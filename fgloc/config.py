@@ -172,7 +172,7 @@ class LandmarksConfig(Section):
 class MotionConfig(Section):
     """The learned motion model."""
 
-    model: Path | None = Field(None, description="a .safetensors file of training.export")
+    model: Path | None = Field(None, description="a .safetensors file that python -m training.train wrote")
     use: bool = True
     correlation: Literal["joint", "independent"] = Field(
         "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
