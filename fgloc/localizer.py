@@ -35,6 +35,7 @@ from fgloc.types import (
 
 _ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
+_NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
@@ -99,6 +100,8 @@ class Localizer:
         self._clock_s += step.dt
         if step.segment != self._segment:
             self._begin_segment(step)
+        elif not self._initializer.waiting and self._nowhere():
+            self._get_lost()
         # 1. Measure: one call per sensor; a silent sensor yields nothing
         with self.stopwatch("motion"):
             motions = self.measure_motion(step)
@@ -229,9 +232,20 @@ class Localizer:
         if believed:
             self._lost = False
         elif self.weights.refused_in_a_row >= self.config.estimator.lost_after and self.factors.known:
-            self._lost = True
-            self.weights.refused_in_a_row = 0
-            self._initializer.reset()
+            self._get_lost()
+
+    def _nowhere(self) -> bool:
+        """Whether the pose is so little known that only a search of the map can find it again."""
+        belief = self.estimator.belief
+        if belief is None or not self.factors.known:
+            return False
+        x, y, yaw = np.sqrt(np.diag(belief.cov))
+        return bool(max(x, y) > _NOWHERE_M or yaw > _NOWHERE_RAD)
+
+    def _get_lost(self) -> None:
+        self._lost = True
+        self.weights.refused_in_a_row = 0
+        self._initializer.reset()
 
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
         mode = Mode.OK

@@ -196,16 +196,23 @@ class IncrementalEstimator:
         frame.sightings = ()
         lag = self._config.lag_s if self._config.kind == "fixed_lag" else np.inf
         frames = [f for f in self.log.since(frame.elapsed_s - lag) if frame.prior is None]
-        self._backend = self._new_backend()
+        try:
+            frame.belief = self._replayed([*frames, frame], initial)
+        except _GTSAM_ERRORS:  # an older sighting is at fault; what the window knew is in the prediction
+            frame.belief = self._replayed([frame], initial)
+
+    def _replayed(self, frames: Sequence[Keyframe], initial: FloatArray) -> Belief:
+        """Give these keyframes to a new backend; the belief of the last, whose pose starts at ``initial``."""
+        self._backend = backend = self._new_backend()
         self._landmarks.clear()
-        for i, held in enumerate([*frames, frame]):
+        newest = frames[-1].k
+        for i, held in enumerate(frames):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
-            start = initial if held.k == frame.k else held.belief.pose
-            graph, values = self._graph_of(held, start, prior)
-            self._backend.update(graph, values, held.k, held.elapsed_s)
-        frame.belief = Belief(self._backend.pose(frame.k), self._backend.covariance(frame.k))
+            graph, values = self._graph_of(held, initial if held.k == newest else held.belief.pose, prior)
+            backend.update(graph, values, held.k, held.elapsed_s)
+        return Belief(backend.pose(newest), backend.covariance(newest))
 
     def _new_backend(self) -> _Backend:
         return _FixedLag(self._config) if self._config.kind == "fixed_lag" else _Full(self._config)
