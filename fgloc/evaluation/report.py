@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import platform
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import yaml
 
 from fgloc.config import Config
+from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_timeline, plot_trajectory, png
 from fgloc.recording.outputs import (
@@ -29,29 +29,6 @@ from fgloc.recording.outputs import (
 from fgloc.types import Mode, RunResult
 
 _PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
-
-_CSS = """
-:root { --ink: #1c2330; --soft: #5b6472; --line: #e3e6ea; --tint: #f5f7f9; --accent: #0072b2; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 66rem; color: var(--ink); background: #fff;
-       font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.6rem; margin: 0 0 .2rem; }
-h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); padding-bottom: .25rem; }
-p.sub, figcaption, td.why { color: var(--soft); }
-code, pre { font: 13px/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
-pre { background: var(--tint); padding: .8rem 1rem; overflow-x: auto; border-radius: 6px; }
-.tiles { display: flex; flex-wrap: wrap; gap: .7rem; margin: 1.2rem 0; }
-.tile { flex: 1 1 8rem; background: var(--tint); border-radius: 8px; padding: .7rem .9rem; }
-.tile b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
-.tile span { color: var(--soft); font-size: .85rem; }
-figure { margin: 1rem 0 1.6rem; } figure img { width: 100%; height: auto; display: block; }
-figcaption { font-size: .9rem; margin-top: .3rem; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; }
-th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-.warn { border-left: 4px solid #d55e00; background: #fdf3ec; padding: .6rem 1rem; }
-.columns { display: flex; flex-wrap: wrap; gap: 0 2.5rem; } .columns > section { flex: 1 1 20rem; }
-"""
 
 
 def write_results(result: RunResult, config: Config, out: Path, command: str, input_hash: str | None = None) -> Metrics:
@@ -114,29 +91,23 @@ def render(
         _modes(result.modes),
         _list("Notes", result.notes),
         "<h2>Trajectory</h2>",
-        _picture(pictures["trajectory"], "Trajectory", "The estimate with 3σ ellipses over the truth and the map."),
+        picture(pictures["trajectory"], "Trajectory", "The estimate with 3σ ellipses over the truth and the map."),
         "<h2>Error and its 3σ band</h2>",
-        _picture(pictures["error"], "Error", "In the map frame. An honest band holds 99.7 % of the errors."),
+        picture(pictures["error"], "Error", "In the map frame. An honest band holds 99.7 % of the errors."),
         "<h2>Timeline</h2>",
-        _picture(pictures["timeline"], "Timeline", "What was heard, fused and rejected, with the number of items."),
+        picture(pictures["timeline"], "Timeline", "What was heard, fused and rejected, with the number of items."),
         "<h2>Figures</h2>",
         _figures(metrics),
         '<div class="columns">',
         _section("Sensors", _sensors(result)),
-        _section("Factors", _table(("kind", "count"), metrics.factors.items(), numbers=1)),
-        _section("Rejected", _table(("reason", "count"), _most(metrics.rejections), numbers=1)),
+        _section("Factors", table(("kind", "count"), metrics.factors.items(), numbers=1)),
+        _section("Rejected", table(("reason", "count"), _most(metrics.rejections), numbers=1)),
         _section("Landmarks", _landmarks(result)),
         "</div>",
         "<h2>Provenance</h2>",
         f"<pre>{escape(yaml.safe_dump(dict(provenance), sort_keys=False, allow_unicode=True))}</pre>",
     ]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>fgloc: {name}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body>\n</html>\n"
-    )
+    return page(name, body)
 
 
 def _tiles(metrics: Metrics) -> str:
@@ -203,7 +174,7 @@ def _sensors(result: RunResult) -> str:
         steps = np.diff(np.sort(times))
         rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
         rows.append((name, len(times), rate, f"{steps.max():.2f}" if len(steps) else "–"))
-    return _table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
+    return table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
 
 
 def _landmarks(result: RunResult) -> str:
@@ -216,24 +187,11 @@ def _landmarks(result: RunResult) -> str:
         (i, f"{lm.position[0]:.3f}", f"{lm.position[1]:.3f}", used[i], refused[i])
         for i, lm in sorted(result.landmarks.landmarks.items())
     ]
-    return _table(("id", "x [m]", "y [m]", "fused", "rejected"), rows, numbers=4)
+    return table(("id", "x [m]", "y [m]", "fused", "rejected"), rows, numbers=4)
 
 
 def _most(counts: Mapping[str, int]) -> list[tuple[str, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int) -> str:
-    """A table whose last `numbers` columns are aligned right; empty without rows."""
-    first = len(head) - numbers
-
-    def line(cells: Sequence[object], tag: str) -> str:
-        looks = ("" if i < first else ' class="n"' for i in range(len(cells)))
-        inside = (f"<{tag}{look}>{escape(str(cell))}</{tag}>" for look, cell in zip(looks, cells, strict=True))
-        return f"<tr>{''.join(inside)}</tr>"
-
-    body = "".join(line(row, "td") for row in rows)
-    return f"<table>{line(head, 'th')}{body}</table>" if body else ""
 
 
 def _section(title: str, content: str) -> str:
@@ -244,12 +202,6 @@ def _list(title: str, items: Sequence[str]) -> str:
     if not items:
         return ""
     return f"<h2>{title}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
-
-
-def _picture(data: bytes, alt: str, caption: str) -> str:
-    code = base64.b64encode(data).decode("ascii")
-    image = f'<img alt="{alt}" src="data:image/png;base64,{code}">'
-    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
 def _number(value: float | None, factor: float, form: str) -> str:
