@@ -80,6 +80,7 @@ class VelocityModel:
         self._noise = card.noise
         self._delay, self._lag = card.lag.delay_s, np.array(card.lag.lag_s)
         self._scale = np.array(card.output_scale)
+        self._gains = _gains(card.kinematics)
         self._track: CommandTrack | None = None
 
     def predict(
@@ -106,7 +107,7 @@ class VelocityModel:
         n = _sub_steps(duration, self.card.dt_s)
         dt = duration / n
         told = track.means(start - self._delay + dt * np.arange(n + 1, dtype=np.float64))
-        aims = _twists(self.card.kinematics, told)[:, ::2]
+        aims = (told @ self._gains)[:, ::2]
         keep = np.exp(-dt / self._lag)
         states = np.empty((n + 1, 2))
         states[0] = velocity
@@ -136,10 +137,12 @@ class DisplacementModel:
         self.joint = _joint(card)
         self._network = network
         self._scale = np.array(card.output_scale)
+        self._gains = _gains(card.kinematics)
         self._ages = np.array(card.edges_s)
-        self._widths = np.diff(self._ages)[:, None]
+        self._widths = np.diff(self._ages)
         self._log_scale = np.log(card.variance_scale)
         self._n_bins = 2 * len(self._widths)
+        self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
         self._track: CommandTrack | None = None
 
     def predict(
@@ -155,40 +158,59 @@ class DisplacementModel:
         if not np.isfinite(y).all():
             return None
         twists = base + self._scale * y[:, :3]
-        variances = np.exp(np.minimum(y[:, 3:] + self._log_scale, _MAX_LOG_VARIANCE))
-        variances = np.maximum(variances, MIN_DENSITY)
+        variances = y[:, 3:] + self._log_scale
+        np.minimum(variances, _MAX_LOG_VARIANCE, out=variances)
+        np.maximum(np.exp(variances, out=variances), MIN_DENSITY, out=variances)
         return MotionPrediction(*_composed(twists * dt, variances * dt), twists[-1, ::2])
 
     def _inputs(
         self, track: CommandTrack, start: float, dt: float, n: int, velocity: FloatArray | None
     ) -> tuple[FloatArray, Float32Array]:
         """Twists ``(n, 3)`` of the calibrated kinematics and inputs ``(n, ·)`` of the network, one row a sub-step."""
-        kinematics = self.card.kinematics
-        limits = start + dt * np.arange(n + 1)
-        middles = limits[:-1] + 0.5 * dt
-        times = np.concatenate([limits - kinematics.delay_s, (middles[:, None] - self._ages).ravel()])
-        integrals = track.integrals(times).T
-        told = (integrals[1 : n + 1] - integrals[:n]) / dt
-        bins = integrals[n + 1 :].reshape(n, -1, 2)
-        base = _twists(kinematics, told)
-        x = np.zeros((n, self.card.n_inputs), dtype=np.float32)
-        x[:, : self._n_bins] = ((bins[:, :-1] - bins[:, 1:]) / self._widths).reshape(n, -1)
-        if velocity is not None and "velocity" in self.card.inputs:
-            fade = np.exp((start - middles) / self.card.velocity_decay_s)
-            x[:, self._n_bins :] = fade[:, None] * (np.asarray(velocity) - base[0, ::2])
+        plan = self._plans.get(n)
+        if plan is None:
+            plan = self._plans[n] = self._plan(n)
+        slope, offset, means_of = plan
+        means = means_of @ track.integrals(slope * dt + (offset + start)).T
+        base = means[:n] @ self._gains / dt
+        x = np.empty((n, self.card.n_inputs), dtype=np.float32)
+        x[:, : self._n_bins] = means[n:].reshape(n, -1)
+        if "velocity" in self.card.inputs:
+            innovation = np.zeros(2) if velocity is None else np.asarray(velocity) - base[0, ::2]
+            ages = dt * (np.arange(n) + 0.5)
+            x[:, self._n_bins :] = np.exp(-ages / self.card.velocity_decay_s)[:, None] * innovation
         return base, x
+
+    def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How to ask a track once for all of n sub-steps.
+
+        Returns:
+            slope, offset: ``(m,)`` times to ask for are ``slope * dt + offset + start``.
+            means_of: ``(n + n * bins, m)`` makes of the integrals at these times the told displacements of the
+                sub-steps, then the mean commands of their age bins.
+        """
+        bins = len(self._widths)
+        limits, middles = np.arange(n + 1.0), np.repeat(np.arange(n) + 0.5, bins + 1)
+        slope = np.concatenate([limits, middles])
+        offset = np.concatenate([np.full(n + 1, -self.card.kinematics.delay_s), np.tile(-self._ages, n)])
+        means_of = np.zeros((n + n * bins, len(slope)))
+        for i in range(n):
+            means_of[i, [i, i + 1]] = -1.0, 1.0
+            for j, width in enumerate(self._widths):
+                first = n + 1 + i * (bins + 1) + j
+                means_of[n + i * bins + j, [first, first + 1]] = 1.0 / width, -1.0 / width
+        return slope, offset, means_of
 
 
 def calibrated(kinematics: Kinematics, track: CommandTrack, limits: FloatArray) -> FloatArray:
     """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
-    return _twists(kinematics, track.means(limits - kinematics.delay_s))
+    return np.asarray(track.means(limits - kinematics.delay_s) @ _gains(kinematics))
 
 
-def _twists(kinematics: Kinematics, told: FloatArray) -> FloatArray:
-    twists = np.zeros((len(told), 3))
-    twists[:, 0] = kinematics.scale_v * told[:, 0]
-    twists[:, 2] = kinematics.scale_omega * told[:, 1] + kinematics.yaw_per_m * twists[:, 0]
-    return twists
+def _gains(kinematics: Kinematics) -> FloatArray:
+    """``(2, 3)``: commands (v, ω) times it are body twists."""
+    v = kinematics.scale_v
+    return np.array([[v, 0.0, kinematics.yaw_per_m * v], [0.0, 0.0, kinematics.scale_omega]])
 
 
 def noise_density(noise: NoiseDensity, v: float, omega: float) -> tuple[float, float, float]:
