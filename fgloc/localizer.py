@@ -92,7 +92,7 @@ class Localizer:
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
         self._last_fix_s = 0.0
         self._clock_s = 0.0
-        self._silent_s = 0.0  # how long no motion source has spoken
+        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
         self._lost = False
 
     def update(self, step: Step) -> Estimate | None:
@@ -163,9 +163,11 @@ class Localizer:
             return self._start(step, started.newest, ())
         first, *rest = started.steps
         estimate = self._start(first.step, started.first, first.sightings)
+        decisions = [*estimate.decisions]
         for later in rest:
             estimate = self._advance(later.step, later.motions, later.sightings)
-        return estimate
+            decisions += estimate.decisions
+        return dataclasses.replace(estimate, decisions=tuple(decisions))
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
@@ -214,6 +216,7 @@ class Localizer:
         self._count_landmarks(decisions)
         if believed:
             self._last_fix_s = self._clock_s
+            self._silent_s = 0.0
         self._watch_for_loss(believed)
         reason = "overruled by sightings" if fit is not None else ""
         decisions = [*motion_decisions(k, motions, reason), *decisions]

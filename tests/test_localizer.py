@@ -1,0 +1,287 @@
+"""The core loop on synthetic drives: accurate, honest, and upright after every fault."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion_models import make_card, make_tensors
+from robot_world import (
+    START_NS,
+    Chain,
+    World,
+    beacons,
+    config,
+    nees,
+    position_error,
+    project,
+    room,
+    standing,
+    truth_at,
+)
+from scipy.stats import chi2
+
+from fgloc import se2
+from fgloc.carry import carry
+from fgloc.config import MotionConfig
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.weights import joint_fit
+from fgloc.motion import load_model, save_model
+from fgloc.motion.source import LearnedMotion
+from fgloc.types import CornerMeasurement, LandmarkMap, Mode
+
+MAPS = {"corners": room, "beacons": beacons}
+
+
+def drive(kind: str, settings=None, **world):
+    world_map = MAPS[kind]()
+    made = World(world_map, **world)
+    chain = Chain(settings or config(), world_map)
+    return made, chain, chain.run(made.events())
+
+
+def modes(estimates) -> list[Mode]:
+    return [mode for mode, _ in itertools.groupby(e.mode for e in estimates)]
+
+
+def seconds(estimate) -> float:
+    return (estimate.stamp_ns - START_NS) * 1e-9
+
+
+@pytest.mark.parametrize(("kind", "bound_m"), [("corners", 0.006), ("beacons", 0.025)])
+def test_a_drive_is_followed_closely(kind, bound_m):
+    for seed in range(3):
+        world, chain, estimates = drive(kind, seed=seed)
+        assert len(estimates) == chain.steps
+        assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < bound_m
+        assert modes(estimates) == [Mode.OK]
+
+
+def test_nees_is_within_its_chi2_bounds_over_seeds():
+    last = []
+    for seed in range(20):
+        world, _, estimates = drive("beacons", seed=seed, seconds=8.0)
+        last.append(nees(estimates[-1], world.truth(estimates[-1].stamp_ns)))
+    low, high = chi2.ppf([0.001, 0.999], 3 * len(last))
+    assert low < sum(last) < high
+
+
+def test_nees_after_dead_reckoning_is_within_its_chi2_bounds():
+    last = []
+    for seed in range(20):
+        world, _, estimates = drive("beacons", seed=seed, seconds=9.0, blind=((4.0, 9.0),))
+        assert estimates[-1].mode is Mode.DEAD_RECKONING
+        last.append(nees(estimates[-1], world.truth(estimates[-1].stamp_ns)))
+    low, high = chi2.ppf([0.001, 0.999], 3 * len(last))
+    assert low < sum(last) < high
+
+
+def test_without_fixes_the_mode_is_dead_reckoning_from_the_configured_time_on():
+    settings = config(estimator={"dead_reckoning_after_s": 3.0})
+    _, _, estimates = drive("corners", settings, blind=((5.0, 12.0),))
+    assert modes(estimates) == [Mode.OK, Mode.DEAD_RECKONING, Mode.OK]
+    blind = [seconds(e) for e in estimates if e.mode is Mode.DEAD_RECKONING]
+    assert 7.85 < blind[0] < 8.3
+    assert 11.5 < blind[-1] < 12.0
+
+
+def test_without_any_motion_source_the_uncertainty_grows_with_time_not_with_steps():
+    spread = {}
+    for max_interval_s in (0.1, 0.5):
+        settings = config(wheels={"source": "none"}, keyframes={"max_interval_s": max_interval_s})
+        _, chain, estimates = drive("corners", settings, seconds=7.0, blind=((6.0, 7.0),))
+        spread[max_interval_s] = math.sqrt(max(np.linalg.eigvalsh(estimates[-1].cov[:2, :2])))
+        assert chain.localizer.rejections["motion.silent"] > 0
+    assert 0.7 < spread[0.1] < 2.0  # the robot drove 0.4 m of what might have been 1 m per second
+    assert spread[0.1] == pytest.approx(spread[0.5], rel=0.5)
+
+
+def test_an_unknown_map_is_estimated_up_to_the_first_pose():
+    truth, settings = beacons(), config(estimator={"kind": "isam2"})
+    world = World(truth, seconds=18.0)
+    chain = Chain(settings, None)
+    estimates = chain.run(world.events())
+    start = world.truth(estimates[0].stamp_ns)
+    errors = [position_error(e, se2.between(start, world.truth(e.stamp_ns))) for e in estimates]
+    assert np.mean(errors) < 0.1
+    sightings = chain.localizer.counts["range_bearing"]
+    early = chain.localizer.weights.rejections["sightings.seen_too_seldom"]
+    assert early == (settings.landmarks.min_sightings - 1) * len(truth)
+    assert sightings + early == 2 * 18 * 10
+
+
+# --- faults ---
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_fault_13_late_sightings_are_fused_at_their_own_time(kind):
+    sizes = []
+    for seed in range(4):
+        world, chain, estimates = drive(kind, seed=seed, late_s=0.3)
+        errors = [position_error(e, world.truth(e.stamp_ns)) for e in estimates]
+        assert np.mean(errors) < 0.05  # taken as made on arrival they would be 0.12 m off
+        assert chain.localizer.counts["corners"] + chain.localizer.counts["range_bearing"] > 300
+        sizes.append(np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates]) / 3)
+    assert np.mean(sizes) < 3.0
+
+
+def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
+    """The spread of poses fitted to corners carried by wrong motions is covered by the covariance of the fit."""
+    rng = np.random.default_rng(5)
+    landmark = standing(0, 2.5, 0.3, math.pi)
+    factors = LandmarkFactors(LandmarkMap({0: landmark}))
+    settings, motion, cov = config(), np.array([-0.1, 0.0, -0.05]), np.diag([0.01, 0.01, 0.02]) ** 2
+    keyframe = np.array([0.2, 0.1, 0.0])
+    then = se2.compose(keyframe, motion)
+    camera = Chain(settings, room()).localizer._landmarks._pinhole
+    values = []
+    for _ in range(40):
+        seen = CornerMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, camera)
+        wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
+        fit = joint_fit(keyframe, [carry(seen, wrong, cov, landmark.size_m)], factors, settings)
+        error = se2.log(se2.between(fit.pose, keyframe))
+        values.append(float(error @ np.linalg.solve(fit.cov, error)))
+    assert np.mean(values) < 3.0 * 1.5
+
+
+def test_fault_15_a_clock_that_jumps_back_begins_a_segment_that_finds_the_robot_again():
+    first = World(room(), seconds=6.0)
+    second = World(room(), seed=1, seconds=6.0, start_ns=START_NS - 10**12, start_s=9.0)
+    chain = Chain(config(), room())
+    estimates = chain.run([*first.events(), *second.events()])
+    before = [e for e in estimates if e.stamp_ns >= START_NS]
+    after = [e for e in estimates if e.stamp_ns < START_NS]
+    assert len(before) > 55
+    assert len(after) > 55
+    assert np.mean([position_error(e, second.truth(e.stamp_ns)) for e in after]) < 0.01
+    assert any("the clock jumped back" in note for note in chain.stepper.notes)
+    assert chain.localizer.counts["prior"] == 2
+
+
+def test_fault_16_a_clock_that_jumps_ahead_inflates_the_covariance_where_no_map_says_where_the_robot_is():
+    first = World(beacons(), seconds=6.0)
+    second = World(beacons(), seed=1, seconds=6.0, start_ns=START_NS + 10**12, start_s=9.0)
+    chain = Chain(config(estimator={"kind": "isam2"}), None)
+    estimates = chain.run([*first.events(), *second.events()])
+    before = [e for e in estimates if e.stamp_ns < START_NS + 10**11]
+    after = [e for e in estimates if e.stamp_ns > START_NS + 10**11]
+    assert math.sqrt(after[0].cov[0, 0]) > 1.0 > 10 * math.sqrt(before[-1].cov[0, 0])
+    assert any("segment 1 begins" in note for note in chain.stepper.notes)
+    start = first.truth(before[0].stamp_ns)
+    assert position_error(after[-1], se2.between(start, second.truth(after[-1].stamp_ns))) < 0.3
+
+
+def test_fault_21_a_silence_of_all_sensors_for_60_s():
+    settings = config(gate={"clock_jump_s": 100.0})
+    world, chain, estimates = drive("corners", settings, seconds=90.0, blind=((10, 72),), dumb=((10, 72),))
+    silent = [e for e in estimates if 10.5 < seconds(e) < 72]
+    sizes = [math.sqrt(max(np.linalg.eigvalsh(e.cov[:2, :2]))) for e in silent]
+    assert sizes == sorted(sizes)
+    assert sizes[-1] > 5.0
+    assert all(e.mode in (Mode.DEAD_RECKONING, Mode.LOST) for e in silent if seconds(e) > 12.5)
+    assert all(position_error(e, world.truth(e.stamp_ns)) < 3 * s for e, s in zip(silent, sizes, strict=True))
+    back = [e for e in estimates if seconds(e) > 73]
+    assert modes(back) == [Mode.OK]
+    assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in back]) < 0.01
+    assert chain.localizer.estimator.rebuilt == 0
+
+
+def test_fault_22_90_s_without_markers():
+    world, _, estimates = drive("corners", seconds=110.0, blind=((10, 100),))
+    assert modes(estimates)[:2] == [Mode.OK, Mode.DEAD_RECKONING]
+    assert estimates[-1].mode is Mode.OK
+    back = [e for e in estimates if seconds(e) > 102]
+    assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in back]) < 0.01
+
+
+def test_fault_33_a_network_that_returns_nan_leaves_the_wheels(tmp_path):
+    card = make_card("displacement")
+    tensors = make_tensors(card, np.random.default_rng(0))
+    tensors["layer0.weight"][:] = 3e38  # finite in the file, not in what it predicts
+    save_model(tmp_path / "wild.safetensors", tensors, card)
+    learned = LearnedMotion(load_model(tmp_path / "wild.safetensors"), MotionConfig())
+    world = World(room())
+    with_nan, without = Chain(config(), room(), learned), Chain(config(), room())
+    a, b = with_nan.run(world.events()), without.run(world.events())
+    assert np.array_equal([e.pose for e in a], [e.pose for e in b])
+    assert with_nan.localizer.counts["learned"] == 0
+    assert learned.rejections["learned.non_finite"] > 190
+
+
+def shift(landmark, dx: float, dy: float):
+    return replace(landmark, position=landmark.position + np.array([dx, dy, 0.0]))
+
+
+def test_fault_49_sightings_of_a_false_id_are_refused_and_do_no_harm():
+    """Marker 7 is now and then taken for marker 2 of another wall."""
+    clean = World(room(), seconds=30.0)
+    events, swapped = [], 0
+    for event in clean.events():
+        sightings = getattr(event, "sightings", ())
+        if any(s.marker_id == 7 for s in sightings) and not any(s.marker_id == 2 for s in sightings) and swapped < 25:
+            event = replace(
+                event, sightings=tuple(replace(s, marker_id=2) if s.marker_id == 7 else s for s in sightings)
+            )
+            swapped += 1
+        events.append(event)
+    chain = Chain(config(), room())
+    estimates = chain.run(events)
+    assert swapped == 25
+    refused = [d for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
+    assert len(refused) == 25
+    assert {d.landmark_id for d in refused} == {2}
+    assert np.mean([position_error(e, clean.truth(e.stamp_ns)) for e in estimates]) < 0.006
+
+
+def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
+    moved = dict(room().landmarks)
+    moved[2] = shift(moved[2], 0.0, 0.4)
+    world, chain, estimates = drive("corners", seconds=40.0, shown=LandmarkMap(moved))
+    refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
+    assert refused.count(2) > 50
+    assert len(refused) - refused.count(2) < 4  # one in ten thousand
+    assert chain.localizer.weights.rejections["sightings.gate"] == len(refused)
+    believed = [d for e in estimates for d in e.decisions if d.landmark_id == 2 and not d.reason]
+    assert not believed
+    assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < 0.006
+
+
+@pytest.mark.parametrize("initial", [None, tuple(truth_at(0.0))])
+def test_a_kidnapped_robot_is_found_elsewhere_without_restart(initial):
+    settings = config(estimator={"initial_pose": initial})
+    world, _, estimates = drive("corners", settings, kidnap_s=10.0)
+    assert modes(estimates) == [Mode.OK, Mode.LOST, Mode.OK]
+    after = [e for e in estimates if seconds(e) > 12.0]
+    assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in after]) < 0.01
+
+
+def test_a_given_first_pose_is_used_with_its_sigmas():
+    settings = config(estimator={"initial_pose": (0.3, -1.0, 0.1), "initial_sigmas": (0.2, 0.1, 0.3)})
+    _, _, estimates = drive("corners", settings, seconds=2.0, blind=((0.0, 2.0),))
+    assert np.allclose(estimates[0].pose, (0.3, -1.0, 0.1))
+    c, s = math.cos(0.1), math.sin(0.1)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    assert np.allclose(estimates[0].cov, R @ np.diag([0.04, 0.01, 0.09]) @ R.T, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_fault_24_fault_68_50_000_steps_stay_flat():
+    """The cost of a step, and all that grows with a run, after 50 000 factors and marginals."""
+    world_map, chain = beacons(), Chain(config(), beacons())
+    chain.localizer.stopwatch.keep = True
+    for part in range(25):
+        world = World(world_map, seed=part, seconds=200.0, start_ns=START_NS + part * 200 * 10**9, start_s=part * 200.0)
+        for event in world.events():
+            passed = chain.gate.check(event)
+            for step in chain.stepper.push(passed) if passed is not None else ():
+                chain.steps += 1
+                estimate = chain.localizer.update(step)
+    fuse = np.array(chain.localizer.stopwatch.samples["fuse"])
+    assert chain.steps > 50_000 - 30
+    assert np.median(fuse[-5000:]) < 1.3 * np.median(fuse[1000:6000])
+    assert len(chain.localizer.estimator.log) < 110
+    assert position_error(estimate, world.truth(estimate.stamp_ns)) < 0.1
+    assert math.sqrt(estimate.cov[0, 0]) < 0.1
