@@ -197,6 +197,39 @@ def make_map(
     _exit_if_lost(result)
 
 
+@app.command()
+def ablate(
+    suite: Annotated[Path, typer.Argument(metavar="SUITE.yaml", help="see ablations/")],
+    out: Out,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes; default: one per core")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
+) -> None:
+    """Tell what the failure of each sensor costs; a killed sweep goes on where it was."""
+    from fgloc.ablation.jobs import make_jobs
+    from fgloc.ablation.report import failed, write_report
+    from fgloc.ablation.suite import expand, load_suite
+    from fgloc.ablation.sweep import sweep
+
+    plan = load_suite(suite)
+    jobs = make_jobs(expand(plan, suite.parent))
+    with tqdm(desc="runs", total=len(jobs), disable=None, file=sys.stderr, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        records = sweep(jobs, out, workers, scheduler, retry, show)
+    for sentence in write_report(plan, jobs, records, out, _typed()):
+        typer.echo(sentence)
+    without = failed(jobs, records)
+    if without:
+        typer.echo(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    typer.echo(f"report: {out / 'report.html'}")
+
+
 def _localise(
     bag: Path,
     map_file: Path | None,

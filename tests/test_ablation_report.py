@@ -1,0 +1,161 @@
+"""The report says what the records say: means, spreads, counts, costs, and what gave no result."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fgloc import cli
+from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
+from fgloc.ablation.report import write_report
+from fgloc.ablation.suite import Cell, Suite, expand, load_suite
+from fgloc.ablation.tables import ATE, join, matrix, rows, sentence, worst
+from fgloc.config import Config
+
+ROOT = Path(cli.__file__).resolve().parent.parent
+SUITE = Suite.model_validate(
+    {
+        "title": "Blind & dead",
+        "seeds": [0, 1, 2],
+        "recordings": [{"name": "a", "bag": "a"}],
+        "variants": [{"name": "full"}, {"name": "bare"}],
+        "failures": [
+            {
+                "name": "blind",
+                "chain": [{"kind": "dropout", "sensor": "camera", "when": {"bursts": 1}}],
+                "severity": {"field": "when.burst_s", "values": [1, 2], "unit": "s"},
+            },
+            {"name": "dark", "chain": [{"kind": "darkness"}]},
+        ],
+    }
+)
+ERRORS = {1.0: [0.02, 0.03, 0.04], 2.0: [0.1, 0.2, None]}  # m by severity, of `full`
+
+
+@pytest.fixture
+def bag(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"stands for a recording")
+    return path
+
+
+def made(bag):
+    """Jobs of the suite with records as a run would leave them."""
+    jobs, records = [], {}
+    for failure, severity in rows(SUITE):
+        for variant in ("full", "bare"):
+            for seed in (0,) if failure == "none" else SUITE.seeds:
+                key = f"{failure}-{severity}-{variant}-{seed}"
+                chain = () if failure == "none" else SUITE.failures[0].chain
+                cell = Cell(
+                    recording="a",
+                    variant=variant,
+                    failure=failure,
+                    severity=severity,
+                    seed=seed,
+                    bag=bag,
+                    map=None,
+                    config=Config(),
+                    mode="online",
+                    start="configured",
+                    chain=chain,
+                )
+                jobs.append(Job(key=key, cell=cell))
+                error = ERRORS[severity][seed] if failure == "blind" else 0.01
+                if variant == "full" and error is None:
+                    record = Record(key=key, outcome="refused", error="EstimatorError: <no> pose", cost=COST)
+                else:
+                    touched = {"dropout": 5} if failure == "blind" else {}
+                    track = {"estimate": [(0, 0), (1, error or 0)], "truth": [(0, 0), (1, 0)]}
+                    figures = {"ate_mean_m": error if variant == "full" else 0.5, "coverage": {"3": 0.99}}
+                    record = Record(key=key, outcome="done", figures=figures, touched=touched, track=track, cost=COST)
+                records[key] = record
+    return jobs, records
+
+
+COST = Cost(seconds=1.0, peak_mb=100.0)
+
+
+def test_matrix_holds_mean_spread_and_counts(bag):
+    entries = {(e.failure, e.severity, e.variant): e for e in matrix(SUITE, join(*made(bag))) if e.metric is ATE}
+    mild, harsh = entries["blind", 1.0, "full"], entries["blind", 2.0, "full"]
+    assert mild.mean == pytest.approx(30.0)
+    assert mild.spread == pytest.approx(10.0)
+    assert mild.interval == pytest.approx((30.0 - 4.3027 * 10 / 3**0.5, 30.0 + 4.3027 * 10 / 3**0.5), rel=1e-4)
+    assert (len(harsh.values), harsh.runs, harsh.text) == (2, 3, "150 ± 70.7 (2 of 3)")
+    assert entries["none", None, "full"].text == "10 (1)"
+    assert entries["blind", 2.0, "bare"].values == (500.0,) * 3
+
+
+def test_sentences_say_the_cost_and_its_limits(bag):
+    runs = join(*made(bag))
+    blind = sentence(SUITE, runs, "blind")
+    assert blind.startswith("Blind at 2 s raises the mean error of 'full' from 10 to 150 mm over 2 runs")
+    assert "1 of 3 runs gave no figure" in blind
+    assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they say nothing about it."
+
+
+def test_worst_case_is_the_largest_error(bag):
+    assert worst(SUITE, join(*made(bag)), "blind").key == "blind-2.0-full-1"
+
+
+def test_report_files_agree(bag, tmp_path):
+    out = tmp_path / "out"
+    jobs, records = made(bag)
+    sentences = write_report(SUITE, jobs, records, out, "fgloc ablate x.yaml")
+    page = (out / "report.html").read_text()
+    assert "Blind &amp; dead" in page
+    assert "<no> pose" not in page
+    assert page.count("data:image/png") == 2
+    assert page.count("EstimatorError: &lt;no&gt; pose") == 1
+    assert "http" not in page.replace("http-equiv", "")
+    content = json.loads((out / "ablation.json").read_text())
+    assert content["sentences"] == sentences
+    assert content["recordings"]["a"]["sha256"]
+    with (out / "matrix.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == len(content["matrix"]) == 4 * 2 * 5
+    for row, entry in zip(table, content["matrix"], strict=True):
+        assert (row["mean"] or None) == (None if entry["mean"] is None else str(entry["mean"]))
+    with (out / "runs.csv").open() as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == len(jobs)
+    full = [float(r[ATE.label]) for r in runs if r["failure"] == "blind" and r["variant"] == "full" and r[ATE.label]]
+    assert np.allclose(full, [20, 30, 40, 100, 200])
+
+
+def test_command_writes_the_report_and_repeats_it(tmp_path):
+    """Bundled recording, cut short: its records are made here, so that the command starts no processes."""
+    suite = tmp_path / "suite.yaml"
+    bag = ROOT / "datasets" / "samples" / "first_run" / "bag"
+    suite.write_text(
+        f"title: short\nrecordings: [{{name: first, bag: {bag}}}]\nvariants:\n"
+        "  - {name: full, config: {recording: {topics: {image: none}}}, start: truth}\n"
+        "failures: [{name: short, chain: [{kind: truncated, keep: 0.2}]}]\n"
+    )
+    out = tmp_path / "out"
+    for job in make_jobs(expand(load_suite(suite), tmp_path)):
+        execute(job, out)
+
+    def ablate():
+        done = CliRunner().invoke(cli.app, ["ablate", str(suite), "--out", str(out)])
+        assert done.exit_code == 0, done.output
+        return done.stdout
+
+    said = ablate()
+    assert said.splitlines()[0].startswith("Short ")
+    assert said.splitlines()[-1] == f"report: {out / 'report.html'}"
+    before = (out / "matrix.csv").read_bytes()
+    assert ablate() == said
+    assert (out / "matrix.csv").read_bytes() == before
+    broken = CliRunner().invoke(cli.app, ["ablate", str(tmp_path / "nowhere.yaml"), "--out", str(out)])
+    assert broken.exit_code == 1
+    assert broken.stderr.startswith("error: ")
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "ablations").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_suites_load(path):
+    assert load_suite(path).failures
