@@ -31,6 +31,7 @@ _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings th
 _MAX_COST_PER_DOF = 4.0
 _MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
+_MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
 _MAX_STEPS = 400
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
@@ -113,6 +114,8 @@ class Initializer:
         best = fits[0]
         rivals = [fit for fit in fits[1:] if _apart(best.pose, fit.pose)]
         if best.dof < 4 or best.cost > _MAX_COST_PER_DOF * best.dof:
+            return None
+        if (np.sqrt(np.diag(best.cov)) > _MAX_SIGMA).any():
             return None
         if rivals and rivals[0].cost < best.cost + _MARGIN:
             return None
