@@ -75,6 +75,26 @@ def test_displacement_without_residual_is_the_calibrated_kinematics(rng: np.rand
     np.testing.assert_allclose(prediction.velocity, twist[[0, 2]], atol=1e-9)
 
 
+def test_ensemble_is_the_mean_and_doubts_where_its_members_differ(rng: np.random.Generator, tmp_path: Path) -> None:
+    card, events = make_card("displacement"), commands(rng)
+    start, path = T0 + 3 * SECOND, tmp_path / "model.safetensors"
+    parts, twists, variances = [], [], []
+    for _ in range(3):
+        parts.append(make_tensors(card, rng))
+        save_model(path, parts[-1], card)
+        alone = load_model(path).predict(known(events, start), start, start + SECOND // 10, None)
+        assert alone is not None
+        twists.append(se2.log(alone.motion) / 0.1)
+        variances.append(np.diag(alone.cov) / 0.1)
+    assert np.std(twists, axis=0).min() > 1e-4
+    save_model(path, {n: np.stack([p[n] for p in parts]) for n in parts[0]}, card.model_copy(update={"members": 3}))
+    together = load_model(path).predict(known(events, start), start, start + SECOND // 10, None)
+    assert together is not None
+    np.testing.assert_allclose(se2.log(together.motion) / 0.1, np.mean(twists, axis=0), atol=1e-6)
+    doubt = 2.0 * np.var(twists, axis=0)
+    np.testing.assert_allclose(np.diag(together.cov) / 0.1, np.mean(variances, axis=0) + doubt, rtol=1e-4)
+
+
 def test_velocity_without_network_is_a_first_order_lag(rng: np.random.Generator, tmp_path: Path) -> None:
     card = make_card("velocity", kinematics=dict(scale_v=0.9, scale_omega=1.1))
     save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)

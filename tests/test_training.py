@@ -12,12 +12,13 @@ import yaml
 from synthetic_robot import SECOND, synthetic, write_bag
 
 from fgloc.errors import ConfigError
-from fgloc.motion import load_model
+from fgloc.motion import load_model, save_model
+from fgloc.motion.load import read_model
 from training import evaluate as evaluation
 from training import train as training
 from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run
-from training.export import card_of, export
+from training.export import card_of, tensors_of
 from training.rollouts import roll_kinematics, roll_model
 
 
@@ -42,7 +43,7 @@ def test_torch_and_numpy_agree(kind: str, use_velocity: bool, runs: dict[str, Ru
         for parameter in net.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape))
     split = training.leave_one_out(list(runs))[0]
-    export(net, card_of(net, config, split, "a test"), tmp_path / "m.safetensors")
+    save_model(tmp_path / "m.safetensors", tensors_of([net]), card_of(net, config, split, "a test"))
     model = load_model(tmp_path / "m.safetensors")
     run = runs["run0"]
     samples, starts = net.samples([run]), torch.tensor([50, 200, 333])
@@ -95,6 +96,26 @@ def test_training_beats_calibrated_commands_and_knows_its_error(
     assert again.read_bytes() == path.read_bytes()
 
 
+def test_ensemble_is_trained_from_different_seeds_and_calibrated_as_one(runs: dict[str, Run], tmp_path: Path) -> None:
+    base = tiny_config("displacement", list(runs))
+    short = base.optimization.model_copy(update=dict(iterations=60, variance_iterations=20))
+    config = base.model_copy(update=dict(network=base.network.model_copy(update=dict(members=2)), optimization=short))
+    split = training.leave_one_out(list(runs))[0]
+    card = training.train(config, split, runs, tmp_path / "model.safetensors", "a test")
+    tensors, read = read_model(tmp_path / "model.safetensors")
+    assert read == card
+    assert card.members == 2
+    assert card.memory is not None
+    first, second = tensors["layer0.weight"]
+    assert np.abs(first - second).max() > 0.01
+    alone = base.model_copy(update=dict(optimization=short))
+    training.train(alone, split, runs, tmp_path / "alone.safetensors", "a test")
+    np.testing.assert_array_equal(read_model(tmp_path / "alone.safetensors")[0]["layer0.weight"], first)
+    learned = evaluation.evaluate([roll_model(load_model(tmp_path / "model.safetensors"), runs["run0"], 0.2)], 10.0)
+    assert learned.nis_over_3 is not None
+    assert 0.1 < learned.nis_over_3 < 4.0
+
+
 def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for seed in range(3):
         write_bag(tmp_path / f"run{seed}" / "bag", seed, 45.0)
@@ -133,6 +154,7 @@ def test_configuration_is_strict(tmp_path: Path) -> None:
     for change, message in (
         ({}, "leave_one_out"),
         ({"leave_one_out": True, "hiden": 3}, "hiden"),
+        ({"leave_one_out": True, "network": dict(kind="velocity", members=2)}, "members: 2"),
         ({"split": dict(train=["a"], validation=["x"])}, r"\['x'\]"),
         ({"split": dict(train=["a"], validation=["a"])}, "neither validate nor test"),
         ({"leave_one_out": True, "recordings": dict(a="a")}, "at least 3"),

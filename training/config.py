@@ -26,6 +26,7 @@ class NetworkConfig(Section):
 
     kind: Literal["velocity", "displacement"] = "displacement"
     hidden: tuple[int, ...] = (64, 64)
+    members: int = Field(1, ge=1, le=64, description="displacement: networks trained from different seeds and averaged")
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
         (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
@@ -35,6 +36,14 @@ class NetworkConfig(Section):
     velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of that velocity [m/s, rad/s]")
     velocity_decay_s: float = Field(0.3, gt=0)
     hold_s: float = Field(1.5, gt=0)
+
+    @model_validator(mode="after")
+    def _may_be_an_ensemble(self) -> NetworkConfig:
+        if self.kind == "velocity" and self.members > 1:
+            raise ValueError(
+                f"a velocity model has one network, got members: {self.members}; take a displacement model"
+            )
+        return self
 
 
 class OptimizationConfig(Section):

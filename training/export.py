@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from fgloc.motion.card import ModelCard, Split
-from fgloc.motion.load import Tensors, save_model
+from fgloc.motion.load import Tensors
 from training.config import TrainConfig
 from training.models import DisplacementNet, MotionNet
 
 _WARM_UP_S = 2.0  # a velocity model that is told no velocity starts from rest this long ago
 
 
-def tensors_of(net: MotionNet) -> Tensors:
-    """Weights by the names that `fgloc.motion.load_model` expects."""
+def tensors_of(nets: list[MotionNet]) -> Tensors:
+    """Weights by the names that `fgloc.motion.load_model` expects; those of several networks stacked."""
     out: Tensors = {}
-    for i, (weight, bias) in enumerate(net.layers()):
-        out[f"layer{i}.weight"] = np.ascontiguousarray(weight.detach().numpy())
-        out[f"layer{i}.bias"] = np.ascontiguousarray(bias.detach().numpy())
+    for i, members in enumerate(zip(*(net.layers() for net in nets), strict=True)):
+        for name, tensors in zip(("weight", "bias"), zip(*members, strict=True), strict=True):
+            arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors]
+            out[f"layer{i}.{name}"] = np.stack(arrays) if len(arrays) > 1 else arrays[0]
     return out
 
 
@@ -34,6 +33,7 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
             inputs=("commands", "velocity") if network.use_velocity or not displacement else ("commands",),
             dt_s=network.dt_s,
             hidden=network.hidden,
+            members=network.members,
             hold_s=network.hold_s,
             history_s=max(network.edges_s[-1], net.kinematics.delay_s) if displacement else _WARM_UP_S,
             kinematics=net.kinematics,
@@ -48,9 +48,3 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
             made_by=made_by,
         )
     )
-
-
-def export(net: MotionNet, card: ModelCard, path: Path) -> None:
-    """Write the model file, its weights from torch, its calibration from the card."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_model(path, tensors_of(net), card)

@@ -30,6 +30,7 @@ from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, re
 from training.rollouts import roll_kinematics, roll_model
 
 _VALIDATION_S = (10.0, 30.0)
+_SEEDS_APART = 1_000  # between the members of an ensemble
 HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
 
 
@@ -38,24 +39,31 @@ def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, m
 
     Without validation recordings the training runs its full length and the covariance stays uncalibrated.
     """
-    torch.manual_seed(config.optimization.seed)
     training = [runs[name] for name in split.train]
     validation = [runs[name] for name in split.validation]
-    net = new_net(config.network, training)
-    train_mean(net, training, validation, config.optimization)
-    if isinstance(net, DisplacementNet):
-        train_variance(net, training, validation, config.optimization)
-    card = card_of(net, config, split, made_by)
+    nets = [train_member(config, training, validation, member) for member in range(config.network.members)]
+    tensors, card = tensors_of(nets), card_of(nets[0], config, split, made_by)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_model(path, tensors_of(net), card)
+    save_model(path, tensors, card)
     if not validation:
         return card
     card = calibrate(path, card, validation, config)
     tested = [runs[name] for name in split.test] or validation
-    save_model(path, tensors_of(net), card)
+    save_model(path, tensors, card)
     card = card.model_copy(update={"figures": card_figures([roll_model(load_model(path), r, STEP_S) for r in tested])})
-    save_model(path, tensors_of(net), card)
+    save_model(path, tensors, card)
     return card
+
+
+def train_member(config: TrainConfig, training: list[Run], validation: list[Run], member: int) -> MotionNet:
+    """One network; the members of an ensemble differ by their seed."""
+    optimization = config.optimization.model_copy(update={"seed": config.optimization.seed + _SEEDS_APART * member})
+    torch.manual_seed(optimization.seed)
+    net = new_net(config.network, training)
+    train_mean(net, training, validation, optimization)
+    if isinstance(net, DisplacementNet):
+        train_variance(net, training, validation, optimization)
+    return net
 
 
 def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:

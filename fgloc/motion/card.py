@@ -97,6 +97,7 @@ class ModelCard(Section):
     inputs: tuple[Literal["commands", "velocity"], ...]
     dt_s: Positive = Field(description="longest sub-step: a step is cut into equal parts no longer than this")
     hidden: tuple[Annotated[int, Field(gt=0, le=4096)], ...]
+    members: Annotated[int, Field(ge=1, le=64)] = Field(1, description="displacement: networks that are averaged")
     hold_s: Positive = Field(description="a command is believed to hold for this long when the next one is missing")
     history_s: Positive = Field(description="seconds of commands before a step that the model wants")
     kinematics: Kinematics = Kinematics()
@@ -136,6 +137,8 @@ class ModelCard(Section):
             raise ValueError(f"a {self.kind} model needs the inputs {sorted(needed)}, the card lacks {sorted(missing)}")
         if self.kind == "displacement":
             _increasing(self.edges_s)
+        elif self.members > 1:
+            raise ValueError(f"a velocity model has one network, the card says {self.members}")
         elif self.noise is None or self.lag is None:
             raise ValueError("a velocity model needs a lag and the noise densities of its error; the card lacks one")
         n_scales = {"velocity": 2, "displacement": 3}[self.kind]

@@ -23,6 +23,7 @@ from fgloc.types import CommandEvent, FloatArray
 
 MIN_DENSITY = np.array([1e-3, 1e-3, 1e-3]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
+_DISAGREEMENT_S = 1.0  # members differ for about this long at a time: a rate of spread s has the density 2 s² times it
 _SMALL = 1e-9
 
 
@@ -127,6 +128,7 @@ class DisplacementModel:
     The twist at the middle of each sub-step follows from the mean commands of the card's age bins and, if the model was
     trained with it, from the velocity's innovation (known minus predicted at the start, fading with
     ``velocity_decay_s``); its integral is the displacement. Nothing is fed back, so errors do not feed themselves.
+    An ensemble answers with its mean, and doubts where its members differ.
 
     Source: design.md §5.
     """
@@ -141,6 +143,7 @@ class DisplacementModel:
         self._ages = np.array(card.edges_s)
         self._widths = np.diff(self._ages)
         self._log_scale = np.log(card.variance_scale)
+        self._spread_gain = 2.0 * _DISAGREEMENT_S * np.array(card.variance_scale)
         self._n_bins = 2 * len(self._widths)
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
         self._track: CommandTrack | None = None
@@ -157,10 +160,16 @@ class DisplacementModel:
         y = self._network(x).astype(np.float64)
         if not np.isfinite(y).all():
             return None
-        twists = base + self._scale * y[:, :3]
-        variances = y[:, 3:] + self._log_scale
-        np.minimum(variances, _MAX_LOG_VARIANCE, out=variances)
-        np.maximum(np.exp(variances, out=variances), MIN_DENSITY, out=variances)
+        residuals, log_variances = y[..., :3], y[..., 3:]
+        log_variances += self._log_scale
+        np.minimum(log_variances, _MAX_LOG_VARIANCE, out=log_variances)
+        variances = np.exp(log_variances)
+        if self.card.members > 1:
+            spread = self._scale * residuals.std(axis=0)
+            residuals = residuals.mean(axis=0)
+            variances = variances.mean(axis=0) + self._spread_gain * spread**2
+        np.maximum(variances, MIN_DENSITY, out=variances)
+        twists = base + self._scale * residuals
         return MotionPrediction(*_composed(twists * dt, variances * dt), twists[-1, ::2])
 
     def _inputs(

@@ -94,9 +94,10 @@ def _card(metadata: dict[str, str], path: Path) -> ModelCard:
 def _layers(tensors: Tensors, card: ModelCard, path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     widths = [card.n_inputs, *card.hidden, card.n_outputs]
     expected: dict[str, tuple[int, ...]] = {}
+    stack = (card.members,) if card.members > 1 else ()
     for i, (n_in, n_out) in enumerate(pairwise(widths)):
-        expected[f"layer{i}.weight"] = (n_out, n_in)
-        expected[f"layer{i}.bias"] = (n_out,)
+        expected[f"layer{i}.weight"] = (*stack, n_out, n_in)
+        expected[f"layer{i}.bias"] = (*stack, n_out)
     if set(tensors) != set(expected):
         raise ModelError(f"{path}: holds the tensors {sorted(tensors)}, its card needs {sorted(expected)}; {_REMEDY}")
     for name, shape in expected.items():

@@ -11,7 +11,8 @@ Float32Array = NDArray[np.float32]
 class Network:
     """``y = W_n relu(... relu(W_0 (x - mean) / std + b_0) ...) + b_n`` for a batch of rows.
 
-    The normalization is folded into the first layer. Not for concurrent use: calls share buffers.
+    The normalization is folded into the first layer. The members of an ensemble, stacked, answer in one call. Not for
+    concurrent use: calls share buffers.
     """
 
     def __init__(
@@ -23,24 +24,27 @@ class Network:
         """Take the layers.
 
         Args:
-            layers: (weight (out, in), bias (out,)) from input to output.
+            layers: (weight (out, in), bias (out,)) from input to output, of an ensemble each with a first axis more.
             mean: ``(in,)`` of the inputs.
             std: ``(in,)`` of the inputs.
         """
-        self._weights = [np.ascontiguousarray(w.T) for w, _ in layers]
-        self._biases = [b for _, b in layers]
         first = layers[0][0] / std
         with np.errstate(over="ignore"):
-            self._weights[0] = np.ascontiguousarray(first.T, dtype=np.float32)
-            self._biases[0] = (layers[0][1] - first @ mean).astype(np.float32)
+            weights = [first.astype(np.float32), *(w for w, _ in layers[1:])]
+            biases = [(layers[0][1] - first @ mean).astype(np.float32), *(b for _, b in layers[1:])]
+        self._weights = [np.ascontiguousarray(w.swapaxes(-1, -2)) for w in weights]
+        self._biases = [b[..., None, :] for b in biases]
         self._buffers: dict[int, list[Float32Array]] = {}
 
     def __call__(self, x: Float32Array) -> Float32Array:
-        """Outputs ``(rows, out)`` of inputs ``(rows, in)``, perhaps not finite. The next call overwrites the result."""
+        """Outputs ``(rows, out)``, or ``(members, rows, out)``, of inputs ``(rows, in)``, perhaps not finite.
+
+        The next call overwrites the result.
+        """
         rows = len(x)
         buffers = self._buffers.get(rows)
         if buffers is None:
-            buffers = [np.empty((rows, w.shape[1]), dtype=np.float32) for w in self._weights]
+            buffers = [np.empty((*w.shape[:-2], rows, w.shape[-1]), dtype=np.float32) for w in self._weights]
             self._buffers[rows] = buffers
         last = len(buffers) - 1
         with np.errstate(over="ignore", invalid="ignore"):
