@@ -35,7 +35,7 @@ class CommandTrack:
         steps = np.diff(times)
         np.cumsum(np.multiply([c.v for c in commands[:-1]], steps), out=self._integrals[0, 1:n])
         np.cumsum(np.multiply([c.omega for c in commands[:-1]], steps), out=self._integrals[1, 1:n])
-        self._hold()
+        self._extend(())
 
     def following(self, commands: tuple[CommandEvent, ...]) -> CommandTrack:
         """This track, extended by what is new in the next step's commands; a new one if they do not continue it."""
@@ -47,9 +47,7 @@ class CommandTrack:
         full = len(self._events) + len(commands) - i >= len(self._times)
         if i < 0 or first < 0 or self._events[first] is not commands[0] or full:
             return CommandTrack(commands)
-        for event in commands[i + 1 :]:
-            self._append(event)
-        self._hold()
+        self._extend(commands[i + 1 :])
         return self
 
     def integrals(self, times_s: FloatArray) -> FloatArray:
@@ -73,18 +71,19 @@ class CommandTrack:
         means = np.diff(self.integrals(limits_s)) / np.diff(limits_s)
         return np.ascontiguousarray(np.moveaxis(means, 0, -1))
 
-    def _append(self, event: CommandEvent) -> None:
-        k, last = len(self._events), self._events[-1]
-        t = (event.stamp_ns - self.origin_ns) * 1e-9
-        dt = t - self._times[k - 1]
-        self._times[k] = t
-        self._integrals[0, k] = self._integrals[0, k - 1] + last.v * dt
-        self._integrals[1, k] = self._integrals[1, k - 1] + last.omega * dt
-        self._events.append(event)
+    def _extend(self, events: tuple[CommandEvent, ...]) -> None:
+        """Append, then one more entry, overwritten by the next command: the last one holds.
 
-    def _hold(self) -> None:
-        """One more entry, overwritten by the next command: the last one holds."""
+        In plain floats: reading single elements of arrays would take most of the time.
+        """
+        times, (integral_v, integral_omega) = self._times, self._integrals
         k, last = len(self._events), self._events[-1]
-        self._times[k] = self._times[k - 1] + _FOREVER_S
-        self._integrals[0, k] = self._integrals[0, k - 1] + last.v * _FOREVER_S
-        self._integrals[1, k] = self._integrals[1, k - 1] + last.omega * _FOREVER_S
+        t, v, omega = float(times[k - 1]), float(integral_v[k - 1]), float(integral_omega[k - 1])
+        for event in events:
+            now = (event.stamp_ns - self.origin_ns) * 1e-9
+            v, omega, t = v + last.v * (now - t), omega + last.omega * (now - t), now
+            times[k], integral_v[k], integral_omega[k] = t, v, omega
+            k, last = k + 1, event
+        self._events.extend(events)
+        times[k] = t + _FOREVER_S
+        integral_v[k], integral_omega[k] = v + last.v * _FOREVER_S, omega + last.omega * _FOREVER_S
