@@ -136,7 +136,7 @@ class Localizer:
         self._segment = step.segment
         self._lost = False
         self._silent_s = 0.0
-        self.weights.refused_in_a_row = 0
+        self.weights.begin_segment()
         self._initializer.reset()
         given = self.config.estimator.initial_pose
         last = self.estimator.belief
@@ -256,6 +256,8 @@ class Localizer:
             mode = Mode.LOST
         elif self._clock_s - self._last_fix_s > self.config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
+        frame = self.estimator.log.keyframes[self.estimator.k]
+        frame.step, frame.mode = step, mode
         cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, mode, tuple(decisions))
 

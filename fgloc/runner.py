@@ -76,11 +76,11 @@ def run(
     began = time.perf_counter()
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, keep_all=mode == "batch" or map_path is None)
-        replay = _Replay(parts, recording.duration_s, progress, pace, mode == "batch", sightings)
+        replay = _Replay(parts, recording.duration_s, progress, pace, sightings)
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
-            replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
+            replay.record(estimate, (time.perf_counter() - start) * 1e3)
             if on_step is not None:
                 on_step(step, estimate)
         hints: tuple[str, ...] = ()
@@ -94,8 +94,14 @@ def run(
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
     if mode == "batch":
-        estimates, landmarks, more = smooth_run(parts, replay.history, estimates)
+        estimates, landmarks, more = smooth_run(parts)
         notes = (*notes, *more)
+    if again := len(estimates) - len(last_pass(estimates)):
+        notes = (
+            *notes,
+            f"The clock jumped back: {again} poses whose times came again are left out.",
+        )
+        estimates = last_pass(estimates)
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),
@@ -121,7 +127,6 @@ class _Replay:
         duration_s: float,
         progress: Progress | None,
         pace: float | None,
-        keep_steps: bool,
         sightings: EventFilter | None,
     ) -> None:
         self._parts = parts
@@ -136,8 +141,6 @@ class _Replay:
         self.estimates: list[Estimate] = []
         self.decisions: list[Decision] = []
         self.step_ms: list[float] = []
-        self._keep_steps = keep_steps
-        self.history: list[Step] = []
 
     def steps(self, events: Iterator[Event]) -> Iterator[Step]:
         """Gate, detect and cut into steps."""
@@ -151,11 +154,9 @@ class _Replay:
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
-    def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
+    def record(self, estimate: Estimate | None, milliseconds: float) -> None:
         """Note one step's outcome."""
         self.step_ms.append(milliseconds)
-        if self._keep_steps:
-            self.history.append(step)
         if estimate is not None:
             self.estimates.append(estimate)
             self.decisions.extend(estimate.decisions)
@@ -225,6 +226,15 @@ def _sentence(note: str) -> str:
     """With a capital, unless it begins with a name (of a topic, a file), and with a full stop."""
     first = note.split(maxsplit=1)[0]
     return (note[0].upper() + note[1:] if first.isalpha() else note) + ("" if note.endswith((".", "?", "!")) else ".")
+
+
+def last_pass(estimates: list[Estimate]) -> list[Estimate]:
+    """Estimates with increasing stamps: where the clock jumped back, the last pass over those times is kept."""
+    kept: list[Estimate] = []
+    for estimate in reversed(estimates):
+        if not kept or estimate.stamp_ns < kept[-1].stamp_ns:
+            kept.append(estimate)
+    return kept[::-1]
 
 
 def _trajectory(estimates: list[Estimate]) -> Trajectory:

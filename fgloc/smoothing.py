@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,10 +17,8 @@ from fgloc.types import (
     FloatArray,
     IntArray,
     LandmarkMap,
-    Mode,
     MotionMeasurement,
     RangeBearingMeasurement,
-    Step,
 )
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
@@ -29,25 +26,20 @@ _NUDGE = 0.005  # of log scale, and of radians: finite differences
 _NEWTON_STEPS = 2
 
 
-def smooth_run(
-    parts: Assembly, steps: Sequence[Step], filtered: Sequence[Estimate]
-) -> tuple[list[Estimate], LandmarkMap | None, tuple[str, ...]]:
+def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tuple[str, ...]]:
     """Smooth a run that was replayed with ``keep_all``.
 
     Args:
         parts: the run's parts; the localizer's log is read, and its motions are replaced.
-        steps: every step of the replay, in order.
-        filtered: the online estimates, whose modes are kept.
 
     Returns:
-        Estimates at every keyframe, the map (given or estimated), and notes.
+        Estimates at every keyframe (with the modes they had online), the map (given or estimated), and notes.
     """
     localizer, config = parts.localizer, parts.config
     solver = BatchSmoother(localizer.estimator.log, localizer.factors, config.batch, config.estimator.gate_probability)
     if parts.learned is not None and parts.learned.reads_velocity:
-        by_stamp = {step.stamp_ns: step for step in steps}
         for _ in range(config.batch.outer_iterations - 1):
-            solver.replace_motions(_measure_again(parts, by_stamp, solver))
+            solver.replace_motions(_measure_again(parts, solver))
     notes = []
     spread = np.zeros((len(solver.frames), 3, 3))
     if localizer.calibrator is not None and parts.landmark_map is not None:
@@ -60,10 +52,9 @@ def smooth_run(
             f"bearings - {offset:.4f} ± {sigmas[1]:.4f} rad."
         )
     result = solver.result()
-    modes = {e.stamp_ns: e.mode for e in filtered}
     estimates = [
-        Estimate(int(stamp), pose, se2.rotate_cov(cov, float(pose[2])), modes.get(int(stamp), Mode.OK))
-        for stamp, pose, cov in zip(result.stamps_ns, result.poses, result.covs + spread, strict=True)
+        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov, float(pose[2])), frame.mode)
+        for frame, pose, cov in zip(solver.frames, result.poses, result.covs + spread, strict=True)
     ]
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
@@ -72,19 +63,15 @@ def smooth_run(
     return estimates, landmarks, tuple(notes)
 
 
-def _measure_again(
-    parts: Assembly, steps: Mapping[int, Step], solver: BatchSmoother
-) -> dict[int, tuple[MotionMeasurement, ...]]:
+def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:
     """Evaluate the learned motion at the velocities of the smoothed trajectory."""
-    stamps = np.array([frame.stamp_ns for frame in solver.frames], dtype=np.int64)
-    poses = solver.poses()
+    stamps, poses = solver.stamps_ns(), solver.poses()
     starts = [i for i, frame in enumerate(solver.frames) if frame.prior is not None]
     again = {}
     for start, end in pairwise([*starts, len(stamps)]):  # no motion leads from one stretch to the next
         velocities = smoothed_velocities(stamps[start:end], poses[start:end])
         for frame, velocity in zip(solver.frames[start + 1 : end], velocities[1:], strict=True):
-            step = steps.get(frame.stamp_ns)
-            if step is not None and (motions := parts.localizer.measure_motion(step, velocity)):
+            if frame.step is not None and (motions := parts.localizer.measure_motion(frame.step, velocity)):
                 again[frame.k] = tuple(motions)
     return again
 

@@ -81,6 +81,10 @@ class BatchSmoother:
         m = sighting.measurement
         return not isinstance(m, CornerMeasurement) or self._factors.depth(m, pose) > MIN_DEPTH_M
 
+    def stamps_ns(self) -> IntArray:
+        """Times of the keyframes ``(n,)``."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+
     def poses(self) -> FloatArray:
         """Smoothed poses ``(n, 3)``."""
         return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
@@ -104,7 +108,7 @@ class BatchSmoother:
         marginals = gtsam.Marginals(self._graph, self._values)
         covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
         return Smoothed(
-            stamps_ns=np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64),
+            stamps_ns=self.stamps_ns(),
             poses=self.poses(),
             covs=np.array(covs),
             landmarks={} if self._factors.known else _landmarks(self.believed, self._values, marginals),

@@ -86,6 +86,11 @@ class LandmarkFactors:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None
 
+    def map_cov(self, landmark_id: int) -> FloatArray | None:
+        """Covariance ``(2, 2)`` of a known landmark's x, y; None if the map does not give it."""
+        landmark = None if self._known is None else self._known.get(landmark_id)
+        return None if landmark is None else landmark.cov
+
     def sighting(
         self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, raw: LandmarkMeasurement | None = None
     ) -> Sighting:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
+from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Step
 
 
 @dataclass(slots=True, eq=False)
@@ -43,6 +43,8 @@ class Keyframe:
     motions: tuple[MotionMeasurement, ...] = ()
     sightings: tuple[Sighting, ...] = ()
     refused: tuple[Sighting, ...] = ()  # not believed online; the batch looks again
+    step: Step | None = None  # what was heard, to be measured again
+    mode: Mode = Mode.OK
 
 
 @dataclass(slots=True)

@@ -68,7 +68,7 @@ class Weights:
         believed, refused, decisions = [], [], []
         values = _values(k, predicted.pose)
         for given in measurements:
-            raw, weight = self._share_information(given)
+            raw, weight = self._share_information(self._with_map_error(given, predicted))
             m = raw if calibration is None else calibration.apply(raw)
             sighting = self._factors.sighting(k, m, self._cauchy(m), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
@@ -142,6 +142,21 @@ class Weights:
         apart = max((m.stamp_ns - last) * 1e-9, 0.01)
         scale = max(1.0, correlation_s / apart)
         return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
+
+    def _with_map_error(self, m: LandmarkMeasurement, predicted: Belief) -> LandmarkMeasurement:
+        """Add the uncertainty of where the landmark is, if the map gives it (a surveyed map does)."""
+        cov = self._factors.map_cov(m.landmark_id)
+        if cov is None or not isinstance(m, RangeBearingMeasurement):
+            return m
+        direction = float(predicted.pose[2]) + m.bearing_rad
+        c, s = math.cos(direction), math.sin(direction)
+        J = np.array([[-s / m.range_m, c / m.range_m], [c, s]])  # bearing, range by the landmark's place
+        return dataclasses.replace(m, cov=m.cov + J @ cov @ J.T)
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of when landmarks were seen last."""
+        self._last_used_ns.clear()
+        self.refused_in_a_row = 0
 
     def _cauchy(self, m: LandmarkMeasurement) -> float:
         section = self._config.markers if isinstance(m, CornerMeasurement) else self._config.landmarks
