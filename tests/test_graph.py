@@ -14,7 +14,7 @@ from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
 from fgloc.graph.incremental import IncrementalEstimator, fuse
-from fgloc.graph.log import Belief
+from fgloc.graph.log import Belief, Keyframe, MeasurementLog
 from fgloc.graph.weights import Weights
 from fgloc.types import (
     Camera,
@@ -354,3 +354,18 @@ def test_repeated_sightings_share_their_information():
     assert np.allclose(a[0].measurement.cov, first.cov)
     assert np.allclose(b[0].measurement.cov, 4.0 * first.cov)
     assert decisions[0].weight == pytest.approx(0.25)
+
+
+@pytest.mark.slow
+def test_fault_68_a_batch_of_many_poses_does_not_overflow_the_stack():
+    n, motion = 120_000, np.array([0.02, 0.0, 0.01])
+    factors = LandmarkFactors(wall_map())
+    log, pose, cov = MeasurementLog(), np.zeros(3), np.diag([1e-6, 1e-6, 1e-6])
+    for k in range(n):
+        prior = Belief(pose, np.eye(3) * 1e-4) if k == 0 else None
+        motions = (MotionMeasurement("wheels", k - 1, k, motion, cov),) if k else ()
+        log.append(Keyframe(k, k * 10**8, 0.1 * k, Belief(pose, np.eye(3)), prior, motions))
+        pose = se2.compose(pose, motion)
+    result = BatchSmoother(log, factors, BatchConfig(), 0.9999).result()
+    assert len(result.covs) == n
+    assert (np.diff(result.covs[:, 2, 2]) > 0).all()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -25,6 +28,9 @@ from fgloc.types import (
     MotionMeasurement,
     RangeBearingMeasurement,
 )
+
+_T = TypeVar("_T")
+_DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +110,17 @@ class BatchSmoother:
         self._graph = self._optimize()
 
     def result(self) -> Smoothed:
-        """The last solution with its covariances."""
+        """The last solution with its covariances.
+
+        Raises:
+            EstimatorError: the graph leaves a pose undetermined.
+        """
+        try:
+            return _with_deep_stack(self._result)
+        except RuntimeError as error:
+            raise EstimatorError(f"the covariances of the batch cannot be had: {error}") from error
+
+    def _result(self) -> Smoothed:
         marginals = gtsam.Marginals(self._graph, self._values)
         covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
         return Smoothed(
@@ -128,6 +144,16 @@ class BatchSmoother:
             raise EstimatorError("the batch optimum is not finite; look at steps.csv for the sighting that broke it")
         self._values = values
         return graph
+
+
+def _with_deep_stack(work: Callable[[], _T]) -> _T:
+    """Run in a thread of its own: GTSAM's elimination of a chain of 1e5 poses overflows the usual 8 MB of stack."""
+    before = threading.stack_size(_DEEP_STACK_BYTES)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(work).result()
+    finally:
+        threading.stack_size(before)
 
 
 def _nis(sighting: Sighting, values: gtsam.Values) -> float:
