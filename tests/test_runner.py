@@ -1,0 +1,156 @@
+"""A run from bag to result: repeatable, honest about what it could not use, batch better than online."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from robot_world import START_NS, World, beacons, config
+from world_bags import write_world
+
+from fgloc import se2
+from fgloc.errors import EstimatorError
+from fgloc.recording.outputs import write_tum
+from fgloc.runner import find_beside, run
+from fgloc.types import Mode, RunResult
+
+
+def errors(result: RunResult) -> np.ndarray:
+    """Distance [m] to the truth of each pose, by the world's own interpolated truth."""
+    truth = se2.interpolate(result.truth.stamps_ns, result.truth.poses, result.trajectory.stamps_ns)
+    return np.hypot(*(result.trajectory.poses - truth)[:, :2].T)
+
+
+def test_batch_is_at_least_as_accurate_as_online_over_seeds(tmp_path):
+    online, batch = [], []
+    for seed in range(4):
+        (tmp_path / str(seed)).mkdir()
+        bag = write_world(tmp_path / str(seed), World(beacons(), seed=seed, seconds=12.0, blind=((5.0, 8.0),)))
+        map_path = find_beside(bag, "map.yaml")
+        online.append(errors(run(bag, map_path, config(), "online")).mean())
+        batch.append(errors(run(bag, map_path, config(), "batch")).mean())
+    assert np.mean(batch) < 0.8 * np.mean(online)
+    assert np.mean(batch) < 0.02
+
+
+def test_the_same_bag_gives_the_same_bytes_twice(tmp_path):
+    bag = write_world(tmp_path, World(beacons(), seconds=8.0))
+    for mode in ("batch", "online"):
+        files = []
+        for name in ("a", "b"):
+            result = run(bag, tmp_path / "map.yaml", config(), mode)
+            write_tum(tmp_path / f"{mode}_{name}.tum", result.trajectory)
+            files.append((tmp_path / f"{mode}_{name}.tum").read_bytes() + result.trajectory.covs.tobytes())
+        assert files[0] == files[1]
+        assert len(result.trajectory) > 75
+
+
+def test_every_keyframe_counts_and_every_factor_is_told(tmp_path):
+    result = run(write_world(tmp_path, World(beacons(), seconds=8.0)), tmp_path / "map.yaml", config(), "online")
+    assert result.counts["wheels"] == len(result.trajectory) - 1
+    fused = [d for d in result.decisions if d.kind == "range_bearing" and not d.reason]
+    assert result.counts["range_bearing"] == len(fused)
+    refused = sum(n for reason, n in result.rejections.items() if reason.startswith("sightings."))
+    assert len(fused) + refused == 2 * 80
+    assert set(result.modes) == {Mode.OK}
+    assert len(result.step_ms) >= len(result.trajectory)
+
+
+def test_the_truth_is_moved_from_its_body_to_the_base(tmp_path):
+    body = (0.12, -0.05, math.radians(87.0))
+    bag = write_world(tmp_path, World(beacons(), seconds=6.0), body=body)
+    settings = config(truth={"offset_m": body[:2], "yaw_offset_rad": body[2]})
+    result, raw = (run(bag, tmp_path / "map.yaml", c, "batch") for c in (settings, config()))
+    world = World(beacons())
+    for stamp, pose in zip(result.truth.stamps_ns[::10], result.truth.poses[::10], strict=True):
+        assert np.allclose(se2.between(pose, world.truth(int(stamp))), 0.0, atol=1e-9)
+    assert errors(result).mean() < 0.02
+    assert 0.1 < errors(raw).mean() < 0.2
+
+
+def test_without_a_fix_the_error_says_what_was_heard_and_what_was_rejected(tmp_path):
+    world = World(beacons(), seconds=4.0)
+    bag = write_world(tmp_path, world)
+    (tmp_path / "other.yaml").write_text("landmarks:\n  - {id: 99, position: [1.0, 2.0]}\n")
+    with pytest.raises(EstimatorError) as caught:
+        run(bag, tmp_path / "other.yaml", config(), "batch")
+    message = str(caught.value)
+    assert "/odom 80" in message
+    assert "sightings.unknown_id 80" in message
+    assert "estimator.initial_pose" in message
+
+
+def test_without_sightings_a_given_first_pose_is_enough(tmp_path):
+    world = World(beacons(), seconds=4.0)
+    bag = write_world(tmp_path, world, sightings=False)
+    settings = config(estimator={"initial_pose": tuple(world.truth(START_NS))})
+    result = run(bag, tmp_path / "map.yaml", settings, "online")
+    assert result.modes[-1] is Mode.DEAD_RECKONING
+    assert errors(result).max() < 0.15
+
+
+def test_without_a_map_landmarks_are_estimated_and_returned(tmp_path):
+    truth = beacons()
+    world = World(truth, seconds=19.0)
+    result = run(write_world(tmp_path, world), None, config(), "batch")
+    assert set(result.landmarks.landmarks) == set(truth.landmarks)
+    start = world.truth(int(result.trajectory.stamps_ns[0]))
+    for number, landmark in result.landmarks.landmarks.items():
+        expected = se2.between(start, (*truth.landmarks[number].position[:2], 0.0))[:2]
+        error = landmark.position[:2] - expected
+        assert error @ np.linalg.solve(landmark.cov, error) < 20.0
+        assert np.hypot(*error) < 0.15
+
+
+def test_progress_and_steps_are_told(tmp_path):
+    bag = write_world(tmp_path, World(beacons(), seconds=4.0))
+    told, steps = [], []
+    result = run(
+        bag,
+        tmp_path / "map.yaml",
+        config(),
+        "online",
+        progress=lambda done, length: told.append((done, length)),
+        on_step=lambda step, estimate: steps.append(estimate),
+    )
+    assert told[-1] == pytest.approx((3.95, 3.95), abs=0.06)
+    assert [e for e, _ in told] == sorted(e for e, _ in told)
+    assert sum(e is not None for e in steps) == len(result.trajectory)
+
+
+def test_a_paced_replay_takes_its_time(tmp_path):
+    bag = write_world(tmp_path, World(beacons(), seconds=2.0))
+    paced = run(bag, tmp_path / "map.yaml", config(), "online", pace=2.0)
+    free = run(bag, tmp_path / "map.yaml", config(), "online")
+    assert 0.9 < paced.wall_s < 3.0
+    assert np.array_equal(paced.trajectory.poses, free.trajectory.poses)
+
+
+@pytest.mark.parametrize("mode", ["online", "batch"])
+def test_fault_15_a_bag_whose_clock_is_set_back_still_gives_a_trajectory_in_order_of_time(tmp_path, mode):
+    """The stamps of the second drive come again: of two poses at one time the later word holds."""
+    first = World(beacons(), seconds=6.0)
+    second = World(beacons(), seed=1, seconds=5.0, start_ns=START_NS + 3 * 10**9, start_s=9.0)
+    bag = write_world(tmp_path, first, second)
+    result = run(bag, tmp_path / "map.yaml", config(), mode)
+    assert (np.diff(result.trajectory.stamps_ns) > 0).all()
+    assert any("he clock jumped back by" in note for note in result.notes)
+    late = result.trajectory.stamps_ns > START_NS + 4 * 10**9
+    truth = [second.truth(int(s)) for s in result.trajectory.stamps_ns[late]]
+    assert np.hypot(*(result.trajectory.poses[late] - np.array(truth))[:, :2].T).mean() < 0.05
+    assert len(result.modes) == len(result.trajectory) == len(result.trajectory.covs)
+
+
+def test_find_beside_looks_in_the_folder_and_in_the_one_that_holds_it(tmp_path):
+    bag = tmp_path / "run" / "bag"
+    bag.mkdir(parents=True)
+    file = bag / "bag_0.mcap"
+    file.touch()
+    assert find_beside(bag, "map.yaml") is None
+    (tmp_path / "run" / "map.yaml").touch()
+    assert find_beside(bag, "map.yaml") == tmp_path / "run" / "map.yaml"
+    assert find_beside(file, "map.yaml") == tmp_path / "run" / "map.yaml"
+    (bag / "map.yaml").touch()
+    assert find_beside(bag, "map.yaml") == bag / "map.yaml"
+    assert find_beside(file, "map.yaml") == bag / "map.yaml"
