@@ -2,6 +2,7 @@
 
 import csv
 import json
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli
+from fgloc.ablation.failures import AnyFailure
 from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
 from fgloc.ablation.report import write_report
 from fgloc.ablation.suite import Cell, Suite, expand, load_suite
@@ -154,6 +156,15 @@ def test_command_writes_the_report_and_repeats_it(tmp_path):
     broken = CliRunner().invoke(cli.app, ["ablate", str(tmp_path / "nowhere.yaml"), "--out", str(out)])
     assert broken.exit_code == 1
     assert broken.stderr.startswith("error: ")
+
+
+def test_document_names_every_failure_and_its_suite_loads(tmp_path):
+    text = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
+    (tmp_path / "suite.yaml").write_text(text.split("```yaml\n")[1].split("```")[0])
+    assert len(load_suite(tmp_path / "suite.yaml").variants) == 3
+    kinds = [c.model_fields["kind"].default for c in typing.get_args(typing.get_args(AnyFailure)[0])]
+    assert len(kinds) > 20
+    assert not [kind for kind in kinds if f"`{kind}`" not in text]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "ablations").glob("*.yaml")), ids=lambda path: path.stem)

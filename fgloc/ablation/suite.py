@@ -23,6 +23,7 @@ class RecordingEntry(Section):
     bag: Path
     map: Path | None = None
     config: Path | None = None
+    settings: dict[str, Any] = Field({}, description="what differs from its configuration, for all variants")
 
 
 class Variant(Section):
@@ -161,7 +162,7 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
             variant=variant.name,
             bag=bag,
             map=map_file,
-            config=_varied(base, variant, folder),
+            config=_varied(base, entry, variant, folder),
             mode=variant.mode or suite.mode,
             start=variant.start,
         )
@@ -172,17 +173,19 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
     return cells
 
 
-def _varied(base: Config, variant: Variant, folder: Path) -> Config:
-    content = _merged(base.model_dump(), variant.config)
+def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path) -> Config:
+    content = _merged(_merged(base.model_dump(), entry.settings), variant.config)
     for section, key in (("camera", "file"), ("motion", "model")):
-        value = variant.config.get(section, {}).get(key)
-        if isinstance(value, str):
-            content[section][key] = folder / value
+        part = content[section]
+        if isinstance(part, dict) and isinstance(part.get(key), str):  # of the suite; the base's are paths already
+            content[section] = part | {key: folder / part[key]}
     try:
         return Config.model_validate(content)
     except ValidationError as error:
         lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()]
-        raise ConfigError(f"variant '{variant.name}': wrong configuration\n" + "\n".join(lines)) from error
+        raise ConfigError(
+            f"variant '{variant.name}' of recording '{entry.name}': wrong configuration\n" + "\n".join(lines)
+        ) from error
 
 
 def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -148,7 +148,7 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     else:
         change = f"does not harm '{variant}': its mean error goes from {before:.3g} to {after:.3g} mm"
     more = np.array([b - a for a, b in pairs])
-    spread = f" (change {more.mean():+.3g} ± {more.std(ddof=1):.2g} mm)" if len(more) > 1 else ""
+    spread = f" (change {more.mean():+.3g} ± {more.std(ddof=1):.3g} mm)" if len(more) > 1 else ""
     return f"{name}{at} {change} over {len(pairs)} run{'s' if len(pairs) > 1 else ''}{spread}{lost}."
 
 
