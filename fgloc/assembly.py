@@ -77,8 +77,8 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
     camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(recording, config, first, notes)
-    if landmark_map is None and config.estimator.kind != "isam2":
-        config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
+    if resolved(config, map_path) != config:
+        config = resolved(config, map_path)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
@@ -112,6 +112,13 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all),
         notes=tuple(notes),
     )
+
+
+def resolved(config: Config, map_path: Path | None) -> Config:
+    """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
+    if map_path is not None or config.estimator.kind == "isam2":
+        return config
+    return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
 
 
 def _first_events(recording: Recording) -> dict[type[Event], Event]:

@@ -242,13 +242,15 @@ def _localise(
 ) -> tuple[RunResult, Metrics]:
     """Run one recording and write its results."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
+    from fgloc.assembly import resolved
     from fgloc.evaluation.report import write_results
     from fgloc.recording.outputs import sha256_of
     from fgloc.runner import find_beside, run
 
-    config = _config(bag, config_file, model)
+    map_path = map_file or find_beside(bag, "map.yaml")
+    config = resolved(_config(bag, config_file, model), map_path)
     with _progress(mode) as progress:
-        result = run(bag, map_file or find_beside(bag, "map.yaml"), config, mode, progress, pace)
+        result = run(bag, map_path, config, mode, progress, pace)
     return result, write_results(result, config, out, command, sha256_of(bag))
 
 
