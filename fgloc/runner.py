@@ -182,10 +182,18 @@ class _Replay:
     def truth(self, config: TruthConfig) -> Trajectory | None:
         """The truth of the base as a planar trajectory with increasing stamps; None if there is none."""
         T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
-        rows = {
-            e.stamp_ns: se2.compose((e.position[0], e.position[1], quaternion_yaw(e.orientation)), T_body_base)
-            for e in self._truth
-        }
+        back_ns = round(self._parts.config.gate.clock_back_s * 1e9)
+        rows: dict[int, FloatArray] = {}
+        newest = set_back = 0
+        for e in self._truth:
+            if e.stamp_ns >= newest - back_ns:
+                newest, set_back = max(newest, e.stamp_ns), 0
+            elif set_back:  # twice running: no stray stamp, the clock was set back; the later pass is kept
+                rows = {stamp: pose for stamp, pose in rows.items() if stamp <= set_back}
+                newest, set_back = e.stamp_ns, 0
+            else:
+                set_back = e.stamp_ns
+            rows[e.stamp_ns] = se2.compose((*e.position[:2], quaternion_yaw(e.orientation)), T_body_base)
         if len(rows) < 2:
             return None
         stamps = np.array(sorted(rows), dtype=np.int64)

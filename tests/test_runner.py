@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from fgloc import se2
 from fgloc.errors import EstimatorError
 from fgloc.recording.outputs import write_tum
 from fgloc.runner import find_beside, run
-from fgloc.types import Mode, RunResult
+from fgloc.types import Mode, RunResult, TruthEvent
 
 
 def errors(result: RunResult) -> np.ndarray:
@@ -140,6 +141,32 @@ def test_fault_15_a_bag_whose_clock_is_set_back_still_gives_a_trajectory_in_orde
     truth = [second.truth(int(s)) for s in result.trajectory.stamps_ns[late]]
     assert np.hypot(*(result.trajectory.poses[late] - np.array(truth))[:, :2].T).mean() < 0.05
     assert len(result.modes) == len(result.trajectory) == len(result.trajectory.covs)
+    assert errors(result).mean() < 0.05
+    known = [
+        (stamp, pose)
+        for stamp, pose in zip(result.truth.stamps_ns, result.truth.poses, strict=True)
+        if stamp > START_NS
+    ]
+    assert len(known) == 8 * 20 - 1
+    for stamp, pose in known:
+        world = first if stamp < second.start_ns else second
+        assert np.allclose(se2.between(pose, world.truth(int(stamp))), 0.0, atol=1e-6)
+
+
+def test_a_single_stray_stamp_of_the_truth_costs_nothing(tmp_path):
+    bag = write_world(tmp_path, World(beacons(), seconds=5.0))
+
+    def one_stray(events):
+        for k, event in enumerate(events):
+            if isinstance(event, TruthEvent) and k >= 150 and not strayed:
+                strayed.append(event.stamp_ns)
+                event = replace(event, stamp_ns=event.stamp_ns - 2 * 10**9 - 7)
+            yield event
+
+    strayed: list[int] = []
+    result = run(bag, tmp_path / "map.yaml", config(), "online", events=one_stray)
+    assert len(strayed) == 1
+    assert len(result.truth) == 100
 
 
 def test_find_beside_looks_in_the_folder_and_in_the_one_that_holds_it(tmp_path):
