@@ -116,6 +116,22 @@ def test_ensemble_is_trained_from_different_seeds_and_calibrated_as_one(runs: di
     assert 0.1 < learned.nis_over_3 < 4.0
 
 
+def test_cross_calibration_hears_every_recording_but_the_tested(runs: dict[str, Run], tmp_path: Path) -> None:
+    base = tiny_config("displacement", list(runs))
+    short = base.optimization.model_copy(update=dict(iterations=60, variance_iterations=20))
+    plain = base.model_copy(update=dict(optimization=short))
+    crossed = plain.model_copy(update=dict(calibration=base.calibration.model_copy(update=dict(cross=True))))
+    split = training.leave_one_out(list(runs))[0]
+    path = tmp_path / "model.safetensors"
+    alone = training.train(plain, split, runs, path, "a test")
+    weights = read_model(path)[0]
+    together = training.train(crossed, split, runs, path, "a test")
+    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
+    for name, tensor in read_model(path)[0].items():
+        np.testing.assert_array_equal(tensor, weights[name])
+    assert together.variance_scale != alone.variance_scale
+
+
 def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for seed in range(3):
         write_bag(tmp_path / f"run{seed}" / "bag", seed, 45.0)

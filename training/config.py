@@ -67,6 +67,11 @@ class OptimizationConfig(Section):
 class CalibrationConfig(Section):
     """Scaling of the covariances on the held-out recording."""
 
+    cross: bool = Field(
+        False,
+        description="also calibrate on each training recording, by a model that left it out: where recordings differ "
+        "as robots do, one alone says little of the next",
+    )
     horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
     short_s: float = Field(
         1.0, gt=0, description="windows that, beside the horizons', tell slow errors from white ones"

@@ -19,15 +19,15 @@ from tqdm import tqdm
 
 from fgloc.errors import FglocError
 from fgloc.motion.card import ModelCard, Split
-from fgloc.motion.load import load_model, read_model, save_model
+from fgloc.motion.load import Tensors, load_model, read_model, save_model
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
-from training.config import NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
+from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
 from training.losses import composed_nll, end_errors, rollout_loss
 from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, relative
-from training.rollouts import roll_kinematics, roll_model
+from training.rollouts import Rollout, roll_kinematics, roll_model
 
 _VALIDATION_S = (10.0, 30.0)
 _SEEDS_APART = 1_000  # between the members of an ensemble
@@ -39,20 +39,51 @@ def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, m
 
     Without validation recordings the training runs its full length and the covariance stays uncalibrated.
     """
+    validation = [runs[name] for name in split.validation]
+    tensors, card = train_uncalibrated(config, split, runs, path, made_by)
+    if not validation:
+        return card
+    held_out = held_out_rollouts(path, card, validation)
+    if config.calibration.cross:
+        held_out += cross_rollouts(config, split, runs, path, made_by)
+    card = calibrate(card, held_out, config.calibration)
+    tested = [runs[name] for name in split.test] or validation
+    save_model(path, tensors, card)
+    card = card.model_copy(update={"figures": card_figures([roll_model(load_model(path), r, STEP_S) for r in tested])})
+    save_model(path, tensors, card)
+    return card
+
+
+def train_uncalibrated(
+    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str
+) -> tuple[Tensors, ModelCard]:
+    """Train all members and write them with a card that knows no calibration yet."""
     training = [runs[name] for name in split.train]
     validation = [runs[name] for name in split.validation]
     nets = [train_member(config, training, validation, member) for member in range(config.network.members)]
     tensors, card = tensors_of(nets), card_of(nets[0], config, split, made_by)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_model(path, tensors, card)
-    if not validation:
-        return card
-    card = calibrate(path, card, validation, config)
-    tested = [runs[name] for name in split.test] or validation
-    save_model(path, tensors, card)
-    card = card.model_copy(update={"figures": card_figures([roll_model(load_model(path), r, STEP_S) for r in tested])})
-    save_model(path, tensors, card)
-    return card
+    return tensors, card
+
+
+def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tuple[Rollout, Rollout]]:
+    """Of the model and of its kinematics alone, over each run."""
+    model = load_model(path)
+    return [(roll_model(model, run, card.dt_s), roll_kinematics(card.kinematics, run, card.dt_s)) for run in runs]
+
+
+def cross_rollouts(
+    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str
+) -> list[tuple[Rollout, Rollout]]:
+    """Over each training recording, by a model that left it out. These models are not kept."""
+    found, scratch = [], path.with_name(path.name + ".fold")
+    for name in split.train:
+        fold = split.model_copy(update={"train": tuple(n for n in split.train if n != name)})
+        _, card = train_uncalibrated(config, fold, runs, scratch, made_by)
+        found += held_out_rollouts(scratch, card, [runs[name]])
+        scratch.unlink()
+    return found
 
 
 def train_member(config: TrainConfig, training: list[Run], validation: list[Run], member: int) -> MotionNet:
@@ -163,24 +194,21 @@ def train_variance(
         net.variance_head.load_state_dict(best_state)
 
 
-def calibrate(path: Path, card: ModelCard, runs: list[Run], config: TrainConfig) -> ModelCard:
-    """The card with covariances that hold on these recordings, and their correlation with the wheels' stand-in."""
-    calibration = config.calibration
-    model = load_model(path)
-    rollouts = [roll_model(model, run, card.dt_s) for run in runs]
+def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: CalibrationConfig) -> ModelCard:
+    """The card with covariances that hold on these rollouts, and their correlation with the wheels' stand-in."""
+    rollouts, wheels = [learned for learned, _ in held_out], [kinematics for _, kinematics in held_out]
     if card.kind == "velocity":
-        noise = fit_noise(rollouts, calibration)
+        noise = fit_noise(rollouts, config)
         card = card.model_copy(update={"noise": noise})
         rollouts = [replace(r, covs=noise_covs(r, noise)) for r in rollouts]
     else:
-        scale, memory = fit_variance(rollouts, calibration)
+        scale, memory = fit_variance(rollouts, config)
         card = card.model_copy(update={"variance_scale": scale, "memory": memory})
         factors = np.sqrt(scale)
         rollouts = [replace(r, covs=r.covs * np.outer(factors, factors), memory=memory) for r in rollouts]
-    wheels = [roll_kinematics(card.kinematics, run, card.dt_s) for run in runs]
-    wheels_noise = fit_noise(wheels, calibration)
+    wheels_noise = fit_noise(wheels, config)
     wheels = [replace(r, covs=noise_covs(r, wheels_noise)) for r in wheels]
-    return card.model_copy(update={"wheels_noise": wheels_noise, "joint": fit_joint(rollouts, wheels, calibration)})
+    return card.model_copy(update={"wheels_noise": wheels_noise, "joint": fit_joint(rollouts, wheels, config)})
 
 
 def leave_one_out(names: list[str]) -> list[Split]:
