@@ -106,7 +106,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
                 n_workers=workers,
                 threads_per_worker=1,  # GTSAM holds Python's lock
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # any free port: several sweeps may run side by side
                 memory_limit=None,
                 silence_logs="ERROR",
             ) as cluster,

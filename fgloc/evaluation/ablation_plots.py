@@ -76,9 +76,10 @@ def plot_tracks(plots: Sequence[Tracks]) -> Figure:
 
 
 def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    rows = math.ceil(count / _COLUMNS)
-    figure = Figure(figsize=(_WIDTH, height * rows + 0.4), dpi=110, layout="constrained")
-    axes = [figure.add_subplot(rows, _COLUMNS, k + 1) for k in range(count)]
+    columns = min(_COLUMNS, count)
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(_WIDTH * columns / _COLUMNS, height * rows + 0.4), dpi=110, layout="constrained")
+    axes = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
     for ax in axes:
         ax.tick_params(labelsize=8)
         ax.spines[["top", "right"]].set_visible(False)
