@@ -7,9 +7,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
+import psutil
 import pytest
 import yaml
 
@@ -168,6 +170,39 @@ def test_job_that_cannot_run_is_quarantined_and_listed(folder, tmp_path):
     assert len(attempts(tmp_path)) == 1  # left alone
     sweep(jobs, tmp_path, workers=1, retry=True)
     assert len(attempts(tmp_path)) == 2
+
+
+@pytest.mark.slow
+def test_job_that_kills_its_workers_is_quarantined_and_the_others_finish(folder, tmp_path):
+    """The worker is killed each time it begins one certain job, as a crash in native code would do."""
+    write_circle(tmp_path, seconds=60.0)  # long enough to be killed in
+    (tmp_path / "suite.yaml").write_text(yaml.safe_dump(SUITE | {"failures": SUITE["failures"][1:]}))
+    jobs = make_jobs(expand(load_suite(tmp_path / "suite.yaml"), tmp_path))
+    poison, out = jobs[1].key, tmp_path / "out"
+    over, kills = threading.Event(), []
+
+    def kill_whenever_it_begins():
+        while not over.is_set():
+            begun = [key for key, _ in attempts(out)].count(poison)
+            if begun > len(kills):
+                workers = [c for c in psutil.Process().children(True) if any("spawn_main" in a for a in c.cmdline())]
+                kills.append(len(workers))
+                for worker in workers:
+                    worker.kill()
+            time.sleep(0.005)
+
+    thread = threading.Thread(target=kill_whenever_it_begins)
+    thread.start()
+    try:
+        records = sweep(jobs, out, workers=1)
+    finally:
+        over.set()
+        thread.join()
+    assert kills == [1] * 4
+    assert records[poison].outcome == "crashed"
+    assert "its worker died 4 times" in records[poison].error
+    assert all(r.outcome == "done" for key, r in records.items() if key != poison)
+    assert sweep(jobs, out) == records  # left alone
 
 
 def test_half_written_record_does_not_count(folder, tmp_path):
