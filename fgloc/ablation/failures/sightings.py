@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
@@ -48,9 +49,9 @@ class SightingFailure(EventFailure):
 
         return change
 
+    @abstractmethod
     def alter(self, scene: Scene) -> Callable[[Sighting], Sighting | None]:
         """What happens to one sighting (None: hidden), with the state of one run."""
-        raise NotImplementedError
 
 
 class SightingNoise(SightingFailure):
