@@ -234,7 +234,7 @@ class Localizer:
         """After many refusals without one belief in between, look for the robot anywhere on the map."""
         if believed:
             self._lost = False
-        elif self.weights.refused_in_a_row >= self.config.estimator.lost_after and self.factors.known:
+        elif self.factors.known and self.weights.contradicted():
             self._get_lost()
 
     def _nowhere(self) -> bool:
@@ -247,7 +247,7 @@ class Localizer:
 
     def _get_lost(self) -> None:
         self._lost = True
-        self.weights.refused_in_a_row = 0
+        self.weights.forget_refusals()
         self._initializer.reset()
 
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:

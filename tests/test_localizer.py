@@ -53,8 +53,8 @@ def seconds(estimate) -> float:
 
 @pytest.mark.parametrize(("kind", "bound_m"), [("corners", 0.006), ("beacons", 0.025)])
 def test_a_drive_is_followed_closely(kind, bound_m):
-    for seed in range(3):
-        world, chain, estimates = drive(kind, seed=seed)
+    for seed in range(2):
+        world, chain, estimates = drive(kind, seed=seed, seconds=12.0)
         assert len(estimates) == chain.steps
         assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < bound_m
         assert modes(estimates) == [Mode.OK]
@@ -119,11 +119,11 @@ def test_an_unknown_map_is_estimated_up_to_the_first_pose():
 @pytest.mark.parametrize("kind", MAPS)
 def test_fault_13_late_sightings_are_fused_at_their_own_time(kind):
     sizes = []
-    for seed in range(4):
-        world, chain, estimates = drive(kind, seed=seed, late_s=0.3)
+    for seed in range(3):
+        world, chain, estimates = drive(kind, seed=seed, seconds=14.0, late_s=0.3)
         errors = [position_error(e, world.truth(e.stamp_ns)) for e in estimates]
         assert np.mean(errors) < 0.05  # taken as made on arrival they would be 0.12 m off
-        assert chain.localizer.counts["corners"] + chain.localizer.counts["range_bearing"] > 300
+        assert chain.localizer.counts["corners"] + chain.localizer.counts["range_bearing"] > 200
         sizes.append(np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates]) / 3)
     assert np.mean(sizes) < 3.0
 
@@ -203,12 +203,12 @@ def test_fault_33_a_network_that_returns_nan_leaves_the_wheels(tmp_path):
     tensors["layer0.weight"][:] = 3e38  # finite in the file, not in what it predicts
     save_model(tmp_path / "wild.safetensors", tensors, card)
     learned = LearnedMotion(load_model(tmp_path / "wild.safetensors"), MotionConfig())
-    world = World(room())
+    world = World(room(), seconds=6.0)
     with_nan, without = Chain(config(), room(), learned), Chain(config(), room())
     a, b = with_nan.run(world.events()), without.run(world.events())
     assert np.array_equal([e.pose for e in a], [e.pose for e in b])
     assert with_nan.localizer.counts["learned"] == 0
-    assert learned.rejections["learned.non_finite"] > 190
+    assert learned.rejections["learned.non_finite"] > 55
 
 
 def shift(landmark, dx: float, dy: float):
@@ -247,6 +247,25 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     believed = [d for e in estimates for d in e.decisions if d.landmark_id == 2 and not d.reason]
     assert len(believed) <= 2  # before the first pose nothing tells it from the others; the kernel holds it down
     assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < 0.006
+
+
+def test_fault_51_a_moved_marker_alone_in_view_does_not_carry_the_robot_away():
+    """However often it is seen: that one landmark disagrees says more of the landmark than of the robot."""
+    world_map = room()
+    moved = LandmarkMap({12: shift(world_map.landmarks[12], 0.3, 0.3)})
+    early, late = World(world_map, seconds=6.0), World(world_map, seconds=20.0, shown=moved)
+    events = [e for e in early.events() if e.stamp_ns < START_NS + 6 * 10**9]
+    events += [e for e in late.events() if e.stamp_ns >= START_NS + 6 * 10**9]
+    chain = Chain(config(), world_map)
+    estimates = chain.run(events)
+    refused = [e.stamp_ns for e in estimates for d in e.decisions if d.landmark_id == 12 and d.reason]
+    assert len(refused) > config().estimator.lost_after + 10
+    assert modes(estimates) == [Mode.OK, Mode.DEAD_RECKONING]
+    assert chain.localizer.counts["prior"] == 1
+    for e in estimates:
+        assert position_error(e, late.truth(e.stamp_ns)) < max(
+            0.02, 3.5 * math.sqrt(max(np.linalg.eigvalsh(e.cov[:2, :2])))
+        )
 
 
 @pytest.mark.parametrize("initial", [None, tuple(truth_at(0.0))])

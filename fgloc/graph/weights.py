@@ -51,6 +51,7 @@ class Weights:
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
         self.refused_in_a_row = 0
+        self._refused_ids: set[int] = set()
 
     def weigh(
         self,
@@ -92,9 +93,10 @@ class Weights:
                 )
             )
         if believed:
-            self.refused_in_a_row = 0
+            self.forget_refusals()
         else:
             self.refused_in_a_row += len(refused)
+            self._refused_ids.update(s.measurement.landmark_id for s in refused)
         return believed, refused, decisions
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
@@ -156,7 +158,19 @@ class Weights:
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
+        self.forget_refusals()
+
+    def contradicted(self) -> bool:
+        """Whether so much was refused, and so little believed, that the robot must be elsewhere.
+
+        One landmark alone does not say so, however often it is seen: it may have been moved.
+        """
+        return self.refused_in_a_row >= self._config.estimator.lost_after and len(self._refused_ids) > 1
+
+    def forget_refusals(self) -> None:
+        """Count refusals anew."""
         self.refused_in_a_row = 0
+        self._refused_ids.clear()
 
     def _cauchy(self, m: LandmarkMeasurement) -> float:
         section = self._config.markers if isinstance(m, CornerMeasurement) else self._config.landmarks
