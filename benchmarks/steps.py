@@ -49,7 +49,7 @@ from fgloc.types import (
 _ROOT = Path(__file__).resolve().parent.parent
 _SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
 _MODEL = _ROOT / "fgloc" / "motion" / "models" / "mrclam" / "all.safetensors"
-_WALL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker that faces -x
+_WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker that faces -x
 _T_BASE_CAM = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]])
 _K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
 _TICK_NS = 10_000_000  # 100 Hz
