@@ -10,13 +10,12 @@ from typing import Literal
 
 import numpy as np
 
-from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config, TruthConfig
 from fgloc.errors import EstimatorError
-from fgloc.frames import quaternion_yaw
 from fgloc.hints import image_hints
 from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import base_pose
 from fgloc.sensors.markers import detect_stream
 from fgloc.smoothing import smooth_run
 from fgloc.types import (
@@ -181,7 +180,6 @@ class _Replay:
 
     def truth(self, config: TruthConfig) -> Trajectory | None:
         """The truth of the base as a planar trajectory with increasing stamps; None if there is none."""
-        T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
         back_ns = round(self._parts.config.gate.clock_back_s * 1e9)
         rows: dict[int, FloatArray] = {}
         newest = set_back = 0
@@ -193,7 +191,7 @@ class _Replay:
                 newest, set_back = e.stamp_ns, 0
             else:
                 set_back = e.stamp_ns
-            rows[e.stamp_ns] = se2.compose((*e.position[:2], quaternion_yaw(e.orientation)), T_body_base)
+            rows[e.stamp_ns] = base_pose(e, config)
         if len(rows) < 2:
             return None
         stamps = np.array(sorted(rows), dtype=np.int64)

@@ -14,9 +14,9 @@ from scipy.signal import savgol_filter
 
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError
-from fgloc.frames import quaternion_yaw
 from fgloc.motion.commands import CommandTrack
 from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import base_pose
 from fgloc.types import CommandEvent, FloatArray, TruthEvent
 from training.config import DataConfig
 
@@ -73,8 +73,7 @@ def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataC
     for kind, events in (("commands", commands), ("truth", truth)):
         if len(events) < 2:
             raise RecordingError(f"{path}: {len(events)} messages of {kind}; identification needs commands and truth")
-    rows = np.array([(e.position[0], e.position[1], quaternion_yaw(e.orientation)) for e in truth])
-    rows[:, 2] -= settings.truth.yaw_offset_rad
+    rows = np.array([base_pose(e, settings.truth) for e in truth])
     return make_run(name, commands, np.array([e.stamp_ns for e in truth]), rows, dt_s, history_s, config)
 
 
