@@ -1,4 +1,4 @@
-"""Frame names, and the one place that reorders ROS and GTSAM covariances and flattens 3D poses to the plane."""
+"""Names of the base frame, rotations, and the flattening of 3D poses to the plane."""
 
 from __future__ import annotations
 
@@ -10,21 +10,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-MAP, ODOM, BASE, CAM, MARKER = "map", "odom", "base", "cam", "marker"
-
 BASE_NAMES = ("base_link", "base_footprint", "base")  # what robots call our "base", first match wins
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z in ROS order
-_ROS_TO_GTSAM = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
-
-
-def planar_cov(cov_ros: FloatArray) -> FloatArray:
-    """x, y, yaw block ``(3, 3)`` of a ROS pose or twist covariance ``(6, 6)``."""
-    return cov_ros[_PLANAR].copy()
-
-
-def ros_to_gtsam_cov(cov_ros: FloatArray) -> FloatArray:
-    """Reorder ``(6, 6)`` from translation, rotation (ROS) to rotation, translation (GTSAM Pose3); its own inverse."""
-    return cov_ros[_ROS_TO_GTSAM].copy()
 
 
 def quaternion_yaw(quaternion: Sequence[float] | FloatArray) -> float:

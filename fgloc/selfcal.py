@@ -111,8 +111,8 @@ def calibration_gradient(
     sightings: Sequence[RangeBearingMeasurement],
     landmark_map: LandmarkMap,
     cauchy_k: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Gradient ``(2,)`` of the robust cost ``½ Σ ρ`` with respect to the calibration, poses fixed, and its curvature.
+) -> FloatArray:
+    """Gradient ``(2,)`` of the robust cost ``½ Σ ρ`` with respect to the calibration, poses fixed.
 
     Args:
         poses: base pose of each sighting.
@@ -121,9 +121,9 @@ def calibration_gradient(
         cauchy_k: Cauchy constant of the kernel.
 
     Returns:
-        Gradient ``(2,)`` and Gauss–Newton Hessian ``(2, 2)`` in log scale and bearing offset.
+        Derivatives by log scale and bearing offset.
     """
-    gradient, hessian = np.zeros(2), np.zeros((2, 2))
+    gradient = np.zeros(2)
     for pose, m in zip(poses, sightings, strict=True):
         landmark = landmark_map.landmarks[m.landmark_id].position
         x, y, _ = se2.compose(se2.inverse(pose), (landmark[0], landmark[1], 0.0))
@@ -132,5 +132,4 @@ def calibration_gradient(
         J = np.array([[0.0, -1.0], [m.range_m, 0.0]])
         weight = 1.0 / (1.0 + float(difference @ information @ difference) / cauchy_k**2)
         gradient += weight * J.T @ information @ difference
-        hessian += weight * J.T @ information @ J
-    return gradient, hessian
+    return gradient

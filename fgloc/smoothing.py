@@ -130,7 +130,7 @@ def refine(solver: BatchSmoother, landmark_map: LandmarkMap, config: LandmarksCo
                 if isinstance(sighting.measurement, RangeBearingMeasurement):
                     poses.append(pose)
                     seen.append(sighting.measurement)
-        partial, _ = calibration_gradient(poses, seen, landmark_map, config.cauchy_k)
+        partial = calibration_gradient(poses, seen, landmark_map, config.cauchy_k)
         return np.asarray(partial[free] + information @ value[free])
 
     # 1. Every sighting was corrected by what was known when it was made: take the last word for all

@@ -312,7 +312,6 @@ class MarkerPoseMeasurement:
 
 
 LandmarkMeasurement = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
-Measurement = MotionMeasurement | LandmarkMeasurement
 
 
 # --- Results ----------------------------------------------------------------------------------------------------------
