@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from fgloc.errors import ConfigError
 
@@ -117,6 +117,16 @@ class WheelsConfig(Section):
     noise: NoiseDensity = NoiseDensity()
 
 
+class GyroConfig(Section):
+    """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
+
+    use: bool = True
+    yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
+    scale_sigma: float = Field(0.003, ge=0, description="of the rate's scale: rad per rad turned")
+    bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
+    bias_walk: float = Field(0.0003, ge=0, description="rad/s/√s")
+
+
 class CameraConfig(Section):
     """The camera, where the recording does not say."""
 
@@ -195,6 +205,31 @@ class EstimatorConfig(Section):
     dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
 
 
+class Distrust(Section):
+    """A time in which a motion source is known to be wrong."""
+
+    source: Literal["wheels", "learned", "gyro"]
+    start_s: float = Field(description="since the first step of the run")
+    end_s: float
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Distrust:
+        if not self.end_s > self.start_s:
+            raise ValueError(f"end_s is {self.end_s}, expected more than start_s, {self.start_s}")
+        return self
+
+
+class WeightsConfig(Section):
+    """How the weights of motion and landmark factors follow what the sources say of one another."""
+
+    adaptive: bool = Field(True, description="false: covariances stay as they were made; sightings are still gated")
+    distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")
+    window_s: float = Field(2.0, gt=0, description="the motion sources are compared over windows of up to this long")
+    alarm: float = Field(30.0, gt=0, description="squared Mahalanobis distance of two sources that flags a disagreement")
+    release_s: float = Field(0.6, gt=0, description="agreement for this long ends it")
+    quarantine_after: int = Field(6, gt=0, description="refusals in excess of what is believed that quarantine a marker")
+
+
 class BatchConfig(Section):
     """The batch smoother."""
 
@@ -218,11 +253,13 @@ class Config(Section):
     gate: GateConfig = GateConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     wheels: WheelsConfig = WheelsConfig()
+    gyro: GyroConfig = GyroConfig()
     camera: CameraConfig = CameraConfig()
     markers: MarkersConfig = MarkersConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     motion: MotionConfig = MotionConfig()
     estimator: EstimatorConfig = EstimatorConfig()
+    weights: WeightsConfig = WeightsConfig()
     batch: BatchConfig = BatchConfig()
     truth: TruthConfig = TruthConfig()
 
