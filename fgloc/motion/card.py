@@ -15,6 +15,8 @@ VERSION = 1
 
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix = tuple[Row, Row, Row]
+Input = Literal["commands", "velocity", "gyro", "effort", "wheels"]
+CHANNELS: dict[str, int] = {"gyro": 1, "effort": 2, "wheels": 2}  # of the measured inputs, in the network's order
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 
@@ -42,6 +44,16 @@ class Lag(Section):
 
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)]
     lag_s: tuple[Positive, Positive] = Field(description="time constants of v and ω")
+
+
+class WheelJoints(Section):
+    """Wheels whose angles or torques a model reads; the names are those of `fgloc.config.WheelsConfig`."""
+
+    left: str | None = Field(None, description="joint of the left wheel; None: the one named so")
+    right: str | None = None
+    left_radius: Positive
+    right_radius: Positive
+    track: Positive
 
 
 class ErrorMemory(Section):
@@ -86,15 +98,16 @@ class ModelCard(Section):
     """Everything but the weights.
 
     A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later; a ``displacement`` model maps the mean
-    commands of the age bins ``edges_s`` (and, if ``inputs`` says so, the velocity's innovation) to a residual twist on
-    the calibrated kinematics and three log-variances.
+    commands of the age bins ``edges_s`` and whatever else ``inputs`` names (means of measured signals over the sub-step
+    and over ages before it, the velocity's innovation) to a residual twist on the best known kinematics and three
+    log-variances.
     """
 
     format: Literal["fgloc-motion"] = "fgloc-motion"
     version: Literal[1] = 1
     kind: Literal["velocity", "displacement"]
     robot: str
-    inputs: tuple[Literal["commands", "velocity"], ...]
+    inputs: tuple[Input, ...]
     dt_s: Positive = Field(description="longest sub-step: a step is cut into equal parts no longer than this")
     hidden: tuple[Annotated[int, Field(gt=0, le=4096)], ...]
     members: Annotated[int, Field(ge=1, le=64)] = Field(1, description="displacement: networks that are averaged")
@@ -103,6 +116,12 @@ class ModelCard(Section):
     kinematics: Kinematics = Kinematics()
     lag: Lag | None = Field(None, description="velocity: the known part of the response")
     edges_s: tuple[FiniteFloat, ...] = Field((), description="displacement: limits of the age bins, youngest first")
+    joints: WheelJoints | None = Field(None, description="the wheels, for the inputs effort and wheels")
+    signal_edges_s: tuple[FiniteFloat, ...] = Field(
+        (0.0,),
+        description="displacement: limits of ages before a sub-step; measured signals are averaged over it and them",
+    )
+    wheel_kinematics: Kinematics = Field(Kinematics(), description="true over nominal wheel motion")
     velocity_decay_s: Positive = Field(0.3, description="displacement: time constant of the velocity's innovation")
     input_mean: tuple[FiniteFloat, ...]
     input_std: tuple[Positive, ...]
@@ -123,7 +142,18 @@ class ModelCard(Section):
         """Width of the network's input that this card implies."""
         if self.kind == "velocity":
             return 5
-        return 2 * (len(self.edges_s) - 1) + 2 * ("velocity" in self.inputs)
+        measured = len(self.signal_edges_s) * sum(CHANNELS[name] for name in self.measured)
+        return 2 * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Inputs that sensors measure during the step, in the network's order."""
+        return tuple(name for name in CHANNELS if name in self.inputs)
+
+    @property
+    def reads_wheels(self) -> bool:
+        """Whether the model reads the wheels' speed: then it cannot witness their slip."""
+        return "wheels" in self.inputs
 
     @property
     def n_outputs(self) -> int:
@@ -137,10 +167,16 @@ class ModelCard(Section):
             raise ValueError(f"a {self.kind} model needs the inputs {sorted(needed)}, the card lacks {sorted(missing)}")
         if self.kind == "displacement":
             _increasing(self.edges_s)
+            if self.signal_edges_s[:1] != (0.0,) or any(b <= a for a, b in pairwise(self.signal_edges_s)):
+                raise ValueError(f"signal_edges_s: expected ages that increase from 0, got {self.signal_edges_s}")
         elif self.members > 1:
             raise ValueError(f"a velocity model has one network, the card says {self.members}")
         elif self.noise is None or self.lag is None:
             raise ValueError("a velocity model needs a lag and the noise densities of its error; the card lacks one")
+        if self.joints is None and {"effort", "wheels"} & set(self.inputs):
+            raise ValueError("the inputs effort and wheels need the card's joints; it names none")
+        if self.kind == "velocity" and self.measured:
+            raise ValueError(f"a velocity model reads commands and velocity, not {', '.join(self.measured)}")
         n_scales = {"velocity": 2, "displacement": 3}[self.kind]
         for name, values, wanted in (
             ("input_mean", self.input_mean, self.n_inputs),

@@ -1,6 +1,6 @@
-"""Identified motion models: from commands to the motion of the base over a step, with covariance.
+"""What identified motion models have in common: from inputs to the motion of the base over a step, with covariance.
 
-Both forms cut a step into equal parts no longer than the card's ``dt_s`` and compose them, so that a step may last any
+All forms cut a step into equal parts no longer than the card's ``dt_s`` and compose them, so that a step may last any
 time and two halves give what the whole gives.
 """
 
@@ -18,12 +18,9 @@ from fgloc.errors import ModelError
 from fgloc.motion.card import Kinematics, ModelCard
 from fgloc.motion.commands import CommandTrack
 from fgloc.motion.joint import JointCalibration
-from fgloc.motion.network import Float32Array, Network
+from fgloc.motion.signals import Signals
 from fgloc.types import CommandEvent, FloatArray
 
-MIN_DENSITY = np.array([1e-3, 1e-3, 1e-3]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
-_MAX_LOG_VARIANCE = 10.0
-_DISAGREEMENT_S = 1.0  # members differ for about this long at a time: a rate of spread s has the density 2 s² times it
 _SMALL = 1e-9
 
 
@@ -43,7 +40,12 @@ class MotionModel(Protocol):
     joint: JointCalibration | None
 
     def predict(
-        self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
+        self,
+        commands: tuple[CommandEvent, ...],
+        start_ns: int,
+        end_ns: int,
+        velocity: FloatArray | None,
+        signals: Signals | None = None,
     ) -> MotionPrediction | None:
         """Motion over ``[start_ns, end_ns]``.
 
@@ -52,171 +54,23 @@ class MotionModel(Protocol):
             start_ns: start of the step.
             end_ns: its end.
             velocity: ``(2,)`` body velocity v, ω at the start, if known. None: what the commands before the start say.
+            signals: what was measured, if the model reads any of it.
 
         Returns:
             None if the network's output is not finite.
 
         Raises:
-            ModelError: there is no command, or the step has no length.
+            ModelError: there is no command, the step has no length, or a signal that the model reads is not given.
         """
         ...
 
 
-class VelocityModel:
-    """The paper's model: ``[v, ω]ₖ₊₁ = F(v, ω, u_v, u_ω, Δt)``, rolled out, kinematics known.
-
-    F is a first-order lag towards the calibrated commands plus Δt times a network, so that Δt may vary and the network
-    starts from what is known.
-
-    Source: paper eq. 9 and 10; the network's part in the rate form of eq. 6.
-    """
-
-    def __init__(self, card: ModelCard, network: Network) -> None:
-        """Take a checked card and its network."""
-        if card.noise is None or card.lag is None:
-            raise ModelError("a velocity model's card needs noise densities and a lag")
-        self.card = card
-        self.joint = _joint(card)
-        self._network = network
-        self._noise = card.noise
-        self._delay, self._lag = card.lag.delay_s, np.array(card.lag.lag_s)
-        self._scale = np.array(card.output_scale)
-        self._gains = _gains(card.kinematics)
-        self._track: CommandTrack | None = None
-
-    def predict(
-        self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
-    ) -> MotionPrediction | None:
-        """See `MotionModel.predict`."""
-        duration = _duration(commands, start_ns, end_ns)
-        track = self._track = _follow(self._track, commands)
-        start = (start_ns - track.origin_ns) * 1e-9
-        if velocity is None:
-            velocity = self._roll(track, start - self.card.history_s, self.card.history_s, np.zeros(2))[-1]
-        states = self._roll(track, start, duration, np.asarray(velocity, dtype=float))
-        if not np.isfinite(states).all():
-            return None
-        dt = duration / (len(states) - 1)
-        middles = 0.5 * (states[:-1] + states[1:])
-        twists = np.zeros((len(middles), 3))
-        twists[:, 0], twists[:, 2] = middles[:, 0] * dt, middles[:, 1] * dt
-        variances = np.array([noise_density(self._noise, v, omega) for v, omega in middles.tolist()]) * dt
-        return MotionPrediction(*_composed(twists, variances), states[-1])
-
-    def _roll(self, track: CommandTrack, start: float, duration: float, velocity: FloatArray) -> FloatArray:
-        """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
-        n = _sub_steps(duration, self.card.dt_s)
-        dt = duration / n
-        told = track.means(start - self._delay + dt * np.arange(n + 1, dtype=np.float64))
-        aims = (told @ self._gains)[:, ::2]
-        keep = np.exp(-dt / self._lag)
-        states = np.empty((n + 1, 2))
-        states[0] = velocity
-        x = np.empty((1, 5), dtype=np.float32)
-        x[0, 4] = dt
-        gain = dt * self._scale
-        for k in range(n):
-            x[0, :2] = states[k]
-            x[0, 2:4] = told[k]
-            states[k + 1] = aims[k] + keep * (states[k] - aims[k]) + gain * self._network(x)[0]
-        return states
-
-
-class DisplacementModel:
-    """A residual twist on calibrated kinematics, from the recent commands alone, with its own log-variance.
-
-    The twist at the middle of each sub-step follows from the mean commands of the card's age bins and, if the model was
-    trained with it, from the velocity's innovation (known minus predicted at the start, fading with
-    ``velocity_decay_s``); its integral is the displacement. Nothing is fed back, so errors do not feed themselves.
-    An ensemble answers with its mean, and doubts where its members differ.
-
-    Source: design.md §5.
-    """
-
-    def __init__(self, card: ModelCard, network: Network) -> None:
-        """Take a checked card and its network."""
-        self.card = card
-        self.joint = _joint(card)
-        self._network = network
-        self._scale = np.array(card.output_scale)
-        self._gains = _gains(card.kinematics)
-        self._ages = np.array(card.edges_s)
-        self._widths = np.diff(self._ages)
-        self._log_scale = np.log(card.variance_scale)
-        self._spread_gain = 2.0 * _DISAGREEMENT_S * np.array(card.variance_scale)
-        self._n_bins = 2 * len(self._widths)
-        self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
-        self._track: CommandTrack | None = None
-
-    def predict(
-        self, commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int, velocity: FloatArray | None
-    ) -> MotionPrediction | None:
-        """See `MotionModel.predict`."""
-        duration = _duration(commands, start_ns, end_ns)
-        track = self._track = _follow(self._track, commands)
-        n = _sub_steps(duration, self.card.dt_s)
-        dt = duration / n
-        base, x = self._inputs(track, (start_ns - track.origin_ns) * 1e-9, dt, n, velocity)
-        y = self._network(x).astype(np.float64)
-        if not np.isfinite(y).all():
-            return None
-        residuals, log_variances = y[..., :3], y[..., 3:]
-        log_variances += self._log_scale
-        np.minimum(log_variances, _MAX_LOG_VARIANCE, out=log_variances)
-        variances = np.exp(log_variances)
-        if self.card.members > 1:
-            spread = self._scale * residuals.std(axis=0)
-            residuals = residuals.mean(axis=0)
-            variances = variances.mean(axis=0) + self._spread_gain * spread**2
-        np.maximum(variances, MIN_DENSITY, out=variances)
-        twists = base + self._scale * residuals
-        return MotionPrediction(*_composed(twists * dt, variances * dt), twists[-1, ::2])
-
-    def _inputs(
-        self, track: CommandTrack, start: float, dt: float, n: int, velocity: FloatArray | None
-    ) -> tuple[FloatArray, Float32Array]:
-        """Twists ``(n, 3)`` of the calibrated kinematics and inputs ``(n, ·)`` of the network, one row a sub-step."""
-        plan = self._plans.get(n)
-        if plan is None:
-            plan = self._plans[n] = self._plan(n)
-        slope, offset, means_of = plan
-        means = means_of @ track.integrals(slope * dt + (offset + start)).T
-        base = means[:n] @ self._gains / dt
-        x = np.empty((n, self.card.n_inputs), dtype=np.float32)
-        x[:, : self._n_bins] = means[n:].reshape(n, -1)
-        if "velocity" in self.card.inputs:
-            innovation = np.zeros(2) if velocity is None else np.asarray(velocity) - base[0, ::2]
-            ages = dt * (np.arange(n) + 0.5)
-            x[:, self._n_bins :] = np.exp(-ages / self.card.velocity_decay_s)[:, None] * innovation
-        return base, x
-
-    def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How to ask a track once for all of n sub-steps.
-
-        Returns:
-            slope, offset: ``(m,)`` times to ask for are ``slope * dt + offset + start``.
-            means_of: ``(n + n * bins, m)`` makes of the integrals at these times the told displacements of the
-                sub-steps, then the mean commands of their age bins.
-        """
-        bins = len(self._widths)
-        limits, middles = np.arange(n + 1.0), np.repeat(np.arange(n) + 0.5, bins + 1)
-        slope = np.concatenate([limits, middles])
-        offset = np.concatenate([np.full(n + 1, -self.card.kinematics.delay_s), np.tile(-self._ages, n)])
-        means_of = np.zeros((n + n * bins, len(slope)))
-        for i in range(n):
-            means_of[i, [i, i + 1]] = -1.0, 1.0
-            for j, width in enumerate(self._widths):
-                first = n + 1 + i * (bins + 1) + j
-                means_of[n + i * bins + j, [first, first + 1]] = 1.0 / width, -1.0 / width
-        return slope, offset, means_of
-
-
 def calibrated(kinematics: Kinematics, track: CommandTrack, limits: FloatArray) -> FloatArray:
     """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
-    return np.asarray(track.means(limits - kinematics.delay_s) @ _gains(kinematics))
+    return np.asarray(track.means(limits - kinematics.delay_s) @ gains(kinematics))
 
 
-def _gains(kinematics: Kinematics) -> FloatArray:
+def gains(kinematics: Kinematics) -> FloatArray:
     """``(2, 3)``: commands (v, ω) times it are body twists."""
     v = kinematics.scale_v
     return np.array([[v, 0.0, kinematics.yaw_per_m * v], [0.0, 0.0, kinematics.scale_omega]])
@@ -230,7 +84,7 @@ def noise_density(noise: NoiseDensity, v: float, omega: float) -> tuple[float, f
     return noise.x_per_sqrt_m**2 * v + turning, noise.y_per_sqrt_m**2 * v + turning, yaw
 
 
-def _composed(twists: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
+def composed(twists: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Motion ``(3,)`` and covariance ``(3, 3)`` of consecutive parts.
 
     Scalars, because a step has two or three parts: five times as fast here as `fgloc.se2` on small arrays.
@@ -263,11 +117,13 @@ def _composed(twists: FloatArray, variances: FloatArray) -> tuple[FloatArray, Fl
     return np.array([x, y, se2.wrap(yaw)]), np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
-def _joint(card: ModelCard) -> JointCalibration | None:
+def joint_of(card: ModelCard) -> JointCalibration | None:
+    """The card's calibration against the wheels, ready for use."""
     return None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
 
 
-def _duration(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) -> float:
+def duration_of(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) -> float:
+    """Length of the step [s]; raises `ModelError` if there is none, or no command."""
     if not commands:
         raise ModelError("no command to predict from; the step needs the last command at or before its start")
     if end_ns <= start_ns:
@@ -275,10 +131,11 @@ def _duration(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) ->
     return (end_ns - start_ns) * 1e-9
 
 
-def _follow(track: CommandTrack | None, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+def follow(track: CommandTrack | None, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+    """The track of these commands, continued from the last step's where it can be."""
     return CommandTrack(commands) if track is None else track.following(commands)
 
 
-def _sub_steps(duration: float, longest_s: float) -> int:
+def sub_steps(duration: float, longest_s: float) -> int:
     """How many equal parts, no longer than the longest."""
     return max(1, math.ceil(duration / longest_s - 1e-6))

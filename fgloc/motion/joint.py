@@ -52,6 +52,11 @@ class JointCalibration:
         L_w, L_n = _cholesky(W, "the wheels' covariance"), _cholesky(N, "the learned covariance")
         return self._gain(L_w, L_n)
 
+    def difference_cov(self, W: FloatArray, N: FloatArray) -> FloatArray:
+        """Covariance ``(3, 3)`` of the difference of the two motions over a step: W + N - C - Cᵀ."""
+        C = self.gain(W, N) @ W
+        return W + N - C - C.T
+
     def decorrelate(self, wheels: MotionMeasurement, learned: MotionMeasurement) -> MotionMeasurement:
         """The learned measurement that may enter beside the unchanged wheels' as if independent.
 

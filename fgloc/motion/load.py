@@ -14,8 +14,10 @@ from safetensors.numpy import save
 
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.motion.card import FORMAT, VERSION, ModelCard
-from fgloc.motion.forms import DisplacementModel, MotionModel, VelocityModel
+from fgloc.motion.displacement import DisplacementModel
+from fgloc.motion.forms import MotionModel
 from fgloc.motion.network import Network
+from fgloc.motion.velocity import VelocityModel
 
 _MAX_BYTES = 64 << 20
 _REMEDY = "export it again with python -m training.train"

@@ -6,6 +6,7 @@ from collections import Counter
 
 from fgloc.config import MotionConfig
 from fgloc.motion.forms import MotionModel
+from fgloc.motion.signals import SignalReader
 from fgloc.types import FloatArray, MotionMeasurement, Step
 
 
@@ -17,7 +18,8 @@ class LearnedMotion:
 
     Attributes:
         rejections: steps without a measurement, by reason: ``learned.no_commands``, ``learned.stale_commands``,
-            ``learned.non_finite``.
+            ``learned.non_finite``, and ``learned.no_gyro``, ``learned.no_effort`` or ``learned.no_wheels`` where a
+            signal that the model reads was silent.
     """
 
     def __init__(self, model: MotionModel, config: MotionConfig) -> None:
@@ -25,6 +27,7 @@ class LearnedMotion:
         self.model = model
         self.rejections: Counter[str] = Counter()
         self._use = config.use
+        self._reader = SignalReader(model.card)
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
@@ -34,12 +37,13 @@ class LearnedMotion:
         card = self.model.card
         return card.kind == "velocity" or "velocity" in card.inputs
 
-    def measure(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+    def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step.
 
         Args:
             step: its commands must reach ``model.card.history_s`` back for a start from nothing.
             velocity: ``(2,)`` body velocity v [m/s], ω [rad/s] at the start, if known better than by the model itself.
+            gyro_bias: to be taken out of the IMU's yaw rate [rad/s].
 
         Returns:
             None if the model is not used or has nothing to say; the reason is counted in `rejections`.
@@ -49,9 +53,13 @@ class LearnedMotion:
         if reason := self._unusable(step):
             self._reject(reason)
             return None
+        signals = self._reader.read(step, gyro_bias)
+        if isinstance(signals, str):
+            self._reject(f"learned.no_{signals}")
+            return None
         if velocity is None and self._reached == (step.segment, step.start_ns):
             velocity = self._velocity
-        prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity)
+        prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
             return None
