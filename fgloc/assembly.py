@@ -116,7 +116,7 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
 
 def resolved(config: Config, map_path: Path | None) -> Config:
     """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
-    if map_path is not None or config.estimator.kind == "isam2":
+    if map_path is not None or config.estimator.kind != "fixed_lag":
         return config
     return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
 

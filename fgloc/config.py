@@ -122,7 +122,7 @@ class GyroConfig(Section):
 
     use: bool = True
     yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
-    scale_sigma: float = Field(0.003, ge=0, description="of the rate's scale: rad per rad turned")
+    scale_sigma: float = Field(0.003, ge=0, description="rad/√rad: error of the rate's scale, by rotation turned")
     bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
     bias_walk: float = Field(0.0003, ge=0, description="rad/s/√s")
 
@@ -192,7 +192,9 @@ class MotionConfig(Section):
 class EstimatorConfig(Section):
     """The incremental estimator."""
 
-    kind: Literal["fixed_lag", "isam2"] = "fixed_lag"
+    kind: Literal["fixed_lag", "isam2", "ekf"] = Field(
+        "fixed_lag", description="isam2: the whole run; ekf: a filter of the pose alone, for comparison"
+    )
     lag_s: float = Field(10.0, gt=0)
     relinearize_threshold: float = Field(0.01, gt=0)
     initial_pose: tuple[float, float, float] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")

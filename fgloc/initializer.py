@@ -12,7 +12,7 @@ from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.incremental import fuse
+from fgloc.graph.estimator import fuse
 from fgloc.graph.log import Belief
 from fgloc.graph.weights import Fit, joint_fit
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates

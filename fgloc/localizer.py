@@ -11,8 +11,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import Config
+from fgloc.graph.ekf import ExtendedKalmanFilter
+from fgloc.graph.estimator import Estimator, fuse
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.incremental import IncrementalEstimator, fuse
+from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.log import Belief
 from fgloc.graph.weights import Fit, Weights
 from fgloc.initializer import Initializer
@@ -43,7 +45,7 @@ class Localizer:
     """Estimates ``T_map_base``, one Step at a time.
 
     Attributes:
-        estimator: the incremental estimator, whose log the batch smoother starts from.
+        estimator: the filter, whose log the batch smoother starts from.
         factors: maker of landmark factors, shared with the batch smoother.
         counts: factors added, by kind.
         rejections: what was not used, by reason.
@@ -73,7 +75,8 @@ class Localizer:
         """
         self.config = config
         self.factors = LandmarkFactors(landmark_map)
-        self.estimator = IncrementalEstimator(config.estimator, self.factors, keep_all)
+        kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
+        self.estimator: Estimator = kind(config.estimator, self.factors, keep_all)
         self.weights = Weights(config, self.factors)
         self.counts: Counter[str] = Counter()
         self.rejections: Counter[str] = Counter()

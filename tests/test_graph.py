@@ -12,8 +12,9 @@ from fgloc.carry import carry
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
+from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
-from fgloc.graph.incremental import IncrementalEstimator, fuse
+from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.log import Belief, Keyframe, MeasurementLog
 from fgloc.graph.weights import Weights
 from fgloc.types import (

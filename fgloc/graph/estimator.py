@@ -1,0 +1,112 @@
+"""What all estimators share: the measurement log, the newest pose, and its prediction."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import EstimatorConfig
+from fgloc.errors import EstimatorError
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.log import Belief, Keyframe, MeasurementLog, Sighting
+from fgloc.types import FloatArray, MotionMeasurement
+
+
+class Estimator(ABC):
+    """Poses of the newest keyframes, one update a step.
+
+    Attributes:
+        log: every measurement of the window (or of the run, if ``keep_all``).
+        belief: the newest pose.
+        rebuilt: how often what the estimator held had to be built again from the log.
+    """
+
+    def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
+        self._config = config
+        self._factors = factors
+        self.log = MeasurementLog(None if keep_all or config.kind == "isam2" else config.lag_s)
+        self.rebuilt = 0
+        self.belief: Belief | None = None
+        self._k = -1
+        self._elapsed_s = 0.0
+
+    @property
+    def k(self) -> int:
+        """Index of the newest keyframe, -1 before the first."""
+        return self._k
+
+    def start(self, stamp_ns: int, prior: Belief, sightings: Sequence[Sighting] = ()) -> Belief:
+        """Begin a segment: a first pose with a prior, unconnected to what was before."""
+        self._k += 1
+        self._elapsed_s += 1e-3
+        frame = Keyframe(self._k, stamp_ns, self._elapsed_s, prior, prior=prior, sightings=tuple(sightings))
+        return self._take(frame)
+
+    def predict(self, motions: Sequence[MotionMeasurement]) -> Belief:
+        """Where the robot is expected after the motions of one step (information-weighted), before any sighting.
+
+        Raises:
+            EstimatorError: not started, or no motion.
+        """
+        if self.belief is None or not motions:
+            raise EstimatorError("predict needs a started estimator and at least one motion measurement")
+        motion, cov = fuse(motions)
+        return Belief(se2.compose(self.belief.pose, motion), se2.compose_cov(self.belief.cov, motion, cov))
+
+    def update(
+        self,
+        stamp_ns: int,
+        dt: float,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[Sighting] = (),
+        refused: Sequence[Sighting] = (),
+        predicted: Belief | None = None,
+    ) -> Belief:
+        """Add one keyframe with its measurements; return the filtered pose.
+
+        Args:
+            stamp_ns: time of the keyframe.
+            dt: time since the one before [s].
+            motions: between-factors from the one before; at least one.
+            sightings: landmark measurements carried to this keyframe.
+            refused: sightings that are only logged, for the batch smoother to look at again.
+            predicted: what `predict` said of these motions, if the caller has asked already.
+        """
+        predicted = predicted or self.predict(motions)
+        self._k += 1
+        self._elapsed_s += max(dt, 1e-6)
+        frame = Keyframe(
+            self._k, stamp_ns, self._elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(refused)
+        )
+        return self._take(frame)
+
+    def _take(self, frame: Keyframe) -> Belief:
+        self._solve(frame)
+        self.log.append(frame)
+        self.belief = frame.belief
+        return frame.belief
+
+    @abstractmethod
+    def _solve(self, frame: Keyframe) -> None:
+        """Replace the belief of a keyframe, which is its prior or its prediction, by the filtered one."""
+
+
+def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
+    """One motion ``(3,)`` and covariance ``(3, 3)`` out of independent ones over the same interval.
+
+    First order: the mean of the logarithms about the first motion, weighted by information.
+    """
+    first = motions[0]
+    if len(motions) == 1:
+        return first.motion, first.cov
+    information = np.linalg.inv(first.cov)
+    pull = np.zeros(3)
+    for m in motions[1:]:
+        weight = np.linalg.inv(m.cov)
+        information = information + weight
+        pull += weight @ se2.log(se2.between(first.motion, m.motion))
+    cov = np.linalg.inv(information)
+    return se2.compose(first.motion, se2.exp(cov @ pull)), 0.5 * (cov + cov.T)
