@@ -13,6 +13,7 @@ from synthetic_robot import SECOND, synthetic, write_bag
 
 from fgloc.errors import ConfigError
 from fgloc.motion import load_model, save_model
+from fgloc.motion.card import Input
 from fgloc.motion.load import read_model
 from training import evaluate as evaluation
 from training import train as training
@@ -33,10 +34,10 @@ def _one_thread() -> None:
 
 
 @pytest.mark.parametrize("kind", ["velocity", "displacement"])
-@pytest.mark.parametrize("use_velocity", [False, True])
-def test_torch_and_numpy_agree(kind: str, use_velocity: bool, runs: dict[str, Run], tmp_path: Path) -> None:
+@pytest.mark.parametrize("inputs", [("commands",), ("commands", "velocity")])
+def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[str, Run], tmp_path: Path) -> None:
     torch.manual_seed(1)
-    network = NetworkConfig(kind=kind, hidden=(32, 32), use_velocity=use_velocity, dt_s=0.1)
+    network = NetworkConfig(kind=kind, hidden=(32, 32), inputs=inputs, dt_s=0.1)
     config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, leave_one_out=True, network=network)
     net = training.new_net(network, list(runs.values()))
     with torch.no_grad():

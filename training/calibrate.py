@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -24,7 +25,15 @@ _MIN_DENSITY = 1e-4
 _FIT_WINDOW_S = 2.0
 
 
-def fit_kinematics(runs: list[Run]) -> Kinematics:
+class MeanTwists(Protocol):
+    """Commands, or wheels that stand in their place."""
+
+    def means(self, limits_s: FloatArray) -> FloatArray:
+        """Mean (v, ω) ``(..., m - 1, 2)`` between limits ``(..., m)``."""
+        ...
+
+
+def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
     Over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
@@ -33,8 +42,8 @@ def fit_kinematics(runs: list[Run]) -> Kinematics:
     def residuals(parameters: FloatArray) -> FloatArray:
         scale_v, scale_omega, yaw_per_m, delay = parameters
         parts = []
-        for run, k, actual in windows:
-            told = run.track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
+        for told_track, run, k, actual in windows:
+            told = told_track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
             v = scale_v * told[:, 0]
             omega = scale_omega * told[:, 1] + yaw_per_m * v
             parts += [(v - actual[:, 0]) / v_unit, (omega - actual[:, 1]) / omega_unit]
@@ -47,8 +56,8 @@ def fit_kinematics(runs: list[Run]) -> Kinematics:
         forward = run.velocities[:, 0]
         travelled = np.concatenate([[0.0], np.cumsum(0.5 * (forward[1:] + forward[:-1]) * run.dt_s)])
         change = np.column_stack([travelled[k + steps] - travelled[k], run.poses[k + steps, 2] - run.poses[k, 2]])
-        windows.append((run, k, change / (steps * run.dt_s)))
-    v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, actual in windows]).std(axis=0))
+        windows.append((told_by(run), run, k, change / (steps * run.dt_s)))
+    v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, _, actual in windows]).std(axis=0))
     bounds = ([0.3, 0.3, -1.0, 0.0], [2.0, 2.0, 1.0, 1.0])
     fit = least_squares(residuals, [1.0, 1.0, 0.0, 0.2], bounds=bounds, diff_step=1e-2, x_scale=[1.0, 1.0, 0.1, 0.2])
     scale_v, scale_omega, yaw_per_m, delay_s = (float(value) for value in fit.x)

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from fgloc.config import Section
 from fgloc.errors import ConfigError
-from fgloc.motion.card import Split
+from fgloc.motion.card import Input, Split
 
 
 class DataConfig(Section):
@@ -32,7 +32,11 @@ class NetworkConfig(Section):
         (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
         description="displacement: limits of the ages over which commands are averaged",
     )
-    use_velocity: bool = Field(False, description="displacement: also read the velocity at the start")
+    inputs: tuple[Input, ...] = Field(("commands",), description="displacement: what the network reads")
+    signal_edges_s: tuple[float, ...] = Field(
+        (0.0,), description="limits of the ages before a sub-step over which measured signals are averaged, from 0 on"
+    )
+    gyro_bias_sigma: float = Field(0.0, ge=0, description="rad/s that the known bias may be off, drawn in training")
     velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of that velocity [m/s, rad/s]")
     velocity_decay_s: float = Field(0.3, gt=0)
     hold_s: float = Field(1.5, gt=0)

@@ -5,6 +5,7 @@ Source: paper eq. 1, 2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from fgloc.errors import RecordingError
 from fgloc.motion.commands import CommandTrack
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
-from fgloc.types import CommandEvent, FloatArray, TruthEvent
+from fgloc.types import CommandEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig
+from training.heard import Heard
 
 _FINE_S = 0.02  # the truth is resampled to this before it is smoothed
 
@@ -33,8 +35,13 @@ class Run:
     poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
     valid: NDArray[np.bool_]  # (n,) the truth was heard around this time
-    commands: tuple[CommandEvent, ...]
+    heard: Heard
     track: CommandTrack  # time zero is origin_ns
+
+    @property
+    def commands(self) -> tuple[CommandEvent, ...]:
+        """In order of stamp."""
+        return self.heard.commands
 
     @property
     def times(self) -> FloatArray:
@@ -62,36 +69,35 @@ def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataC
         RecordingError: it cannot be read, or has no commands, no truth or too little of both.
     """
     settings = _settings(path)
-    commands: list[CommandEvent] = []
     truth: list[TruthEvent] = []
+    sensed: list[Event] = []
     with open_recording(path, settings.recording) as recording:
         for event in recording.events():
-            if isinstance(event, CommandEvent):
-                commands.append(event)
-            elif isinstance(event, TruthEvent):
-                truth.append(event)
-    for kind, events in (("commands", commands), ("truth", truth)):
-        if len(events) < 2:
-            raise RecordingError(f"{path}: {len(events)} messages of {kind}; identification needs commands and truth")
+            (truth if isinstance(event, TruthEvent) else sensed).append(event)
+    heard = Heard(sensed, settings)
+    for kind, count in (("commands", len(heard.commands)), ("truth", len(truth))):
+        if count < 2:
+            raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
     rows = np.array([base_pose(e, settings.truth) for e in truth])
-    return make_run(name, commands, np.array([e.stamp_ns for e in truth]), rows, dt_s, history_s, config)
+    return make_run(name, heard, np.array([e.stamp_ns for e in truth]), rows, dt_s, history_s, config)
 
 
 def make_run(
     name: str,
-    commands: list[CommandEvent],
+    heard: Heard | Sequence[CommandEvent],
     truth_ns: NDArray[np.int64],
     truth: FloatArray,
     dt_s: float,
     history_s: float,
     config: DataConfig,
 ) -> Run:
-    """A run from commands and truth poses ``(m, 3)`` at ``truth_ns``; arguments else as in `load_run`.
+    """A run from what was heard, or commands alone, and truth poses ``(m, 3)`` at ``truth_ns``; else as `load_run`.
 
     Raises:
         RecordingError: commands and truth overlap too little.
     """
-    commands = sorted(commands, key=lambda c: c.stamp_ns)
+    heard = heard if isinstance(heard, Heard) else Heard(heard)
+    commands = heard.commands
     order = np.unique(truth_ns, return_index=True)[1]
     truth_ns, truth = truth_ns[order], truth[order]
     first = max(int(truth_ns[0]) + round(config.margin_s * 1e9), commands[0].stamp_ns + round(history_s * 1e9))
@@ -112,8 +118,8 @@ def make_run(
         poses=poses,
         velocities=velocities,
         valid=_heard(t_truth, times, config),
-        commands=tuple(commands),
-        track=CommandTrack(tuple(commands), first),
+        heard=heard,
+        track=CommandTrack(commands, first),
     )
 
 

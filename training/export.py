@@ -30,7 +30,7 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
         dict(
             kind=network.kind,
             robot=config.robot,
-            inputs=("commands", "velocity") if network.use_velocity or not displacement else ("commands",),
+            inputs=network.inputs if displacement else ("commands", "velocity"),
             dt_s=network.dt_s,
             hidden=network.hidden,
             members=network.members,
@@ -39,6 +39,9 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
             kinematics=net.kinematics,
             lag=None if displacement else net.lag,
             edges_s=network.edges_s if displacement else (),
+            joints=net.joints if displacement and {"effort", "wheels"} & set(network.inputs) else None,
+            signal_edges_s=network.signal_edges_s,
+            wheel_kinematics=net.wheel_kinematics if displacement else {},
             velocity_decay_s=network.velocity_decay_s,
             input_mean=net.mean.tolist(),
             input_std=net.std.tolist(),

@@ -9,8 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fgloc.motion.card import Kinematics, Lag
+from fgloc.errors import RecordingError
+from fgloc.motion.card import CHANNELS, Kinematics, Lag
+from fgloc.motion.displacement import measured_twists, signal_features
 from fgloc.motion.forms import calibrated
+from fgloc.motion.signals import Signals
 from fgloc.types import FloatArray
 from training.config import NetworkConfig
 from training.data import Run
@@ -40,17 +43,22 @@ def mlp(widths: list[int]) -> nn.Sequential:
 
 
 class DisplacementNet(nn.Module):
-    """Residual twist on calibrated kinematics from binned commands; log-variances from the last hidden layer."""
+    """Residual twist on the best known kinematics; log-variances from the last hidden layer."""
 
-    def __init__(self, config: NetworkConfig, kinematics: Kinematics, runs: list[Run]) -> None:
+    def __init__(
+        self, config: NetworkConfig, kinematics: Kinematics, wheel_kinematics: Kinematics, runs: list[Run]
+    ) -> None:
         """Take the normalization from the training runs."""
         super().__init__()
-        self.config, self.kinematics = config, kinematics
+        self.config, self.kinematics, self.wheel_kinematics = config, kinematics, wheel_kinematics
+        self.joints = runs[0].heard.joints
+        self.measured = tuple(name for name in CHANNELS if name in config.inputs)
+        self._gyro_columns = self._columns("gyro")
         features = np.concatenate([self._features(run) for run in runs])
-        base = np.concatenate([_base(kinematics, run) for run in runs])
+        base = np.concatenate([self._base(run) for run in runs])
         actual = np.concatenate([run.velocities for run in runs])
         mean, std = features.mean(axis=0), features.std(axis=0)
-        if config.use_velocity:
+        if "velocity" in config.inputs:
             mean = np.append(mean, [0.0, 0.0])
             std = np.append(std, (actual - base)[:, [0, 2]].std(axis=0))
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
@@ -65,22 +73,53 @@ class DisplacementNet(nn.Module):
 
     def _features(self, run: Run) -> FloatArray:
         middles = run.times + 0.5 * run.dt_s
-        return run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
+        told = run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
+        signals, edges = self._signals(run), np.array(self.config.signal_edges_s)
+        parts = [told]
+        for name in self.measured:
+            signal = signals.named(name)
+            if signal is None:
+                raise RecordingError(f"{run.name}: the model is to read {name}, which the recording does not hold")
+            parts.append(signal_features(signal, run.times, run.dt_s, edges))
+        return np.concatenate(parts, axis=1)
+
+    def _base(self, run: Run) -> FloatArray:
+        base = _base(self.kinematics, run)
+        measured_twists(base, self.wheel_kinematics, self._signals(run), run.times, run.dt_s)
+        return base
+
+    def _signals(self, run: Run) -> Signals:
+        return run.heard.signals(self.measured, run.origin_ns)
+
+    def _columns(self, name: str) -> slice:
+        """Columns of the features that hold a measured input; empty if it is not read."""
+        first, ages = 2 * (len(self.config.edges_s) - 1), len(self.config.signal_edges_s)
+        for other in self.measured:
+            width = CHANNELS[other] * ages
+            if other == name:
+                return slice(first, first + width)
+            first += width
+        return slice(0, 0)
 
     def samples(self, runs: list[Run]) -> Samples:
         """Samples of runs, in order."""
-        return _samples(runs, [self._features(run) for run in runs], self.kinematics)
+        return _samples(runs, [self._features(run) for run in runs], [self._base(run) for run in runs])
 
     def hidden(
         self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
         """Base twists ``(b, steps, 3)`` and last hidden layer ``(b, steps, ·)``.
 
-        With ``rng``, half of the windows are told the velocity at their start, with noise (if the model reads it).
+        With ``rng``, half of the windows are told the velocity at their start, with noise (if the model reads it), and
+        the gyro has a bias that is not known.
         """
         rows = starts[:, None] + torch.arange(steps)
         x, base = samples.features[rows], samples.base[rows]
-        if self.config.use_velocity:
+        if rng is not None and self.config.gyro_bias_sigma > 0.0 and "gyro" in self.measured:
+            bias = self.config.gyro_bias_sigma * torch.randn(len(starts), 1, generator=rng)
+            x[..., self._gyro_columns] += bias[..., None]
+            base[..., 2] += bias
+        if "velocity" in self.config.inputs:
             innovation = torch.zeros(len(starts), steps, 2)
             if rng is not None:
                 known = samples.velocities[starts] - samples.base[starts][:, [0, 2]]
@@ -129,7 +168,7 @@ class VelocityNet(nn.Module):
     def samples(self, runs: list[Run]) -> Samples:
         """Samples of runs, in order."""
         aims = self.kinematics.model_copy(update={"delay_s": self.lag.delay_s})
-        return _samples(runs, [self._features(run) for run in runs], aims)
+        return _samples(runs, [self._features(run) for run in runs], [_base(aims, run) for run in runs])
 
     def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
         """Poses ``(b, steps, 3)`` after each step, seen from the start.
@@ -186,13 +225,13 @@ def _base(kinematics: Kinematics, run: Run) -> FloatArray:
     return calibrated(kinematics, run.track, np.append(run.times, len(run.poses) * run.dt_s))
 
 
-def _samples(runs: list[Run], features: list[FloatArray], kinematics: Kinematics) -> Samples:
+def _samples(runs: list[Run], features: list[FloatArray], base: list[FloatArray]) -> Samples:
     def tensor(parts: list[FloatArray]) -> Tensor:
         return torch.tensor(np.concatenate(parts), dtype=torch.float32)
 
     return Samples(
         features=tensor(features),
-        base=tensor([_base(kinematics, run) for run in runs]),
+        base=tensor(base),
         poses=torch.tensor(np.concatenate([run.poses for run in runs])),
         velocities=tensor([run.velocities[:, [0, 2]] for run in runs]),
         dt_s=runs[0].dt_s,

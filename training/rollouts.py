@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,6 +14,8 @@ from fgloc import se2
 from fgloc.errors import ModelError
 from fgloc.motion.card import ErrorMemory, Kinematics
 from fgloc.motion.forms import MotionModel, calibrated
+from fgloc.motion.signals import SignalReader
+from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import FloatArray
 from training.data import Run
 
@@ -67,21 +69,43 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
     Raises:
         ModelError: a prediction is not finite.
     """
-    stamps = [c.stamp_ns for c in run.commands]
+    reader = SignalReader(model.card)
     velocity: FloatArray | None = None
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         nonlocal velocity
-        first = max(0, bisect_right(stamps, start_ns - round(model.card.history_s * 1e9)) - 1)
-        commands = run.commands[first : bisect_left(stamps, end_ns)]
+        heard = run.heard.step(start_ns, end_ns, model.card.history_s)
+        commands = heard.commands[: bisect_left(heard.commands, end_ns, key=lambda c: c.stamp_ns)]
+        signals = reader.read(heard, run.heard.gyro_bias(start_ns))
+        if isinstance(signals, str):
+            raise ModelError(f"{run.name}: the model reads {signals}, which was silent at {start_ns} ns")
         carried = velocity if model.card.kind == "velocity" else None
-        prediction = model.predict(commands, start_ns, end_ns, carried)
+        prediction = model.predict(commands, start_ns, end_ns, carried, signals)
         if prediction is None:
             raise ModelError(f"{run.name}: the model's output at {start_ns} ns is not finite")
         velocity = prediction.velocity
         return prediction.motion, prediction.cov
 
     return replace(_roll(run, step_s, step), memory=model.card.memory)
+
+
+def roll_wheels(run: Run, step_s: float) -> Rollout:
+    """Wheel odometry as the localizer measures it.
+
+    Raises:
+        ModelError: the recording holds none.
+    """
+    if not run.heard.has_wheels:
+        raise ModelError(f"{run.name}: no wheel odometry in the recording")
+    wheels = WheelMotion(run.heard.wheels)
+
+    def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
+        measured = wheels.measure(run.heard.step(start_ns, end_ns))
+        if measured is None:
+            raise ModelError(f"{run.name}: no wheel motion at {start_ns} ns")
+        return measured.motion, measured.cov
+
+    return _roll(run, step_s, step)
 
 
 def roll_kinematics(kinematics: Kinematics, run: Run, step_s: float) -> Rollout:

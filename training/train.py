@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from fgloc.errors import FglocError
-from fgloc.motion.card import ModelCard, Split
+from fgloc.errors import FglocError, RecordingError
+from fgloc.motion.card import Kinematics, ModelCard, Split
 from fgloc.motion.load import Tensors, load_model, read_model, save_model
+from fgloc.motion.signals import Signal
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run, load_run
@@ -27,7 +28,7 @@ from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
 from training.losses import composed_nll, end_errors, rollout_loss
 from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, relative
-from training.rollouts import Rollout, roll_kinematics, roll_model
+from training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
 
 _VALIDATION_S = (10.0, 30.0)
 _SEEDS_APART = 1_000  # between the members of an ensemble
@@ -68,9 +69,13 @@ def train_uncalibrated(
 
 
 def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tuple[Rollout, Rollout]]:
-    """Of the model and of its kinematics alone, over each run."""
+    """Of the model and of wheel odometry, or of the model's kinematics where there is none, over each run."""
     model = load_model(path)
-    return [(roll_model(model, run, card.dt_s), roll_kinematics(card.kinematics, run, card.dt_s)) for run in runs]
+
+    def wheels(run: Run) -> Rollout:
+        return roll_wheels(run, card.dt_s) if run.heard.has_wheels else roll_kinematics(card.kinematics, run, card.dt_s)
+
+    return [(roll_model(model, run, card.dt_s), wheels(run)) for run in runs]
 
 
 def cross_rollouts(
@@ -101,8 +106,18 @@ def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
     """An untrained network on top of what is known of these recordings' robot."""
     kinematics = fit_kinematics(training)
     if config.kind == "displacement":
-        return DisplacementNet(config, kinematics, training)
+        wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
+        return DisplacementNet(config, kinematics, wheel_kinematics, training)
     return VelocityNet(config, kinematics, fit_lag(training, kinematics), training)
+
+
+def _wheels_of(run: Run) -> Signal:
+    wheels = run.heard.signals(("wheels",), run.origin_ns).wheels
+    if wheels is None:
+        raise RecordingError(
+            f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"
+        )
+    return wheels
 
 
 def train_mean(net: MotionNet, training: list[Run], validation: list[Run], config: OptimizationConfig) -> None:

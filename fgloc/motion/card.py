@@ -51,9 +51,14 @@ class WheelJoints(Section):
 
     left: str | None = Field(None, description="joint of the left wheel; None: the one named so")
     right: str | None = None
-    left_radius: Positive
-    right_radius: Positive
-    track: Positive
+    left_radius: Positive | None = Field(None, description="m; the input wheels needs it")
+    right_radius: Positive | None = None
+    track: Positive | None = None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the geometry is known."""
+        return None not in (self.left_radius, self.right_radius, self.track)
 
 
 class ErrorMemory(Section):
@@ -175,6 +180,8 @@ class ModelCard(Section):
             raise ValueError("a velocity model needs a lag and the noise densities of its error; the card lacks one")
         if self.joints is None and {"effort", "wheels"} & set(self.inputs):
             raise ValueError("the inputs effort and wheels need the card's joints; it names none")
+        if self.reads_wheels and (self.joints is None or not self.joints.measured):
+            raise ValueError("the input wheels needs left_radius, right_radius and track of the card's joints")
         if self.kind == "velocity" and self.measured:
             raise ValueError(f"a velocity model reads commands and velocity, not {', '.join(self.measured)}")
         n_scales = {"velocity": 2, "displacement": 3}[self.kind]

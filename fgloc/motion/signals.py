@@ -162,6 +162,8 @@ def _effort(events: Sequence[JointsEvent], origin_ns: int, joints: WheelJoints) 
 
 def _wheels(events: Sequence[JointsEvent], origin_ns: int, joints: WheelJoints) -> Signal | None:
     """By the angles or, where the joints report none, by the rates."""
+    if joints.left_radius is None or joints.right_radius is None or joints.track is None:
+        return None
     stamps, pair = _pairs(events, joints, "position")
     of_angles = len(stamps) > 1
     if not of_angles:
