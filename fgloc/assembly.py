@@ -16,6 +16,7 @@ from fgloc.motion import load_model
 from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import camera_from_info, load_camera, rescaled
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.images import ImageError, decode
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
@@ -29,6 +30,7 @@ from fgloc.types import (
     Event,
     FloatArray,
     ImageEvent,
+    ImuEvent,
     LandmarkMap,
     MarkerPosesEvent,
     OdometryEvent,
@@ -97,6 +99,9 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         learned = LearnedMotion(model, config.motion)
         joint = model.joint if config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
+    gyro = (
+        Gyro(config.gyro, _imu_up(recording, config, first)) if "imu" in recording.roles and config.gyro.use else None
+    )
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     return Assembly(
@@ -109,7 +114,7 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         wheels=wheels,
         landmarks=landmarks,
         learned=learned,
-        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all),
+        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro),
         notes=tuple(notes),
     )
 
@@ -169,6 +174,14 @@ def _camera(recording: Recording, config: Config, first: dict[type[Event], Event
             "calibrate at this size, or set camera.rescale: true"
         )
     return rescaled(camera, *size)
+
+
+def _imu_up(recording: Recording, config: Config, first: dict[type[Event], Event]) -> FloatArray:
+    """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level."""
+    base, event = _base_frame(recording, config, first), first.get(ImuEvent)
+    if isinstance(event, ImuEvent) and event.frame_id in recording.frames and base in recording.frames:
+        return np.asarray(recording.frames.lookup(base, event.frame_id)[2, :3])
+    return np.array([0.0, 0.0, 1.0])
 
 
 def _image_size(recording: Recording) -> tuple[int, int] | None:

@@ -227,9 +227,13 @@ class WeightsConfig(Section):
     adaptive: bool = Field(True, description="false: covariances stay as they were made; sightings are still gated")
     distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")
     window_s: float = Field(2.0, gt=0, description="the motion sources are compared over windows of up to this long")
-    alarm: float = Field(30.0, gt=0, description="squared Mahalanobis distance of two sources that flags a disagreement")
+    alarm: float = Field(
+        30.0, gt=0, description="squared Mahalanobis distance of two sources that flags a disagreement"
+    )
     release_s: float = Field(0.6, gt=0, description="agreement for this long ends it")
-    quarantine_after: int = Field(6, gt=0, description="refusals in excess of what is believed that quarantine a marker")
+    quarantine_after: int = Field(
+        6, gt=0, description="refusals in excess of what is believed that quarantine a marker"
+    )
 
 
 class BatchConfig(Section):

@@ -11,8 +11,8 @@ import numpy as np
 from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import Config
-from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.estimator import fuse
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.log import Belief
 from fgloc.graph.weights import Fit, joint_fit
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -24,6 +24,7 @@ from fgloc.types import (
     MarkerPoseMeasurement,
     MotionMeasurement,
     RangeBearingMeasurement,
+    Readings,
     Step,
 )
 
@@ -46,6 +47,7 @@ class Collected:
     step: Step
     motions: tuple[MotionMeasurement, ...]
     sightings: tuple[LandmarkMeasurement, ...]
+    readings: Readings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,10 +85,21 @@ class Initializer:
         self.waiting = True
 
     def collect(
-        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[LandmarkMeasurement],
+        readings: Readings | None = None,
     ) -> Start | None:
-        """Add a step; return the start once one place explains what was seen and no other does."""
-        self._steps.append(Collected(step, tuple(motions), tuple(sightings)))
+        """Add a step; return the start once one place explains what was seen and no other does.
+
+        Args:
+            step: the next one.
+            motions: factors of the motion over it.
+            sightings: made in it.
+            readings: what the motions were made of, kept for the replay.
+        """
+        self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
         while self._steps[0].step.stamp_ns < horizon:
             self._steps.popleft()

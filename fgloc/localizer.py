@@ -20,10 +20,13 @@ from fgloc.graph.weights import Fit, Weights
 from fgloc.initializer import Initializer
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
+from fgloc.motions import MotionSources
 from fgloc.selfcal import Calibration, Calibrator
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.timing import Stopwatch
+from fgloc.trust import SourceTrust, Trust
 from fgloc.types import (
     Decision,
     Estimate,
@@ -32,11 +35,11 @@ from fgloc.types import (
     LandmarkMeasurement,
     Mode,
     MotionMeasurement,
+    Readings,
     Step,
 )
 
 _ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
-_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
@@ -61,6 +64,7 @@ class Localizer:
         learned: LearnedMotion | None = None,
         joint: JointCalibration | None = None,
         keep_all: bool = False,
+        gyro: Gyro | None = None,
     ) -> None:
         """Put the parts together.
 
@@ -72,6 +76,7 @@ class Localizer:
             learned: the learned motion, if any.
             joint: its correlation with the wheels; None: the two are taken as independent.
             keep_all: keep the measurement log of the whole run, for the batch smoother.
+            gyro: the gyro, if any.
         """
         self.config = config
         self.factors = LandmarkFactors(landmark_map)
@@ -81,9 +86,9 @@ class Localizer:
         self.counts: Counter[str] = Counter()
         self.rejections: Counter[str] = Counter()
         self.stopwatch = Stopwatch()
+        self.sources = MotionSources(config, wheels, learned, joint, gyro)
+        self.trust = SourceTrust(config.weights, self.sources, config.wheels.track)
         self._wheels = wheels
-        self._learned = learned
-        self._joint = joint
         self._landmarks = landmarks
         known = landmark_map.landmarks.values() if landmark_map is not None else ()
         self._sizes = {landmark.landmark_id: landmark.size_m for landmark in known}
@@ -95,7 +100,6 @@ class Localizer:
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
         self._last_fix_s = 0.0
         self._clock_s = 0.0
-        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
         self._lost = False
 
     def update(self, step: Step) -> Estimate | None:
@@ -107,22 +111,12 @@ class Localizer:
             self._get_lost()
         # 1. Measure: one call per sensor; a silent sensor yields nothing
         with self.stopwatch("motion"):
-            motions = self.measure_motion(step)
+            readings = self.sources.read(step, self._clock_s - step.dt - self._last_fix_s)
         with self.stopwatch("sightings"):
             sightings = self._measure_landmarks(step)
         if self._initializer.waiting:
-            return self._initialize(step, motions, sightings)
-        return self._advance(step, motions, sightings)
-
-    def measure_motion(self, step: Step, velocity: FloatArray | None = None) -> list[MotionMeasurement]:
-        """Motion factors of a step; ``velocity`` ``(2,)`` at its start, if known better than by the learned model."""
-        if step.dt <= 0.0:
-            return []
-        wheels = self._wheels.measure(step)
-        learned = self._learned.measure(step, velocity) if self._learned is not None else None
-        if wheels is not None and learned is not None and self._joint is not None:
-            learned = self._joint.decorrelate(wheels, learned)
-        return [m for m in (wheels, learned) if m is not None]
+            return self._initialize(step, readings, sightings)
+        return self._advance(step, readings, sightings)
 
     def _measure_landmarks(self, step: Step) -> list[LandmarkMeasurement]:
         measured: list[LandmarkMeasurement] = []
@@ -138,7 +132,8 @@ class Localizer:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         self._segment = step.segment
         self._lost = False
-        self._silent_s = 0.0
+        self.sources.begin_segment()
+        self.trust.reset()
         self.weights.begin_segment()
         self._initializer.reset()
         given = self.config.estimator.initial_pose
@@ -150,17 +145,15 @@ class Localizer:
         else:
             self._prior = None
 
-    def _initialize(
-        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
-    ) -> Estimate | None:
+    def _initialize(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
         """Collect steps until the first pose is clear, then run them all through the estimator."""
         if self._prior is not None:
             prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
             self._initializer.waiting = False
             return self._start(step, prior, sightings)
-        started = self._initializer.collect(step, motions, sightings)
+        started = self._initializer.collect(step, self.sources.combine(readings), sightings, readings)
         if started is None:
-            return self._advance(step, motions, ()) if self._lost else None
+            return self._advance(step, readings, ()) if self._lost else None
         if self._lost:
             self._lost = False
             return self._start(step, started.newest, ())
@@ -168,7 +161,7 @@ class Localizer:
         estimate = self._start(first.step, started.first, first.sightings)
         decisions = [*estimate.decisions]
         for later in rest:
-            estimate = self._advance(later.step, later.motions, later.sightings)
+            estimate = self._advance(later.step, later.readings, later.sightings)
             decisions += estimate.decisions
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 
@@ -183,26 +176,27 @@ class Localizer:
         self._last_fix_s = self._clock_s
         return self._estimate(step, belief, decisions)
 
-    def _advance(
-        self, step: Step, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]
-    ) -> Estimate:
+    def _advance(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
-        if motions:
-            self._silent_s = 0.0
-        else:
-            motions = [self._unknown_motion(step)]
-        # 2. Weigh: sightings against the prediction, and the motion against sightings that agree it is wrong
+        # 2. Weigh: the motion sources against each other, back to where they began to disagree; the sightings against
+        # the prediction; and the motion against sightings that agree it is wrong
         with self.stopwatch("weigh"):
+            trust = self.trust.judge(step, readings)
+            decisions = self._revise(k, trust)
+            motions = self.sources.combine(readings, trust.off)
+            if motions:
+                self.sources.told()
+            else:
+                motions = [self.sources.unknown(step)]
+                self.rejections["motion.silent"] += 1
             predicted = self.estimator.predict(motions)
-            believed, refused, decisions = self.weights.weigh(
-                k, step.stamp_ns, sightings, predicted, self._calibration()
-            )
-            fit = None if believed else self.weights.overruled(refused, decisions, predicted)
+            believed, refused, weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+            fit = None if believed else self.weights.overruled(refused, weighed, predicted)
             if fit is not None:
                 motions = [doubted(m, predicted, fit) for m in motions]
                 self.rejections["motion.overruled"] += 1
                 predicted = self.estimator.predict(motions)
-                believed, refused, decisions = self.weights.weigh(
+                believed, refused, weighed = self.weights.weigh(
                     k, step.stamp_ns, sightings, predicted, self._calibration()
                 )
         # 3. Fuse
@@ -212,26 +206,36 @@ class Localizer:
         if self.estimator.rebuilt > rebuilt:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
-            decisions = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in decisions]
+            weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
         if self.calibrator is not None:
             self.calibrator.step(*fuse(motions), [s.raw for s in believed])
         self.counts.update(m.source for m in motions)
-        self._count_landmarks(decisions)
+        self._count_landmarks(weighed)
         if believed:
             self._last_fix_s = self._clock_s
-            self._silent_s = 0.0
+            self.sources.told(belief)
         self._watch_for_loss(believed)
-        reason = "overruled by sightings" if fit is not None else ""
-        decisions = [*motion_decisions(k, motions, reason), *decisions]
-        return self._estimate(step, belief, decisions)
+        frame = self.estimator.log.keyframes[k]
+        frame.readings, frame.off = readings, frozenset(trust.off)
+        decisions += motion_decisions(k, motions, readings, trust, "overruled by sightings" if fit is not None else "")
+        return self._estimate(step, belief, [*decisions, *weighed])
 
-    def _unknown_motion(self, step: Step) -> MotionMeasurement:
-        """Nothing spoke: sigma grows with the time of silence, however many steps it is cut into."""
-        self.rejections["motion.silent"] += 1
-        before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
-        speed, turn = _LIKELY * self.config.gate.max_speed, _LIKELY * self.config.gate.max_yaw_rate
-        cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
-        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
+    def _revise(self, k: int, trust: Trust) -> list[Decision]:
+        """Take back what a source that is not believed any more has said in the steps before this one."""
+        if trust.span < 2:
+            return []
+        log = self.estimator.log.keyframes
+        frames = [log[i] for i in range(k - trust.span + 1, k) if i in log and log[i].prior is None]
+        changed, decisions = {}, []
+        for frame in frames:
+            frame.off |= frozenset(trust.off)
+            changed[frame.k] = motions = self.sources.combine(frame.readings, frame.off)
+            if motions:
+                decisions += motion_decisions(frame.k, motions, frame.readings, trust, "")
+            else:
+                del changed[frame.k]
+        self.estimator.revise(changed)
+        return decisions
 
     def _watch_for_loss(self, believed: Sequence[object]) -> None:
         """After many refusals without one belief in between, look for the robot anywhere on the map."""
@@ -277,15 +281,26 @@ def doubted(m: MotionMeasurement, predicted: Belief, fit: Fit) -> MotionMeasurem
     return dataclasses.replace(m, cov=m.cov + np.diag(miss**2))
 
 
-def motion_decisions(k: int, motions: Sequence[MotionMeasurement], reason: str) -> list[Decision]:
-    """Rows of ``steps.csv`` for motion factors: the residual is that against the first of them (the wheels).
+def motion_decisions(
+    k: int, motions: Sequence[MotionMeasurement], readings: Readings, trust: Trust, reason: str
+) -> list[Decision]:
+    """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
 
-    A reason says why their covariance was inflated; their weight is then 0, as they no longer hold the pose.
+    Sources that are not believed have weight 0 and say why. A ``reason`` says why the covariance of all the others was
+    inflated; their weight is then 0 too, as they no longer hold the pose. A step that was judged again has more than
+    one row for a source; the last one holds.
     """
     rows = []
-    first = motions[0]
-    for m in motions:
-        difference: FloatArray = se2.log(se2.between(first.motion, m.motion))
-        nis = float(difference @ np.linalg.solve(first.cov + m.cov, difference))
-        rows.append(Decision(k, m.stamp_ns, m.source, -1, nis**0.5, nis, 3, 0.0 if reason else 1.0, reason))
+    used = {m.source: m for m in motions}
+    for source in ("wheels", "learned", "gyro", "unknown"):
+        reading = getattr(readings, source, None) or used.get(source)
+        why = trust.off.get(source, reason)
+        if reading is None or (source not in used and not why):
+            continue
+        nis = 0.0
+        if readings.wheels is not None and source != "wheels":
+            difference: FloatArray = se2.log(se2.between(readings.wheels.motion, reading.motion))
+            nis = float(difference @ np.linalg.solve(readings.wheels.cov + reading.cov, difference))
+        weight = 0.0 if why else 1.0
+        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why))
     return rows

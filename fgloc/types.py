@@ -270,13 +270,22 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionMeasurement:
-    """``T_start_end`` of the base, from ``source`` ("wheels" or "learned"), with right-perturbation covariance."""
+    """``T_start_end`` of the base from ``source`` (wheels, learned or gyro), with right-perturbation covariance."""
 
     source: str
     start_ns: int
     stamp_ns: int
     motion: FloatArray  # (3,)
     cov: FloatArray  # (3, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """What each motion source says of one step, as if it were alone; None where it is silent."""
+
+    wheels: MotionMeasurement | None = None
+    learned: MotionMeasurement | None = None
+    gyro: MotionMeasurement | None = None  # only its yaw means anything
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,7 +340,7 @@ class Decision:
 
     step: int
     stamp_ns: int
-    kind: str  # "wheels", "learned", "corners", "range_bearing", "marker_pose", "prior"
+    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "prior"
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float

@@ -36,6 +36,8 @@ MOTION = np.array([0.02, 0.0, 0.0])
 class Wheels:
     """Exact motion of a robot that drives straight on."""
 
+    stands_in = False
+
     def measure(self, step: Step) -> MotionMeasurement:
         return MotionMeasurement("wheels", step.start_ns, step.stamp_ns, MOTION, np.diag([1e-6, 1e-6, 1e-6]))
 

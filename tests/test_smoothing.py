@@ -51,10 +51,10 @@ def test_velocity_through_the_turn_of_yaw():
 class Listening(LearnedMotion):
     """Notes the velocities that it is given."""
 
-    def measure(self, step, velocity):
+    def measure(self, step, velocity, gyro_bias=0.0):
         if velocity is not None:
             self.heard[step.stamp_ns] = velocity
-        return super().measure(step, velocity)
+        return super().measure(step, velocity, gyro_bias)
 
 
 def replayed(bag, settings):
@@ -64,7 +64,7 @@ def replayed(bag, settings):
         if parts.learned is not None:
             listening = Listening(parts.learned.model, settings.motion)
             listening.heard = {}
-            parts.localizer._learned = listening
+            parts.localizer.sources._learned = listening
         for event in recording.events():
             passed = parts.gate.check(event)
             for step in parts.stepper.push(passed) if passed is not None else ():
@@ -79,7 +79,7 @@ def test_only_a_model_that_reads_velocity_is_asked_again_at_the_smoothed_one(tmp
     bag = write_world(tmp_path, World(beacons(), seconds=8.0))
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
     estimates, _, _ = smooth_run(parts)
-    heard = parts.localizer._learned.heard
+    heard = parts.localizer.sources._learned.heard
     if kind == "displacement":
         assert not heard
         return
@@ -97,7 +97,7 @@ def test_no_velocity_leads_across_a_jump(tmp_path):
     bag = write_world(tmp_path, World(beacons(), seconds=5.0), second)
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
     estimates, _, _ = smooth_run(parts)
-    heard = np.array(list(parts.localizer._learned.heard.values()))
+    heard = np.array(list(parts.localizer.sources._learned.heard.values()))
     assert len(heard) == len(estimates) - 2
     assert np.abs(heard[:, 0]).max() < 2 * SPEED
     assert heard[:, 0].min() > 0.0

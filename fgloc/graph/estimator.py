@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -83,11 +83,33 @@ class Estimator(ABC):
         )
         return self._take(frame)
 
+    def revise(self, motions: Mapping[int, Sequence[MotionMeasurement]]) -> None:
+        """Replace the motion factors of keyframes that the estimator still holds; the newest belief follows.
+
+        Older ones are changed in the log alone, for the batch smoother.
+        """
+        for k, changed in motions.items():
+            self.log.keyframes[k].motions = tuple(changed)
+        if motions and self.belief is not None:
+            self._solve_again(sorted(motions))
+            self.belief = self.log.keyframes[self._k].belief
+
     def _take(self, frame: Keyframe) -> Belief:
         self._solve(frame)
         self.log.append(frame)
         self.belief = frame.belief
         return frame.belief
+
+    def _solve_again(self, changed: Sequence[int]) -> None:
+        """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
+        for k in range(changed[0], self._k + 1):
+            before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
+            if before is None or frame.prior is not None:
+                continue
+            motion, cov = fuse(frame.motions)
+            pose = se2.compose(before.belief.pose, motion)
+            frame.belief = Belief(pose, se2.compose_cov(before.belief.cov, motion, cov))
+            self._solve(frame)
 
     @abstractmethod
     def _solve(self, frame: Keyframe) -> None:

@@ -27,10 +27,16 @@ from fgloc.types import (
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
+_MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
 
 
 class _Backend(Protocol):
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> None: ...
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
+        """Add a keyframe; the slots of its factors, in their order."""
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        """Put factors in the place of those in these slots; their own slots."""
+
     def pose(self, k: int) -> FloatArray: ...
     def covariance(self, k: int) -> FloatArray: ...
 
@@ -41,8 +47,13 @@ class _FixedLag:
     def __init__(self, config: EstimatorConfig) -> None:
         self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config))
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> None:
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
         self._smoother.update(graph, values, dict.fromkeys(values.keys(), elapsed_s))
+        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        self._smoother.update(graph, gtsam.Values(), {}, slots)
+        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
     def pose(self, k: int) -> FloatArray:
         return _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
@@ -57,8 +68,11 @@ class _Full:
     def __init__(self, config: EstimatorConfig) -> None:
         self._isam2 = gtsam.ISAM2(isam2_params(config))
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> None:
-        self._isam2.update(graph, values)
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
+        return list(self._isam2.update(graph, values).getNewFactorsIndices())
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
 
     def pose(self, k: int) -> FloatArray:
         return _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
@@ -74,20 +88,70 @@ class IncrementalEstimator(Estimator):
         super().__init__(config, factors, keep_all)
         self._backend: _Backend | None = None
         self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
+        self._slots: dict[int, tuple[float, list[int]]] = {}  # keyframe -> elapsed_s, slots of its motion factors
 
     def _solve(self, frame: Keyframe) -> None:
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
             self._backend = self._new_backend()
+            self._slots.clear()
         backend, initial = self._backend, frame.belief.pose
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
-            backend.update(graph, values, frame.k, frame.elapsed_s)
+            self._keep_slots(frame, backend.update(graph, values, frame.k, frame.elapsed_s))
             belief = Belief(backend.pose(frame.k), backend.covariance(frame.k))
             if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
                 raise ValueError("estimate is not finite")
             frame.belief = belief
         except _GTSAM_ERRORS:
             self._rebuild(frame, initial)
+
+    def _solve_again(self, changed: Sequence[int]) -> None:
+        """Swap the motion factors of these keyframes, as far as the window holds them."""
+        backend = self._backend
+        if backend is None:
+            return
+        frames = [self.log.keyframes[k] for k in changed if k in self._slots]
+        newest = self.log.keyframes[self._k]
+        graph, slots = gtsam.NonlinearFactorGraph(), []
+        for frame in frames:
+            slots += self._slots[frame.k][1]
+            for motion in frame.motions:
+                graph.add(motion_factor(frame.k, motion))
+        try:
+            new = backend.swap(graph, slots) if frames else []
+            newest.belief = Belief(backend.pose(newest.k), backend.covariance(newest.k))
+        except _GTSAM_ERRORS:
+            self.rebuilt += 1
+            newest.belief = self._replayed(self._window(newest), newest.belief.pose)
+            return
+        for frame in frames:
+            held, new = new[: len(frame.motions)], new[len(frame.motions) :]
+            self._slots[frame.k] = frame.elapsed_s, held
+
+    def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: Belief | None = None) -> None:
+        """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""
+        if frame.prior is None and prior is None:
+            self._slots[frame.k] = frame.elapsed_s, list(slots[: len(frame.motions)])
+        if self._config.kind == "fixed_lag":
+            horizon = frame.elapsed_s - self._config.lag_s
+            while self._slots:
+                oldest = next(iter(self._slots))
+                before = self.log.keyframes.get(oldest - 1)
+                if before is not None and before.elapsed_s > horizon + _MARGIN_S:
+                    break
+                if oldest == frame.k:
+                    break
+                del self._slots[oldest]
+
+    def _window(self, frame: Keyframe) -> list[Keyframe]:
+        """Logged keyframes that are in the window together with this one: of its segment, unless all are kept."""
+        if self._config.kind != "fixed_lag":
+            return list(self.log.keyframes.values())
+        if frame.prior is not None:
+            return []
+        frames = list(self.log.since(frame.elapsed_s - self._config.lag_s))
+        starts = [i for i, f in enumerate(frames) if f.prior is not None]
+        return frames[starts[-1] :] if starts else frames
 
     def _graph_of(
         self, frame: Keyframe, initial: FloatArray, prior: Belief | None
@@ -127,10 +191,8 @@ class IncrementalEstimator(Estimator):
         self.rebuilt += 1
         frame.refused = (*frame.refused, *frame.sightings)
         frame.sightings = ()
-        lag = self._config.lag_s if self._config.kind == "fixed_lag" else np.inf
-        frames = [f for f in self.log.since(frame.elapsed_s - lag) if frame.prior is None]
         try:
-            frame.belief = self._replayed([*frames, frame], initial)
+            frame.belief = self._replayed([*self._window(frame), frame], initial)
         except _GTSAM_ERRORS:  # an older sighting is at fault; what the window knew is in the prediction
             frame.belief = self._replayed([frame], initial)
 
@@ -138,13 +200,14 @@ class IncrementalEstimator(Estimator):
         """Give these keyframes to a new backend; the belief of the last, whose pose starts at ``initial``."""
         self._backend = backend = self._new_backend()
         self._landmarks.clear()
+        self._slots.clear()
         newest = frames[-1].k
         for i, held in enumerate(frames):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
             graph, values = self._graph_of(held, initial if held.k == newest else held.belief.pose, prior)
-            backend.update(graph, values, held.k, held.elapsed_s)
+            self._keep_slots(held, backend.update(graph, values, held.k, held.elapsed_s), prior)
         return Belief(backend.pose(newest), backend.covariance(newest))
 
     def _new_backend(self) -> _Backend:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Step
+from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 
 @dataclass(slots=True, eq=False)
@@ -45,6 +45,8 @@ class Keyframe:
     refused: tuple[Sighting, ...] = ()  # not believed online; the batch looks again
     step: Step | None = None  # what was heard, to be measured again
     mode: Mode = Mode.OK
+    readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
+    off: frozenset[str] = frozenset()  # ... and which of them were not believed
 
 
 @dataclass(slots=True)

@@ -61,6 +61,11 @@ class WheelMotion:
         self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
 
     @property
+    def stands_in(self) -> bool:
+        """Whether there are no wheels to hear, and commands stand in for them."""
+        return self._chosen == "command"
+
+    @property
     def rejections(self) -> Counter[str]:
         """What could not be used so far, by reason."""
         counts = Counter({"wheels.silence": self._silent_steps} if self._silent_steps else {})

@@ -1,0 +1,163 @@
+"""The motion sources side by side, and what of them enters the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.log import Belief
+from fgloc.motion.joint import JointCalibration
+from fgloc.motion.source import LearnedMotion
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.types import FloatArray, MotionMeasurement, Readings, Step
+
+_SAYS_NOTHING = 1e2  # m²: a gyro knows no position
+_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
+_SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
+_SLIP_LASTS_S = 1.0  # ... for this long in one direction
+
+
+class MotionSources:
+    """Wheels, learned motion and gyro."""
+
+    def __init__(
+        self,
+        config: Config,
+        wheels: WheelMotion,
+        learned: LearnedMotion | None = None,
+        joint: JointCalibration | None = None,
+        gyro: Gyro | None = None,
+    ) -> None:
+        """Take the sources.
+
+        Args:
+            config: of all of them.
+            wheels: wheel odometry.
+            learned: the learned motion, if any.
+            joint: its correlation with the wheels; None: the two are taken as independent.
+            gyro: the gyro, if any.
+        """
+        self._config = config
+        self._wheels = wheels
+        self._learned = learned
+        self._joint = joint
+        self.gyro = gyro
+        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
+
+    @property
+    def gyro_is_read(self) -> bool:
+        """Whether the learned motion has the gyro in it already."""
+        return self._learned is not None and "gyro" in self._learned.model.card.inputs
+
+    def read(self, step: Step, blind_s: float = 0.0, velocity: FloatArray | None = None) -> Readings:
+        """Ask every source once.
+
+        Args:
+            step: what was heard.
+            blind_s: time before the step without a fix.
+            velocity: ``(2,)`` at its start, if known better than by the learned model itself.
+        """
+        if step.dt <= 0.0:
+            return Readings()
+        wheels = self._wheels.measure(step)
+        motion = np.zeros(3) if wheels is None else wheels.motion
+        gyro = None
+        if self.gyro is not None:
+            turn = self.gyro.measure(step, None if wheels is None else motion, blind_s)
+            if turn is not None:
+                cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
+                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
+        return Readings(wheels, self._measure_learned(step, velocity), gyro)
+
+    def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
+        """The readings with the learned motion evaluated at a better velocity."""
+        return replace(readings, learned=self._measure_learned(step, velocity))
+
+    def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+        if self._learned is None:
+            return None
+        return self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+
+    def combine(self, readings: Readings, off: Container[str] = ()) -> list[MotionMeasurement]:
+        """Factors of a step, independent of each other.
+
+        Args:
+            readings: what the sources say.
+            off: sources that are not to be trusted. The wheels' factor is then left out or, if nothing else knows the
+                distance, kept with room for a slip. The other sources enter as they are.
+        """
+        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        if learned is None or "learned" in off:
+            learned = None
+        if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
+            gyro = None
+        if wheels is not None and "wheels" in off:
+            wheels = None if learned is not None else slipping(wheels)
+        elif wheels is not None and learned is not None:
+            if self._wheels.stands_in:  # made of the very commands that the model reads
+                wheels = None
+            elif self._joint is not None:
+                learned = self._joint.decorrelate(wheels, learned)
+        known = [m for m in (wheels, learned) if m is not None]
+        if gyro is not None and known:
+            known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
+        return known
+
+    def disagreement(self, readings: Readings) -> tuple[FloatArray, FloatArray] | None:
+        """How far the wheels and the sources that witness their slip are apart over the step.
+
+        Returns:
+            Difference ``(3,)`` in the body frame and the covariance ``(3, 3)`` that it has if both are right; None
+            where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand in
+            for wheels.
+        """
+        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        if wheels is None or self._wheels.stands_in:
+            return None
+        if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
+            d = se2.log(se2.between(wheels.motion, learned.motion))
+            if self._joint is None:
+                return d, wheels.cov + learned.cov
+            return d, self._joint.difference_cov(wheels.cov, learned.cov)
+        if gyro is None:
+            return None
+        d = np.array([0.0, 0.0, se2.wrap(float(gyro.motion[2] - wheels.motion[2]))])
+        return d, np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
+
+    def unknown(self, step: Step) -> MotionMeasurement:
+        """Nothing spoke: sigma grows with the time of silence, however many steps it is cut into."""
+        before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
+        gate = self._config.gate
+        speed, turn = _LIKELY * gate.max_speed, _LIKELY * gate.max_yaw_rate
+        cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
+
+    def told(self, belief: Belief | None = None) -> None:
+        """A motion source or, if a belief is given, a fix has told where the robot went."""
+        self._silent_s = 0.0
+        if belief is not None and self.gyro is not None:
+            self.gyro.fix(float(belief.pose[2]), float(belief.cov[2, 2]))
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of what happened in between."""
+        self._silent_s = 0.0
+        if self.gyro is not None:
+            self.gyro.forget_fix()
+
+
+def slipping(m: MotionMeasurement) -> MotionMeasurement:
+    """The wheels' motion with room for a slip: the robot may do anything between what they say and nothing."""
+    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
+    speed = np.hypot(*m.motion[:2]) / seconds
+    turn = abs(float(m.motion[2])) / seconds
+    density = np.square([max(speed, _SLIP_SPEED), max(0.3 * speed, 0.3 * _SLIP_SPEED), max(turn, _SLIP_TURN)])
+    return replace(m, cov=m.cov + np.diag(density * _SLIP_LASTS_S * seconds))
+
+
+def _turned(motion: FloatArray, yaw: float) -> FloatArray:
+    return np.array([motion[0], motion[1], yaw])

@@ -1,0 +1,145 @@
+"""Yaw rate of an IMU, rid of its bias."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fgloc.config import GyroConfig
+from fgloc.types import ImuEvent, Step
+
+_MAX_GAP_S = 0.1  # over a longer silence the turn is not known
+_AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
+_STILL_RATE = 0.03  # rad/s on top of what the bias may be: a robot that turns faster is not at rest
+_STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
+_GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
+_APART_S = 2.0  # ... and another one after at least this long
+_REST_M, _REST_RAD = 1e-3, 1e-3  # of wheel motion a second: quantization is no motion
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """How far the robot turned over a step.
+
+    Attributes:
+        yaw: [rad], rid of the bias.
+        variance: [rad²], of the noise and of what the bias may be off.
+    """
+
+    yaw: float
+    variance: float
+
+
+class Gyro:
+    """Integrates the yaw rate over steps and keeps an estimate of its bias (a scalar Kalman filter).
+
+    The bias is learned while the wheels stand, and between fixes of the yaw.
+
+    Attributes:
+        bias: [rad/s].
+        bias_variance: [rad²/s²].
+        rejections: steps without a turn, by reason: ``gyro.silence``.
+    """
+
+    def __init__(self, config: GyroConfig, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Set up.
+
+        Args:
+            config: noise of the gyro.
+            up: ``(3,)`` the base's z axis in the IMU's frame.
+        """
+        self.bias = 0.0
+        self.bias_variance = config.bias_sigma**2
+        self.rejections: Counter[str] = Counter()
+        self._config = config
+        self._up = np.asarray(up, dtype=float)
+        self._standing_s = 0.0
+        self._anchor: tuple[float, float] | None = None  # yaw and variance of the last fix ...
+        self._turned = self._turned_s = 0.0  # ... and what was turned since
+        self._heard = False
+        self.forget_fix()
+
+    def measure(self, step: Step, wheels: ArrayLike | None, blind_s: float = 0.0) -> Turn | None:
+        """Turn over the step.
+
+        Args:
+            step: with the IMU's messages.
+            wheels: ``(3,)`` what the wheels say of the step: where they stand, the bias shows.
+            blind_s: how long before the step nothing but motion has told the yaw. A wrong bias turns all steps alike,
+                so that its variance grows with the square of that time, however it is cut into steps.
+
+        Returns:
+            None if the gyro was silent; once it has spoken, that is counted.
+        """
+        dt = step.dt
+        raw = None if dt <= 0.0 else self._integral(step.imu, step.start_ns, step.stamp_ns)
+        if raw is None:
+            self._standing_s = 0.0
+            if self._heard:
+                self.rejections["gyro.silence"] += 1
+            self.forget_fix()
+            return None
+        self._heard = True
+        self.bias_variance += self._config.bias_walk**2 * dt
+        self._watch_rest(raw / dt, dt, wheels)
+        yaw = raw - self.bias * dt
+        self._turned += yaw
+        self._turned_s += dt
+        drift = self.bias_variance * ((blind_s + dt) ** 2 - blind_s**2)
+        noise = self._config.yaw_per_sqrt_s**2 * dt + self._config.scale_sigma**2 * abs(yaw)
+        return Turn(yaw, noise + drift)
+
+    def fix(self, yaw: float, variance: float) -> None:
+        """Take in the yaw at the end of the last step, as sightings have told it; two of them teach the bias.
+
+        Args:
+            yaw: [rad].
+            variance: [rad²].
+        """
+        if variance > _GOOD_YAW**2:
+            return
+        if self._anchor is not None:
+            if self._turned_s < _APART_S:
+                return
+            before, spread = self._anchor
+            error = math.remainder(self._turned - (yaw - before), math.tau)
+            noise = self._config.yaw_per_sqrt_s**2 * self._turned_s
+            self._learn(self.bias + error / self._turned_s, (spread + variance + noise) / self._turned_s**2)
+        self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
+
+    def forget_fix(self) -> None:
+        """The robot may have been turned unheard since the last fix."""
+        self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
+
+    def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
+        stands = False
+        if wheels is not None:
+            x, y, yaw = np.asarray(wheels, dtype=float)
+            stands = math.hypot(x, y) < _REST_M * max(dt, 0.1) and abs(yaw) < _REST_RAD * max(dt, 0.1)
+        still = abs(rate - self.bias) < _STILL_RATE + 3.0 * math.sqrt(self.bias_variance)
+        self._standing_s = self._standing_s + dt if stands and still else 0.0
+        if self._standing_s > _AT_REST_S:
+            self._learn(rate, self._config.yaw_per_sqrt_s**2 / dt + _STILL_SIGMA**2)
+
+    def _learn(self, bias: float, variance: float) -> None:
+        gain = self.bias_variance / (self.bias_variance + variance)
+        self.bias += gain * (bias - self.bias)
+        self.bias_variance *= 1.0 - gain
+
+    def _integral(self, events: tuple[ImuEvent, ...], start_ns: int, end_ns: int) -> float | None:
+        """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""
+        if not events:
+            return None
+        up = self._up
+        times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in events])
+        rates = np.array([event.angular_velocity for event in events]) @ up
+        end = (end_ns - start_ns) * 1e-9
+        inside = times[(times > 0.0) & (times < end)]
+        nodes = np.concatenate([[0.0], inside, [end]])
+        if max(times[0], end - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
+            return None
+        return float(np.trapezoid(np.interp(nodes, times, rates), nodes))

@@ -1,0 +1,114 @@
+"""Which motion sources are believed, step by step, and since when not."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgloc.config import WeightsConfig
+from fgloc.disagreement import Disagreement
+from fgloc.motions import MotionSources
+from fgloc.types import FloatArray, Readings, Step
+
+_MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
+_LEAST_M = 0.03  # of a wheel's travel: less says nothing
+_EVIDENCE_S = 1.0  # of travel from which a kind of failure is told
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What is thought of the motion sources.
+
+    Attributes:
+        off: source -> why it is not believed.
+        span: for how many of the newest steps, this one included; more than one where a failure is seen only now.
+        nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
+    """
+
+    off: Mapping[str, str] = field(default_factory=dict)
+    span: int = 1
+    nis: float = math.nan
+
+
+class SourceTrust:
+    """Watches wheels and their witness for a disagreement; known failures are taken as given.
+
+    Attributes:
+        flags: how often each source was flagged, by "source.reason".
+    """
+
+    def __init__(self, config: WeightsConfig, sources: MotionSources, track_m: float | None) -> None:
+        """Set up.
+
+        Args:
+            config: thresholds, and known failures.
+            sources: says what the difference of two readings means.
+            track_m: distance of the wheels, to tell left from right; None: unknown.
+        """
+        self.flags: Counter[str] = Counter()
+        self._config = config
+        self._sources = sources
+        self._track_m = track_m
+        self._disagreement = Disagreement(config)
+        self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
+        self._first_ns: int | None = None
+        self._reason = "slip"
+
+    def reset(self) -> None:
+        """A new segment."""
+        self._disagreement.reset()
+        self._travels.clear()
+
+    def judge(self, step: Step, readings: Readings) -> Trust:
+        """Take in what the sources say of a step that follows the last one."""
+        if self._first_ns is None:
+            self._first_ns = step.start_ns
+        off = self._known_failures(step)
+        difference = self._sources.disagreement(readings) if self._config.adaptive else None
+        if difference is None:
+            return Trust(off)
+        verdict = self._disagreement.judge(step.dt, *difference)
+        self._travelled(step.dt, readings)
+        if not verdict.flagged:
+            return Trust(off, nis=verdict.nis)
+        if verdict.since:
+            self._reason = "slip"
+        reason = self._failure(verdict.since)
+        if verdict.since or reason != self._reason:
+            self.flags[f"wheels.{reason}"] += 1
+            self._reason = reason
+        return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+
+    def _known_failures(self, step: Step) -> dict[str, str]:
+        start = (step.start_ns - (self._first_ns or 0)) * 1e-9
+        end = start + step.dt
+        return {d.source: "distrusted" for d in self._config.distrust if start < d.end_s and end > d.start_s}
+
+    def _travelled(self, dt: float, readings: Readings) -> None:
+        witness = readings.learned or readings.gyro
+        if readings.wheels is None or witness is None:
+            return
+        self._travels.append((dt, readings.wheels.motion, witness.motion))
+        while sum(t for t, _, _ in self._travels) - self._travels[0][0] > _EVIDENCE_S:
+            self._travels.popleft()
+
+    def _failure(self, since: int) -> str:
+        """What kind of failure it looks like: which wheel stood still while the robot went on."""
+        newest = list(self._travels)[-since:] if since else list(self._travels)
+        half = 0.5 * (self._track_m or 0.0)
+
+        def sides(motion: FloatArray) -> FloatArray:
+            return np.array([motion[0] - half * motion[2], motion[0] + half * motion[2]])
+
+        told = sum((np.abs(sides(w)) for _, w, _ in newest), np.zeros(2))
+        did = sum((np.abs(sides(n)) for _, _, n in newest), np.zeros(2))
+        stood = (told < _MOVED * did) & (did > _LEAST_M)
+        if stood.all():
+            return "frozen"
+        if self._track_m is None or not stood.any():
+            return self._reason if not since else "slip"
+        return "left_wheel_dead" if stood[0] else "right_wheel_dead"
