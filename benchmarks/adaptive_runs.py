@@ -1,0 +1,217 @@
+"""One cell of the benchmark of adaptive weights: a failure on a floor, replayed for some seeds with some configuration.
+
+    >>> from benchmarks.adaptive_runs import ORACLE, OURS, cell
+    >>> cell("slip", (22, 23), OURS, split="validation")  # doctest: +SKIP
+
+Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch come
+from the same replay.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
+from fgloc.ablation.failures import AnyFailure, Failure, Scene, generators, spoil
+from fgloc.config import Config
+from fgloc.errors import EstimatorError
+from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.runner import run
+from fgloc.sensors.maps import write_map
+from fgloc.types import CornersEvent, Decision, Estimate, FloatArray, Mode, RunResult, Step, Trajectory
+
+Changes = Mapping[str, Any]
+Interval = tuple[float, float]
+
+FAILED_S = (30.0, 50.0)  # when encoders fail
+KIDNAPPED_S, KIDNAPPED_M = 30.0, 3.0
+MOVED_M = 0.5
+_FAILURE = TypeAdapter(AnyFailure)
+_OFF_M, _OFF_RAD = 0.3, 0.2  # nearer to the truth than this, a kidnapped robot is found again
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A failure on a floor."""
+
+    floor: Floor
+    chain: Callable[[Recorded], list[dict[str, Any]]] = lambda recorded: []
+    wheels_wrong: Callable[[Recorded], list[Interval]] = lambda recorded: []  # what the oracle is told [s]
+
+
+def _dark(length_s: float) -> Case:
+    start = 0.5 * (80.0 - length_s)
+    failure = {"kind": "dropout", "sensor": "camera", "when": {"intervals": [(start, start + length_s)]}}
+    return Case("patches", lambda recorded: [failure], slip_intervals)
+
+
+def _wrong_ids(share: float) -> Case:
+    return Case("unequal_radii", lambda recorded: [{"kind": "wrong_ids", "probability": share}])
+
+
+def _encoders(failure: dict[str, Any]) -> Case:
+    told = failure | {"when": {"intervals": [FAILED_S]}}
+    return Case("unequal_radii", lambda recorded: [told], lambda recorded: [(FAILED_S[0], FAILED_S[1] + 0.2)])
+
+
+CASES: dict[str, Case] = {
+    "none": Case("unequal_radii"),
+    "slip": Case("patches", wheels_wrong=slip_intervals),
+    "mu01": Case("slippery", wheels_wrong=slip_intervals),
+    "dark30": _dark(30.0),
+    "dark60": _dark(60.0),
+    "ids10": _wrong_ids(0.1),
+    "ids30": _wrong_ids(0.3),
+    "ids50": _wrong_ids(0.5),
+    "moved": Case(
+        "unequal_radii",
+        lambda recorded: [{"kind": "moved_marker", "ids": [moved_id(recorded)], "distance_m": MOVED_M}],
+    ),
+    "frozen": _encoders({"kind": "encoder_frozen"}),
+    "onewheel": _encoders({"kind": "encoder_dead", "wheel": "left"}),
+    "kidnap": Case(
+        "unequal_radii",
+        lambda recorded: [
+            {"kind": "kidnap", "when": {"intervals": [moved_interval(recorded, KIDNAPPED_S, KIDNAPPED_M)]}}
+        ],
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """One run: its figures online and, if it was smoothed, in batch."""
+
+    recorded: Recorded
+    online: RunResult
+    metrics: Metrics
+    batch: Metrics | None
+    step_ms: FloatArray
+
+    @property
+    def ate_m(self) -> float:
+        """Mean distance from the truth, online [m]."""
+        return _known(self.metrics.ate_mean_m)
+
+    @property
+    def nees_over_3(self) -> float:
+        """Of the online estimates."""
+        return _known(self.metrics.nees_over_3)
+
+    @property
+    def batch_ate_m(self) -> float:
+        """Mean distance from the truth of the smoothed trajectory [m]; NaN if it was not smoothed."""
+        return np.nan if self.batch is None else _known(self.batch.ate_mean_m)
+
+    @property
+    def batch_nees_over_3(self) -> float:
+        """Of the smoothed trajectory; NaN if it was not smoothed."""
+        return np.nan if self.batch is None else _known(self.batch.nees_over_3)
+
+
+def cell(
+    name: str,
+    seeds: Iterable[int],
+    changes: Changes | None = None,
+    *,
+    oracle: bool = False,
+    batch: bool = False,
+    split: Split = "test",
+) -> list[Outcome]:
+    """Replay a case for each seed.
+
+    Args:
+        name: of `CASES`.
+        seeds: of the split's recordings.
+        changes: of the configuration, as nested mappings.
+        oracle: tell the weights when the wheels are wrong.
+        batch: smooth as well.
+        split: of the simulated suite.
+    """
+    case = CASES[name]
+    outcomes = []
+    for seed in seeds:
+        recorded = load(case.floor, split, seed)
+        chain = [_FAILURE.validate_python(failure) for failure in case.chain(recorded)]
+        config = changed(recorded.config, changes or {})
+        if oracle:
+            config = changed(config, distrusting(case.wheels_wrong(recorded)))
+        outcomes.append(replay(recorded, config, chain, seed, batch))
+    return outcomes
+
+
+def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Outcome:
+    """One run of a recording with failures.
+
+    Raises:
+        FglocError: no pose was ever found, or the configuration does not fit.
+    """
+    ids = tuple(sorted(recorded.landmarks.landmarks))
+    scenes = [Scene(recorded.start_ns, recorded.duration_s, config, ids, rng) for rng in generators(len(chain), seed)]
+    estimates: list[Estimate] = []
+
+    def note(_: Step, estimate: Estimate | None) -> None:
+        if estimate is not None:
+            estimates.append(estimate)
+
+    with tempfile.TemporaryDirectory() as folder:
+        map_path, landmarks = recorded.map_path, recorded.landmarks
+        for failure, scene in zip(chain, scenes, strict=True):
+            landmarks = failure.spoil_map(landmarks, scene)
+        if landmarks is not recorded.landmarks:
+            map_path = Path(folder) / "map.yaml"
+            write_map(landmarks, map_path)
+        result = run(
+            recorded.bag,
+            map_path,
+            config,
+            "batch" if batch else "online",
+            on_step=note,
+            events=lambda _: spoil(chain, "recorded", iter(recorded.events), scenes),
+            sightings=lambda events: spoil(chain, "sightings", events, scenes),
+        )
+    online = replace(
+        result,
+        trajectory=Trajectory(
+            np.array([e.stamp_ns for e in estimates], dtype=np.int64),
+            np.array([e.pose for e in estimates]),
+            np.array([e.cov for e in estimates]),
+        ),
+        modes=tuple(e.mode for e in estimates),
+    )
+    smoothed = compute_metrics(result, config) if batch else None
+    return Outcome(recorded, online, compute_metrics(online, config), smoothed, result.step_ms)
+
+
+def changed(config: Config, changes: Changes) -> Config:
+    """The configuration with some of its values replaced."""
+
+    def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+        return {**old, **{k: merged(old[k], v) if isinstance(v, Mapping) else v for k, v in new.items()}}
+
+    return Config.model_validate(merged(config.model_dump(), changes))
+
+
+def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:
+    """Configuration that tells when the wheels are wrong."""
+    return {"weights": {"distrust": [{"source": "wheels", "start_s": a, "end_s": b} for a, b in intervals]}}
+
+
+def moved_id(recorded: Recorded) -> int:
+    """The marker that is seen most often: moving another might change nothing."""
+    seen = [s.marker_id for e in recorded.events if isinstance(e, CornersEvent) for s in e.sightings]
+    ids, counts = np.unique(seen, return_counts=True)
+    return int(ids[int(np.argmax(counts))])
+
+
+def _known(value: float | None) -> float:
+    if value is None:
+        raise EstimatorError("the run and the truth have no time in common; nothing can be compared")
+    return value
