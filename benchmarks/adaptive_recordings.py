@@ -1,9 +1,9 @@
 """Recordings for the benchmark of adaptive weights: simulated and searched for markers once, then kept.
 
-They lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by the hash of
-what made them, so that a change of the simulator or of the detector makes them anew. Floors are those of the simulated
-suite with the control functions of the split; test and validation use seeds of their own, which neither the suite's
-training nor the tuning of any setting has seen.
+They lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by the hash
+of what made them, so that a change of the simulator or of the detector makes them anew. Floors are those of the
+simulated suite with the control functions of the split; test and validation use seeds of their own, which neither the
+suite's training nor the tuning of any setting has seen.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -142,7 +142,7 @@ def load(floor: Floor, split: Split, seed: int) -> Recorded:
 
 
 def slip_intervals(recorded: Recorded, least_s: float = 0.1, join_s: float = 0.3) -> list[tuple[float, float]]:
-    """When wheels slipped, by the simulator [s from the start]: closer than ``join_s`` is one, shorter ones are left out."""
+    """When wheels slipped, by the simulator [s from the start]; closer than ``join_s`` is one, short ones are left out."""
     out: list[tuple[float, float]] = []
     for t, slips in zip(recorded.slip_s.tolist(), recorded.slipping.tolist(), strict=True):
         if slips:
@@ -232,7 +232,7 @@ def _slip(bag: Path, start_ns: int) -> tuple[FloatArray, FloatArray, NDArray[np.
     with AnyReader([bag]) as reader:
         wanted = [c for c in reader.connections if c.topic in ("/truth/slip", "/truth/slipping")]
         for connection, _, raw in reader.messages(wanted):
-            message = reader.deserialize(raw, connection.msgtype)
+            message: Any = reader.deserialize(raw, connection.msgtype)
             if connection.topic == "/truth/slipping":
                 flags.append(bool(message.data))
                 continue

@@ -3,15 +3,15 @@
     >>> from benchmarks.adaptive_runs import ORACLE, OURS, cell
     >>> cell("slip", (22, 23), OURS, split="validation")  # doctest: +SKIP
 
-Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch come
-from the same replay.
+Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch
+come from the same replay.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from fgloc.errors import EstimatorError
 from fgloc.evaluation.metrics import Metrics, compute_metrics
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import CornersEvent, Decision, Estimate, FloatArray, Mode, RunResult, Step, Trajectory
+from fgloc.types import CornersEvent, Estimate, FloatArray, RunResult, Step, Trajectory
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]

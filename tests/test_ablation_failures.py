@@ -2,7 +2,7 @@
 
 import math
 import typing
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -140,7 +140,8 @@ def test_unknown_keys_and_empty_intervals_are_refused():
 def test_no_failure_touches_the_truth_or_an_instant_outside_its_interval(kind):
     failure = make(kind, **({"sensor": "wheels"} if "sensor" in FIELDS[kind] else {}))
     if failure.timed:
-        failure = failure.model_copy(update={"when": failure.when.model_copy(update={"intervals": ((50.0, 60.0),)})})
+        later = failure.when.model_copy(update={"intervals": ((50.0, 60.0),), "bursts": 0})
+        failure = failure.model_copy(update={"when": later})
         before = driving()
         after = list(failure.apply(iter(before), scene()))
         assert all(a is b or same(a, b) for a, b in zip(before, after, strict=True))
@@ -400,6 +401,53 @@ def test_imu_bias_adds():
     event = of(ImuEvent, apply("imu_bias", driving(), yaw_rate=0.05, acceleration=(0.1, 0.0, 0.0)))[0]
     assert event.angular_velocity == pytest.approx([0.0, 0.0, 0.35])
     assert event.linear_acceleration == pytest.approx([0.1, 0.0, 9.81])
+
+
+# --- kidnap ---
+
+
+def test_kidnap_cuts_a_piece_out_of_all_sensors_and_closes_the_gap():
+    before = driving()
+    after = apply("kidnap", before, when={"intervals": [(1.95, 3.95)]})
+    for kind in {type(e) for e in before}:
+        left, whole = of(kind, after), of(kind, before)
+        assert len(left) == len(whole) - 20
+        assert all(a is b for a, b in zip(left[:20], whole[:20], strict=True))
+        assert [e.stamp_ns for e in left[20:]] == [e.stamp_ns - 2 * 10**9 for e in whole[40:]]
+    assert (np.diff(seconds(after)) >= 0.0).all()
+
+
+def test_kidnapped_wheels_tell_of_no_motion_and_go_on():
+    after = apply("kidnap", driving(), when={"intervals": [(1.95, 3.95)]})
+    for events, n in ((after[: 6 * 21], 19), (after, 78)):  # the step over the cut is one of standing still
+        by_pose, _, by_angle, _ = travelled(events)
+        assert by_pose == pytest.approx([0.1 * n * 0.4, 0.1 * n * 0.3])
+        assert by_angle == pytest.approx([0.1 * n * (0.4 - 0.5 * TRACK * 0.3), 0.1 * n * (0.4 + 0.5 * TRACK * 0.3)])
+
+
+def test_kidnap_twice_and_late_messages_stay_with_their_time():
+    late = [replace(image(0.1 * k), received_ns=round((0.1 * k + 0.25) * 1e9)) for k in range(100)]
+    before = sorted([*driving(), *late], key=lambda e: e.received_ns)
+    after = apply("kidnap", before, when={"intervals": [(6.95, 7.95), (1.95, 3.95), (3.05, 4.95)]})
+    stamps = np.array([e.stamp_ns for e in of(type(late[0]), after)]) * 1e-9
+    assert np.allclose(stamps, 0.1 * np.arange(60))
+    assert (np.diff(seconds(after)) >= 0.0).all()
+    by_pose, _, by_angle, _ = travelled(after)
+    assert by_pose == pytest.approx([5.7 * 0.4, 5.7 * 0.3])
+    assert by_angle[1] == pytest.approx(5.7 * (0.4 + 0.5 * TRACK * 0.3))
+
+
+def test_a_topic_that_begins_after_the_kidnap_is_only_shifted():
+    before = [e for e in driving() if not isinstance(e, JointsEvent) or e.stamp_ns > 4.5e9]
+    after = apply("kidnap", before, when={"intervals": [(1.95, 3.95)]})
+    told, exact = of(JointsEvent, after), of(JointsEvent, before)
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(told, exact, strict=True))
+
+
+def test_kidnap_needs_bounds_and_takes_all():
+    for when in ({"after_s": 1.0}, {"intervals": [(1.0, 2.0)], "share": 0.5}):
+        with pytest.raises(ValidationError, match="kidnap cuts whole pieces out"):
+            make("kidnap", when=when)
 
 
 # --- chains ---

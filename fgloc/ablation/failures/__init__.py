@@ -10,6 +10,7 @@ from pydantic import Field
 
 from fgloc.ablation.failures.base import Failure, Scene
 from fgloc.ablation.failures.camera import Darkness, FrameRate, MirroredImage
+from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.ablation.failures.messages import (
     EncoderFrozen,
     EncoderRollover,
@@ -37,6 +38,7 @@ AnyFailure = Annotated[
     | ClockOffset
     | DuplicatedMessages
     | Truncated
+    | Kidnap
     | WheelSlip
     | EncoderDead
     | EncoderFrozen

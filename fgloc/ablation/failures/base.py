@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import heapq
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -117,7 +119,8 @@ class Failure(Section):
     """One way in which sensors fail: a filter of events, drawn anew for each run from the scene's generator.
 
     Failures of stage "sightings" act once markers are found: after detection, or on recorded sightings. No failure
-    touches the truth or the transforms, save that a truncated recording ends for all.
+    touches the truth or the transforms, save that the recording ends early (truncated) or lacks a piece
+    (kidnap) for all.
     """
 
     stage: ClassVar[Literal["recorded", "sightings"]] = "recorded"
@@ -167,3 +170,15 @@ class EventFailure(Failure):
                 self.touch(scene)
             if changed is not None:
                 yield changed
+
+
+def by_receipt(events: Iterator[tuple[int, Event]]) -> Iterator[Event]:
+    """Sort events, each given with the time before which nothing more will arrive."""
+    waiting: list[tuple[int, int, Event]] = []
+    order = count()
+    for now_ns, event in events:
+        heapq.heappush(waiting, (event.received_ns, next(order), event))
+        while waiting and waiting[0][0] < now_ns:
+            yield heapq.heappop(waiting)[2]
+    while waiting:
+        yield heapq.heappop(waiting)[2]

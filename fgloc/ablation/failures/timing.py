@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene, Sensor
+from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene, Sensor, by_receipt
 from fgloc.types import Event
 
 
@@ -80,7 +78,7 @@ class Latency(Failure):
                         event = replace(event, received_ns=now_ns + late_ns, stamp_ns=stamp_ns)
                 yield now_ns, event
 
-        return _by_receipt(delayed())
+        return by_receipt(delayed())
 
 
 class DuplicatedMessages(Failure):
@@ -101,7 +99,7 @@ class DuplicatedMessages(Failure):
                     self.touch(scene)
                     yield event.received_ns, replace(event, received_ns=event.received_ns + round(self.after_s * 1e9))
 
-        return _by_receipt(doubled())
+        return by_receipt(doubled())
 
 
 class Truncated(Failure):
@@ -118,15 +116,3 @@ class Truncated(Failure):
                 yield event
             else:
                 self.touch(scene)
-
-
-def _by_receipt(events: Iterator[tuple[int, Event]]) -> Iterator[Event]:
-    """Sort events, each given with the time before which nothing more will arrive."""
-    waiting: list[tuple[int, int, Event]] = []
-    order = count()
-    for now_ns, event in events:
-        heapq.heappush(waiting, (event.received_ns, next(order), event))
-        while waiting and waiting[0][0] < now_ns:
-            yield heapq.heappop(waiting)[2]
-    while waiting:
-        yield heapq.heappop(waiting)[2]
