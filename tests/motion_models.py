@@ -16,7 +16,8 @@ def make_card(kind: str, **changes: Any) -> ModelCard:
     """A valid card; ``changes`` override its fields."""
     inputs = changes.get("inputs", ("commands", "velocity") if kind == "velocity" else ("commands",))
     edges = () if kind == "velocity" else tuple(0.1 * i for i in range(9))
-    n = 5 if kind == "velocity" else 16 + 2 * ("velocity" in inputs)
+    widths = {"velocity": 2, "gyro": 1, "effort": 2, "wheels": 2}
+    n = 5 if kind == "velocity" else 16 + sum(widths.get(name, 0) for name in inputs)
     fields: dict[str, Any] = dict(
         kind=kind,
         robot="test robot",
@@ -26,6 +27,7 @@ def make_card(kind: str, **changes: Any) -> ModelCard:
         hold_s=1.5,
         history_s=2.0,
         kinematics=dict(scale_v=0.95, scale_omega=0.9, delay_s=0.1),
+        joints=dict(left_radius=0.05, right_radius=0.05, track=0.26),
         lag=dict(delay_s=0.05, lag_s=(0.2, 0.3)) if kind == "velocity" else None,
         edges_s=edges,
         input_mean=(0.1,) * n,

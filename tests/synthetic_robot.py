@@ -8,12 +8,15 @@ import numpy as np
 
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.config import Config, WheelsConfig
+from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent
 from training.config import DataConfig
 from training.data import Run, make_run
+from training.heard import Heard
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
+RADIUS, TRACK, JOINTS = 0.05, 0.26, ("left_wheel", "right_wheel")
 GAIN_V, GAIN_OMEGA, DELAY, TAU = 0.9, 1.05, 0.08, 0.15
 
 
@@ -36,6 +39,32 @@ def drive(rng: np.random.Generator, seconds: float) -> tuple[list[CommandEvent],
         state = state + dt / TAU * (aim - state)
         pose = se2.compose(pose, se2.exp((state[0] * dt, 0.0, state[1] * dt)))
     return commands, T0 + np.round(t * SECOND).astype(np.int64), np.array(poses)
+
+
+def sensed(seed: int, seconds: float = 60.0, bias: float = 0.0) -> list[Event]:
+    """IMU at 100 Hz and joints at 50 Hz of the robot that `drive` drives: its left wheel is 2 % larger than nominal."""
+    _, stamps, poses = drive(np.random.default_rng(seed), seconds)
+    forward = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    turned = np.diff(np.unwrap(poses[:, 2]), prepend=poses[0, 2])
+    left, right = ((forward + side * 0.5 * TRACK * turned) / RADIUS for side in (-1.0, 1.0))
+    angles = np.cumsum(np.column_stack([left / 1.02, right]), axis=0)
+    out: list[Event] = []
+    for k, stamp in enumerate(stamps.tolist()):
+        rate = np.array([0.0, 0.0, turned[k] * 100.0 + bias])
+        out.append(ImuEvent(stamp, stamp, "/imu", "imu", rate, np.zeros(3), np.zeros((3, 3))))
+        if k % 2 == 0:
+            effort = np.array([0.1 + angles[k, 0] % 0.3, 0.2])
+            out.append(JointsEvent(stamp, stamp, "/joints", JOINTS, angles[k], np.zeros(2), effort))
+    return out
+
+
+def sensing(seed: int, seconds: float = 60.0, bias: float = 0.0) -> Run:
+    """A run with all signals."""
+    commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
+    geometry = {"left_radius": RADIUS, "right_radius": RADIUS, "track": TRACK}
+    config = Config(wheels=WheelsConfig(source="ticks", **geometry))
+    heard = Heard([*commands, *sensed(seed, seconds, bias)], config)
+    return make_run(f"run{seed}", heard, stamps, poses, 0.1, 2.0, DataConfig())
 
 
 def synthetic(seed: int, seconds: float = 60.0, dt_s: float = 0.1, name: str = "") -> Run:

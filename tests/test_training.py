@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from synthetic_robot import SECOND, synthetic, write_bag
+from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
+from fgloc import se2
 from fgloc.errors import ConfigError
 from fgloc.motion import load_model, save_model
-from fgloc.motion.card import Input
+from fgloc.motion.card import Input, Split
 from fgloc.motion.load import read_model
 from training import evaluate as evaluation
 from training import train as training
 from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run
 from training.export import card_of, tensors_of
-from training.rollouts import roll_kinematics, roll_model
+from training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +57,49 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
             got = model.predict(run.commands, start, start + steps * SECOND // 10, velocity)
             assert got is not None
             np.testing.assert_allclose(got.motion, poses[steps - 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "edges"),
+    [(("commands", "gyro"), (0.0,)), (("commands", "velocity", "gyro", "effort", "wheels"), (0.0, 0.1, 0.35))],
+)
+def test_torch_and_numpy_agree_on_measured_signals(
+    inputs: tuple[Input, ...], edges: tuple[float, ...], tmp_path: Path
+) -> None:
+    torch.manual_seed(1)
+    runs = {f"run{seed}": sensing(seed, 30.0, bias=0.01) for seed in (0, 1)}
+    network = NetworkConfig(hidden=(32, 32), inputs=inputs, signal_edges_s=edges)
+    split = Split(train=("run0",), validation=("run1",))
+    config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, split=split, network=network)
+    net = training.new_net(network, [runs["run0"]])
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape))
+    save_model(tmp_path / "m.safetensors", tensors_of([net]), card_of(net, config, split, "a test"))
+    run = runs["run1"]
+    rolled = roll_model(load_model(tmp_path / "m.safetensors"), run, 0.2)
+    samples, start = net.samples([run]), 20
+    poses = net.roll(samples, torch.tensor([start]), 20).detach().numpy()[0]
+    for steps in (2, 10, 20):  # of 0.1 s, all within one window for the network, in steps of 0.2 s for the model
+        got = relative(rolled.track[[start // 2]], rolled.track[[(start + steps) // 2]])[0]
+        np.testing.assert_allclose(got[:2], poses[steps - 1, :2], atol=2e-6)
+        np.testing.assert_allclose(se2.wrap(got[2] - poses[steps - 1, 2]), 0.0, atol=2e-6)
+
+
+def test_wheels_with_unequal_radii_are_learned_and_slip_free_odometry_beaten(tmp_path: Path) -> None:
+    runs = {f"run{seed}": sensing(seed) for seed in range(3)}
+    split = Split(train=("run0",), validation=("run1",), test=("run2",))
+    base = tiny_config("displacement", list(runs))
+    network = base.network.model_copy(update=dict(inputs=("commands", "wheels")))
+    optimization = base.optimization.model_copy(update=dict(iterations=50))
+    config = base.model_copy(update=dict(leave_one_out=False, split=split, network=network, optimization=optimization))
+    card = training.train(config, split, runs, tmp_path / "m.safetensors", "a test")
+    assert card.reads_wheels
+    assert card.wheel_kinematics.yaw_per_m == pytest.approx(-0.01 / 0.26 * 2, rel=0.1)
+    learned = roll_model(load_model(tmp_path / "m.safetensors"), runs["run2"], 0.2)
+    wheels = roll_wheels(runs["run2"], 0.2)
+    ratio = np.hypot(*learned.errors(5.0)[:, :2].T).mean() / np.hypot(*wheels.errors(5.0)[:, :2].T).mean()
+    assert ratio < 0.2
 
 
 # --- training ---------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from fgloc.motion.network import Float32Array, Network
 from fgloc.motion.signals import Signal, Signals
 from fgloc.types import CommandEvent, FloatArray
 
-MIN_DENSITY = np.array([1e-3, 1e-3, 1e-3]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
+MIN_DENSITY = np.array([1e-4, 1e-4, 1e-4]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
 _DISAGREEMENT_S = 1.0  # members differ for about this long at a time: a rate of spread s has the density 2 s² times it
 
