@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -15,6 +16,7 @@ from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator, fuse
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import IncrementalEstimator
+from fgloc.graph.interval import interval_scale
 from fgloc.graph.log import Belief
 from fgloc.graph.weights import Fit, Weights
 from fgloc.initializer import Initializer
@@ -39,6 +41,12 @@ from fgloc.types import (
     Step,
 )
 
+_REASONS = {
+    "slip": "they slipped",
+    "frozen": "they stood still while the robot moved",
+    "left_wheel_dead": "the left wheel's encoder stood still",
+    "right_wheel_dead": "the right wheel's encoder stood still",
+}
 _ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
@@ -98,7 +106,7 @@ class Localizer:
         self._initializer = Initializer(config, landmark_map, self.factors)
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
-        self._last_fix_s = 0.0
+        self._last_fix_s = self._last_fix_elapsed_s = 0.0
         self._clock_s = 0.0
         self._lost = False
 
@@ -173,7 +181,7 @@ class Localizer:
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
-        self._last_fix_s = self._clock_s
+        self._fixed()
         return self._estimate(step, belief, decisions)
 
     def _advance(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
@@ -189,6 +197,8 @@ class Localizer:
             else:
                 motions = [self.sources.unknown(step)]
                 self.rejections["motion.silent"] += 1
+            motions, returned = self._return(k, step, motions, sightings)
+            decisions += returned
             predicted = self.estimator.predict(motions)
             believed, refused, weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
             fit = None if believed else self.weights.overruled(refused, weighed, predicted)
@@ -212,7 +222,7 @@ class Localizer:
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
-            self._last_fix_s = self._clock_s
+            self._fixed()
             self.sources.told(belief)
         self._watch_for_loss(believed)
         frame = self.estimator.log.keyframes[k]
@@ -236,6 +246,32 @@ class Localizer:
                 del changed[frame.k]
         self.estimator.revise(changed)
         return decisions
+
+    def _return(
+        self,
+        k: int,
+        step: Step,
+        motions: list[MotionMeasurement],
+        sightings: Sequence[LandmarkMeasurement],
+    ) -> tuple[list[MotionMeasurement], list[Decision]]:
+        """After dead reckoning, let the interval's covariances grow to what the returning sightings say of it."""
+        usable = [m for m in sightings if not self.weights.quarantine.holds(m.landmark_id)]
+        blind_s = self._clock_s - self._last_fix_s
+        adaptive = self.config.weights.adaptive and self.factors.known and not self._lost
+        if not adaptive or not usable or blind_s <= self.config.estimator.dead_reckoning_after_s:
+            return motions, []
+        scale, nis = interval_scale(self.estimator.predict(motions), usable, self.factors, self.config)
+        reason = "interval_nis" if scale > 1.0 else ""
+        if reason:
+            self.estimator.inflate(self._last_fix_elapsed_s, scale)
+            motions = [dataclasses.replace(m, cov=m.cov * scale) for m in motions]
+            self.rejections["motion.interval_nis"] += 1
+        residual = math.sqrt(max(nis, 0.0))
+        return motions, [Decision(k, step.stamp_ns, "interval", -1, residual, nis, 3, 1.0 / scale, reason)]
+
+    def _fixed(self) -> None:
+        """Sightings were believed at the newest keyframe."""
+        self._last_fix_s, self._last_fix_elapsed_s = self._clock_s, self.estimator.elapsed_s
 
     def _watch_for_loss(self, believed: Sequence[object]) -> None:
         """After many refusals without one belief in between, look for the robot anywhere on the map."""
@@ -267,6 +303,20 @@ class Localizer:
         frame.step, frame.mode = step, mode
         cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, mode, tuple(decisions))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        notes = []
+        for landmark_id, moved in self.weights.quarantine.displacements.items():
+            notes.append(
+                f"marker {landmark_id} does not stand where the map has it: it seems to be {math.hypot(*moved):.2f} m "
+                f"off (x {moved[0]:+.2f}, y {moved[1]:+.2f}) and was not used; correct the map or take it down"
+            )
+        for kind, n in sorted(self.trust.flags.items()):
+            source, reason = kind.split(".")
+            notes.append(f"the {source} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}")
+        return tuple(notes)
 
     def _calibration(self) -> Calibration | None:
         return None if self.calibrator is None else self.calibrator.calibration

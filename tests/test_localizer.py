@@ -243,7 +243,13 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
-    assert chain.localizer.weights.rejections["sightings.gate"] == len(refused)
+    counts = chain.localizer.weights.rejections
+    assert counts["sightings.gate"] + counts["sightings.quarantined"] == len(refused)
+    assert counts["sightings.quarantined"] > 40
+    moved_by = chain.localizer.weights.quarantine.displacements
+    assert list(moved_by) == [2]
+    assert np.allclose(moved_by[2], (0.0, 0.4), atol=0.05)
+    assert any("marker 2 does not stand where" in note for note in chain.localizer.notes)
     believed = [d for e in estimates for d in e.decisions if d.landmark_id == 2 and not d.reason]
     assert len(believed) <= 2  # before the first pose nothing tells it from the others; the kernel holds it down
     assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < 0.006

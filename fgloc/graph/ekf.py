@@ -51,3 +51,6 @@ class ExtendedKalmanFilter(Estimator):
         # 3. Joseph's form stays positive definite
         left = np.eye(3) - K @ H
         frame.belief = Belief(pose, left @ P @ left.T + K @ K.T)
+
+    def _build_again(self) -> None:
+        """The beliefs in the log are all there is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,6 +33,11 @@ class Estimator(ABC):
         self.belief: Belief | None = None
         self._k = -1
         self._elapsed_s = 0.0
+
+    @property
+    def elapsed_s(self) -> float:
+        """The estimator's own time: runs on through clock jumps."""
+        return self._elapsed_s
 
     @property
     def k(self) -> int:
@@ -93,6 +99,24 @@ class Estimator(ABC):
         if motions and self.belief is not None:
             self._solve_again(sorted(motions))
             self.belief = self.log.keyframes[self._k].belief
+
+    def inflate(self, since_s: float, scale: float) -> None:
+        """Scale the covariances of all motions that ended after a time, and of the beliefs they led to.
+
+        Args:
+            since_s: of the estimator's own time.
+            scale: on the covariances.
+        """
+        for frame in self.log.since(since_s):
+            if frame.elapsed_s > since_s and frame.prior is None:
+                frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
+                frame.belief = Belief(frame.belief.pose, frame.belief.cov * scale)
+        self._build_again()
+        self.belief = self.log.keyframes[self._k].belief
+
+    @abstractmethod
+    def _build_again(self) -> None:
+        """The log has changed: take it up, and give the newest keyframe its belief."""
 
     def _take(self, frame: Keyframe) -> Belief:
         self._solve(frame)

@@ -16,6 +16,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
 from fgloc.graph.log import Belief, Sighting
+from fgloc.graph.quarantine import Quarantine
 from fgloc.selfcal import Calibration
 from fgloc.types import (
     CornerMeasurement,
@@ -52,6 +53,7 @@ class Weights:
         self.rejections: Counter[str] = Counter()
         self.refused_in_a_row = 0
         self._refused_ids: set[int] = set()
+        self.quarantine = Quarantine(config.weights.quarantine_after)
 
     def weigh(
         self,
@@ -73,6 +75,10 @@ class Weights:
             m = raw if calibration is None else calibration.apply(raw)
             sighting = self._factors.sighting(k, m, self._cauchy(m), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
+            if not reason:
+                self.quarantine.fits(m.landmark_id)
+            if self.quarantine.holds(m.landmark_id):
+                reason = "quarantined"
             if reason:
                 refused.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
@@ -94,10 +100,19 @@ class Weights:
             )
         if believed:
             self.forget_refusals()
+            self._accuse(k, refused, decisions, predicted)
         else:
-            self.refused_in_a_row += len(refused)
-            self._refused_ids.update(s.measurement.landmark_id for s in refused)
+            contrary = [d.landmark_id for d in decisions if d.reason != "quarantined"]
+            self.refused_in_a_row += len(contrary)
+            self._refused_ids.update(contrary)
         return believed, refused, decisions
+
+    def _accuse(self, k: int, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> None:
+        """Others were believed: what was refused beside them may have been moved."""
+        reasons = iter([d.reason for d in decisions if d.reason])
+        gated = [s for s, reason in zip(refused, reasons, strict=True) if reason in ("gate", "quarantined")]
+        if self._config.weights.adaptive and self._factors.known and gated:
+            self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
         """The place that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
@@ -106,14 +121,14 @@ class Weights:
         is taken back.
         """
         gated = [s for s, d in zip(refused, decisions, strict=True) if d.reason == "gate"]
-        if len({s.measurement.landmark_id for s in gated}) < 2:
+        if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
         fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
         if fit is None or fit.cost > chi2_bound(self._config.estimator.gate_probability, fit.dof):
             return None
         self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
         self.rejections += Counter()  # drops the zeros
-        self.refused_in_a_row -= len(refused)
+        self.refused_in_a_row -= sum(d.reason != "quarantined" for d in decisions)
         return fit
 
     def _judge(self, k: int, sighting: Sighting, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:

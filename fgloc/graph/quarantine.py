@@ -1,0 +1,120 @@
+"""Landmarks that do not stand where the map has them: found by their own refusals, set aside, named."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
+from fgloc.graph.log import Sighting
+from fgloc.types import CornerMeasurement, FloatArray
+
+_REMEMBERED = 12  # displacements of a landmark
+_AGREE_M, _AGREE_SHARE = 0.15, 0.3  # how far they may lie from their median: at least, and of the displacement
+_BELIEVED_COUNTS = 2.0  # a sighting that fits weighs as much as this many that do not
+_ITERATIONS = 4
+
+
+@dataclass(slots=True)
+class _Case:
+    """What speaks against one landmark."""
+
+    score: float = 0.0
+    places: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    held: bool = False
+    fitted: int = 0  # sightings in a row that fitted although it was held
+
+
+class Quarantine:
+    """Counts, for every landmark, how often it was refused while others were believed.
+
+    Wrong ids scatter: only a landmark whose refused sightings agree on another place has been moved. One that fits
+    again, time after time, is believed again.
+
+    Source: design.md §6.5.
+    """
+
+    def __init__(self, after: int) -> None:
+        """Take how many refusals, in excess of what is believed, put a landmark into quarantine."""
+        self._after = after
+        self._cases: dict[int, _Case] = {}
+
+    @property
+    def displacements(self) -> dict[int, FloatArray]:
+        """Landmarks in quarantine and how far ``(2,)`` [m], in the map, they seem to stand from their place."""
+        return {i: np.median(case.places, axis=0) for i, case in sorted(self._cases.items()) if case.held}
+
+    def holds(self, landmark_id: int) -> bool:
+        """Whether sightings of this landmark are not to be used."""
+        case = self._cases.get(landmark_id)
+        return case is not None and case.held
+
+    def fits(self, landmark_id: int) -> None:
+        """A sighting agreed with the prediction."""
+        case = self._cases.get(landmark_id)
+        if case is None:
+            return
+        if case.held:
+            case.fitted += 1
+            if case.fitted > 2 * self._after:
+                del self._cases[landmark_id]
+            return
+        case.score -= _BELIEVED_COUNTS
+        if case.score <= 0.0:
+            del self._cases[landmark_id]
+
+    def disagree(self, refused: Iterable[Sighting], k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
+        """Sightings contradicted a prediction that others confirmed.
+
+        Args:
+            refused: these sightings.
+            k: their keyframe.
+            pose: ``(3,)`` predicted.
+            factors: of the map.
+        """
+        for sighting in refused:
+            case = self._cases.setdefault(sighting.measurement.landmark_id, _Case())
+            case.fitted = 0
+            if case.held:
+                continue
+            case.score += 1.0
+            place = displacement(sighting, k, pose, factors)
+            if place is not None:
+                case.places.append(place)
+            case.held = case.score >= self._after and self._moved(case)
+
+    def _moved(self, case: _Case) -> bool:
+        if len(case.places) < self._after:
+            return False
+        places = np.array(case.places)
+        median = np.median(places, axis=0)
+        apart = np.hypot(*(places - median).T)
+        near = max(_AGREE_M, _AGREE_SHARE * math.hypot(*median))
+        return bool(np.quantile(apart, 0.8) < near and math.hypot(*median) > np.median(apart))
+
+
+def displacement(sighting: Sighting, k: int, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:
+    """How far ``(2,)`` [m] the landmark must have been moved on the map, unturned, to be seen so from this pose.
+
+    Gauss-Newton: moving the landmark one way is moving the robot the other.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    R = np.array([[c, -s], [s, c]])
+    moved = np.zeros(2)
+    for _ in range(_ITERATIONS):
+        x, y = pose[:2] - moved
+        seen_from = np.array([x, y, pose[2]])
+        m = sighting.measurement
+        if isinstance(m, CornerMeasurement) and factors.depth(m, seen_from) < MIN_DEPTH_M:
+            return None
+        values = gtsam.Values()
+        values.insert(pose_key(k), gtsam.Pose2(*seen_from))
+        residual, J = whitened(sighting.factors, values, sighting.cauchy_k)
+        step = np.linalg.lstsq(J[:, :2] @ R.T, residual, rcond=None)[0]
+        moved = moved + step
+    return moved if np.isfinite(moved).all() else None
