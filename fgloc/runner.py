@@ -16,7 +16,8 @@ from fgloc.errors import EstimatorError
 from fgloc.hints import image_hints
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
-from fgloc.sensors.markers import detect_stream
+from fgloc.sensors.markers import Detector, detect_stream
+from fgloc.sensors.remembered import RememberedDetections
 from fgloc.smoothing import smooth_run
 from fgloc.types import (
     CornersEvent,
@@ -55,6 +56,7 @@ def run(
     on_step: Callable[[Step, Estimate | None], None] | None = None,
     events: EventFilter | None = None,
     sightings: EventFilter | None = None,
+    detections: Path | None = None,
 ) -> RunResult:
     """Localise one recording.
 
@@ -68,6 +70,7 @@ def run(
         on_step: called after each step (online displays, benchmarks).
         events: filter of the recorded events (ablations).
         sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
+        detections: file that remembers what was found in the images, for other runs of the same ones.
 
     Raises:
         FglocError: the input cannot be used, or no pose was ever found.
@@ -75,13 +78,18 @@ def run(
     began = time.perf_counter()
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, keep_all=mode == "batch" or map_path is None)
-        replay = _Replay(parts, recording.duration_s, progress, pace, sightings)
+        detector: Detector | None = parts.detector
+        if parts.detector is not None and detections is not None:
+            detector = RememberedDetections(detections, parts.detector)
+        replay = _Replay(parts, detector, recording.duration_s, progress, pace, sightings)
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
             replay.record(estimate, (time.perf_counter() - start) * 1e3)
             if on_step is not None:
                 on_step(step, estimate)
+        if isinstance(detector, RememberedDetections):
+            detector.save()
         hints: tuple[str, ...] = ()
         if parts.detector is not None and not parts.localizer.counts["corners"]:
             hints = image_hints(recording, parts.detector)
@@ -123,12 +131,14 @@ class _Replay:
     def __init__(
         self,
         parts: Assembly,
+        detector: Detector | None,
         duration_s: float,
         progress: Progress | None,
         pace: float | None,
         sightings: EventFilter | None,
     ) -> None:
         self._parts = parts
+        self._detector = detector
         self._duration_s = duration_s
         self._progress = progress
         self._pace = pace
@@ -143,10 +153,10 @@ class _Replay:
 
     def steps(self, events: Iterator[Event]) -> Iterator[Step]:
         """Gate, detect and cut into steps."""
-        if self._parts.detector is None:
+        if self._detector is None:
             gated = self._gated(self._sightings(events))
         else:
-            found = detect_stream(self._gated(events), self._parts.detector, self._image_rejections)
+            found = detect_stream(self._gated(events), self._detector, self._image_rejections)
             gated = self._regated(self._sightings(found))
         for event in gated:
             self._heard.setdefault(event.topic, []).append(event.stamp_ns)

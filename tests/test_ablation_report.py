@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import fgloc
 from fgloc import cli
 from fgloc.ablation.failures import AnyFailure
-from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
+from fgloc.ablation.jobs import Job, execute, make_jobs
+from fgloc.ablation.records import Cost, Record
 from fgloc.ablation.report import write_report
 from fgloc.ablation.suite import Cell, Suite, expand, load_suite
 from fgloc.ablation.tables import ATE, join, matrix, rows, sentence, worst
 from fgloc.config import Config
 
-ROOT = Path(cli.__file__).resolve().parent.parent
+ROOT = Path(fgloc.__file__).resolve().parent.parent
 SUITE = Suite.model_validate(
     {
         "title": "Blind & dead",
@@ -78,7 +80,7 @@ def made(bag):
     return jobs, records
 
 
-COST = Cost(seconds=1.0, peak_mb=100.0)
+COST = Cost(seconds=1.0, cpu_s=1.0, peak_mb=100.0)
 
 
 def test_matrix_holds_mean_spread_and_counts(bag):

@@ -233,7 +233,7 @@ def test_pipe_gets_no_progress_bar_and_no_traceback(bag, tmp_path):
 
 
 def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "SAMPLE", bag)
+    monkeypatch.setattr(cli.runs, "SAMPLE", bag)
     code, stdout, _ = fgloc("demo", "--out", tmp_path / "out")
     assert code == 0
     for mode in ("batch", "online"):
@@ -242,7 +242,7 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
 
 
 def test_demo_without_the_sample_says_where_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "SAMPLE", tmp_path / "absent")
+    monkeypatch.setattr(cli.runs, "SAMPLE", tmp_path / "absent")
     assert "clone the repository" in refused("demo", "--out", tmp_path / "out")
 
 

@@ -1,20 +1,19 @@
-"""One run of a sweep: named by the hash of its inputs, executed once, its record written whole or not at all."""
+"""One run of a sweep: named by the hash of its inputs, and executed once."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import resource
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -22,12 +21,15 @@ from pydantic import BaseModel, ConfigDict
 import fgloc
 from fgloc import se2
 from fgloc.ablation.failures import Scene, generators, spoil
+from fgloc.ablation.records import Cost, Record, Track, log_attempt, read_record, write_record
 from fgloc.ablation.suite import Cell
+from fgloc.assembly import resolved
 from fgloc.config import Config
 from fgloc.errors import FglocError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
+from fgloc.evaluation.report import write_results
 from fgloc.frames import quaternion_yaw
-from fgloc.recording.outputs import sha256_of, write_json
+from fgloc.recording.outputs import sha256_of
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
@@ -35,7 +37,7 @@ from fgloc.types import Mode, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
 _SOURCES_LEFT_OUT = (
-    "cli.py",
+    "ablation/bags.py",
     "ablation/report.py",
     "ablation/tables.py",
     "ablation/sweep.py",
@@ -47,40 +49,6 @@ _SOURCES_LEFT_OUT = (
 _COSTS = {"real_time_factor", "step_ms"}
 
 
-class Track(BaseModel):
-    """Estimate and truth at common times, for a picture [m]."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    estimate: list[tuple[float, float]]
-    truth: list[tuple[float, float]]
-
-
-class Cost(BaseModel):
-    """What a run took; never the same twice."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    seconds: float
-    peak_mb: float
-    real_time_factor: float | None = None
-
-
-class Record(BaseModel):
-    """What is known of a job after its run. All but ``cost`` depends on the inputs alone."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    key: str
-    outcome: Literal["done", "refused", "crashed"]
-    error: str = ""  # of a refused run the message, of a crashed one the traceback
-    figures: dict[str, Any] = {}  # of Metrics, without times
-    modes: dict[str, float] = {}  # mode -> share of the poses
-    touched: dict[str, int] = {}  # events that the failures changed, by kind
-    track: Track | None = None
-    cost: Cost
-
-
 class Job(BaseModel):
     """A cell and the hash of everything that its result depends on."""
 
@@ -88,12 +56,20 @@ class Job(BaseModel):
 
     key: str
     cell: Cell
+    images: str = ""  # hash of the images that it sees and of how markers are found in them
+    folder: str | None = None  # of the sweep's folder: gets all files of the run
+    command: str = ""  # for those files
 
 
-def make_jobs(cells: Sequence[Cell]) -> list[Job]:
+def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, command: str = "") -> list[Job]:
     """Name each cell by the SHA-256 of recording, map, model, configuration, failures, seed and code.
 
     Two cells with the same inputs get the same key, and run once.
+
+    Args:
+        cells: from `expand`.
+        folders: recording -> folder for all files of its run; None: figures alone are kept.
+        command: what the user typed, for those files.
     """
     hashes: dict[Path, str] = {}
 
@@ -119,89 +95,71 @@ def make_jobs(cells: Sequence[Cell]) -> list[Job]:
             "seed": cell.seed if cell.chain else None,
             "code": code_hash(),
         }
-        jobs.append(Job(key=hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest(), cell=cell))
+        seen = {name: inputs[name] for name in ("bag", "map", "code")} | {"dictionary": cell.config.markers.dictionary}
+        if any(failure.pixels for failure in cell.chain):
+            seen |= {name: inputs[name] for name in ("chain", "seed")}
+        folder = None if folders is None else folders[cell.recording]
+        if folder is not None:
+            inputs["folder"] = folder
+        jobs.append(Job(key=_hash(inputs), cell=cell, images=_hash(seen), folder=folder, command=command))
     return jobs
+
+
+def _hash(inputs: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
 @cache
 def code_hash() -> str:
     """SHA-256 of the package's code, but for what only shows results, and of the versions of the solvers."""
     root = Path(fgloc.__file__).parent
-    sources = (
-        file for file in sorted(root.rglob("*.py")) if file.relative_to(root).as_posix() not in _SOURCES_LEFT_OUT
-    )
-    digest = hashlib.sha256(" ".join([sys.version, version("gtsam"), version("numpy")]).encode())
-    for source in sources:
-        digest.update(source.relative_to(root).as_posix().encode())
-        digest.update(source.read_bytes())
+    versions = [version(name) for name in ("gtsam", "numpy", "opencv-contrib-python-headless")]
+    digest = hashlib.sha256(" ".join([sys.version, *versions]).encode())
+    for source in sorted(root.rglob("*.py")):
+        name = source.relative_to(root).as_posix()
+        if name not in _SOURCES_LEFT_OUT and not name.startswith("cli/"):
+            digest.update(name.encode())
+            digest.update(source.read_bytes())
     return digest.hexdigest()
 
 
-def record_path(out: Path, key: str) -> Path:
-    """Where a job's record is."""
-    return out / "jobs" / f"{key}.json"
-
-
-def read_record(out: Path, key: str) -> Record | None:
-    """A job's record; None if it has none."""
-    path = record_path(out, key)
-    return Record.model_validate_json(path.read_bytes()) if path.exists() else None
-
-
-def write_record(out: Path, record: Record) -> None:
-    """Write a job's record, whole or not at all.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    write_json(record_path(out, record.key), record.model_dump(mode="json"))
+def finished(job: Job, out: Path) -> Record | None:
+    """The record of a job that need not run; None if it has none, or if the files of its run are gone."""
+    record = read_record(out, job.key)
+    if record is None or record.outcome != "done" or job.folder is None:
+        return record
+    return record if (out / job.folder / "metrics.json").exists() else None
 
 
 def execute(job: Job, out: Path) -> str:
-    """Run a job unless its record is there already; return its key. A run that fails is recorded as such.
+    """Run a job unless it is finished already; return its key. A run that fails is recorded as such.
 
     Raises:
         OutputError: the record cannot be written.
     """
-    if record_path(out, job.key).exists():
+    if finished(job, out) is not None:
         return job.key
-    _log_attempt(out, job.key)
-    began = time.perf_counter()
+    log_attempt(out, job.key)
+    began, cpu = time.perf_counter(), time.process_time()
     outcome: dict[str, Any]
     try:
-        outcome = {"outcome": "done", **_localise(job.cell)}
+        outcome = {"outcome": "done", **_localise(job, out)}
     except FglocError as error:
         outcome = {"outcome": "refused", "error": f"{type(error).__name__}: {error}"}
     except Exception:  # a bug: the sweep goes on, and the report lists it
         outcome = {"outcome": "crashed", "error": traceback.format_exc(limit=-4)}
     cost = Cost(
         seconds=time.perf_counter() - began,
+        cpu_s=time.process_time() - cpu,
         peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-        real_time_factor=outcome.pop("real_time_factor", None),
     )
     write_record(out, Record(key=job.key, cost=cost, **outcome))
     return job.key
 
 
-def attempts(out: Path) -> list[tuple[str, float]]:
-    """Key and time [s since 1970] of every run that was begun, in order."""
-    path = out / "jobs" / "attempts.log"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [(key, float(stamp)) for key, stamp in (line.split() for line in lines)]
-
-
-def _log_attempt(out: Path, key: str) -> None:
-    folder = out / "jobs"
-    folder.mkdir(parents=True, exist_ok=True)
-    file = os.open(folder / "attempts.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        os.write(file, f"{key} {time.time():.6f}\n".encode())  # one short write: lines of several workers do not mix
-    finally:
-        os.close(file)
-
-
-def _localise(cell: Cell) -> dict[str, Any]:
-    config = cell.config
+def _localise(job: Job, out: Path) -> dict[str, Any]:
+    cell = job.cell
+    config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
     landmark_map = load_map(cell.map, config.markers.default_size_m) if cell.map is not None else None
@@ -225,8 +183,11 @@ def _localise(cell: Cell) -> dict[str, Any]:
             cell.mode,
             events=lambda events: spoil(cell.chain, "recorded", events, scenes),
             sightings=lambda events: spoil(cell.chain, "sightings", events, scenes),
+            detections=out / "detections" / f"{job.images}.npz" if job.folder is None else None,
         )
     metrics = compute_metrics(result, config)
+    if job.folder is not None:
+        write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
     touched: dict[str, int] = {}
     for scene in scenes:
         for kind, n in scene.touched.items():
@@ -236,7 +197,6 @@ def _localise(cell: Cell) -> dict[str, Any]:
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "touched": touched,
         "track": _track(result, config),
-        "real_time_factor": metrics.real_time_factor,
     }
 
 

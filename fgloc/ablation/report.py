@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from fgloc.ablation.jobs import Job, Record, code_hash
+from fgloc.ablation.jobs import Job, code_hash
+from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Suite
 from fgloc.ablation.tables import ATE, METRICS, Entry, Run, join, matrix, matrix_csv, rows, runs_csv, sentence, worst
 from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks

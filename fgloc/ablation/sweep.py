@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fgloc.ablation.jobs import Cost, Job, Record, execute, read_record, record_path, write_record
+from fgloc.ablation.jobs import Job, execute, finished
+from fgloc.ablation.records import Cost, Record, read_record, record_path, write_record
 from fgloc.errors import ConfigError
 
 Progress = Callable[[int, int], None]
@@ -43,12 +45,12 @@ def sweep(
         OutputError: a record cannot be written.
     """
     unique = {job.key: job for job in jobs}
-    records = {key: record for key in unique if (record := read_record(out, key)) is not None}
+    records = {key: record for key, job in unique.items() if (record := finished(job, out)) is not None}
     if retry:
         for key in [key for key, record in records.items() if record.outcome != "done"]:
             record_path(out, key).unlink()
             del records[key]
-    todo = [job for key, job in unique.items() if key not in records]
+    todo = _by_turns([job for key, job in unique.items() if key not in records])
     if progress is not None:
         progress(len(records), len(unique))
     if not todo:
@@ -57,13 +59,25 @@ def sweep(
     with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
         for key, error in _finished(client, todo, out):
             if error is not None and not record_path(out, key).exists():
-                write_record(out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, peak_mb=0.0)))
+                write_record(
+                    out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
+                )
             record = read_record(out, key)
             assert record is not None
             records[key] = record
             if progress is not None:
                 progress(len(records), len(unique))
     return records
+
+
+def _by_turns(jobs: Sequence[Job]) -> list[Job]:
+    """Jobs of different images in turn, so that those of the same ones find what the first of them has detected."""
+    turns: Counter[str] = Counter()
+    ranked = []
+    for place, job in enumerate(jobs):
+        ranked.append((turns[job.images], place, job))
+        turns[job.images] += 1
+    return [job for *_, job in sorted(ranked, key=lambda r: r[:2])]
 
 
 def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str, str | None]]:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from fgloc.ablation.jobs import Job, Record
+from fgloc.ablation.jobs import Job
+from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Cell, Suite
 
 

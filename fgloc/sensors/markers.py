@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,6 +22,14 @@ _SECOND_LOOKS = 12  # small unreadable squares of an image that are enlarged and
 _SECOND_LOOK_SIDE_PX = (6.0, 32.0)  # smaller ones cannot be read, larger ones needed no enlarging
 _ENLARGE = 3
 _HINT_RATIO = 2  # a changed image has to show more than this many times the markers to be worth a hint
+
+
+class Detector(Protocol):
+    """What finds markers in images."""
+
+    def detect(self, event: ImageEvent) -> CornersEvent:
+        """The markers of one image; see `MarkerDetector.detect`."""
+        ...
 
 
 class MarkerDetector:
@@ -123,7 +132,7 @@ def suggest_dictionary(images: Iterable[GrayImage]) -> str | None:
     return suggest(look)
 
 
-def detect_stream(events: Iterable[Event], detector: MarkerDetector, rejections: Counter[str]) -> Iterator[Event]:
+def detect_stream(events: Iterable[Event], detector: Detector, rejections: Counter[str]) -> Iterator[Event]:
     """All events in their order, with a CornersEvent in the place of each image.
 
     Detection runs in one thread of its own, at most a few images ahead of the consumer; OpenCV releases Python's lock

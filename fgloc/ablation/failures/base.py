@@ -125,6 +125,7 @@ class Failure(Section):
 
     stage: ClassVar[Literal["recorded", "sightings"]] = "recorded"
     timed: ClassVar[bool] = True  # False: lasts the whole run, `when` is refused
+    pixels: ClassVar[bool] = False  # True: changes what an image shows
     kind: str
     when: When = When()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from fgloc.types import Event, ImageEvent
 class Darkness(EventFailure):
     """Images get darker by the factor ``gain`` and noisy by ``noise`` gray levels (standard deviation, of 255)."""
 
+    pixels: ClassVar[bool] = True
     kind: Literal["darkness"] = "darkness"
     gain: float = Field(0.1, ge=0, le=1, description="brightness that is left, as a share")
     noise: float = Field(2.0, ge=0, description="read noise [gray levels of 255]")
@@ -39,6 +40,7 @@ class Darkness(EventFailure):
 class MirroredImage(EventFailure):
     """Images are flipped left to right, as by a wrong setting of the driver."""
 
+    pixels: ClassVar[bool] = True
     kind: Literal["mirrored_image"] = "mirrored_image"
 
     def targets(self) -> tuple[type[Event], ...]:

@@ -1,0 +1,46 @@
+"""Arguments that several commands share, and what is taken where they are not given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgloc.config import Config, load_config
+
+BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
+
+Bag = Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)]
+Bags = Annotated[list[Path], typer.Argument(metavar="BAG...", help=BAG_HELP)]
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results; made if missing")]
+MapOption = Annotated[
+    Path | None, typer.Option("--map", metavar="MAP", help="marker map; default: map.yaml beside the bag, else none")
+]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="M", help="learned motion (.safetensors); default: the configuration's"),
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="C", help="configuration; default: robot.yaml beside the bag, else none"),
+]
+WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
+SchedulerOption = Annotated[
+    str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")
+]
+
+
+def configured(bag: Path, config_file: Path | None, model: Path | None) -> Config:
+    """The given configuration, else the one beside the bag, else the defaults; `model` overrides it.
+
+    Raises:
+        ConfigError: the file is missing or wrong.
+    """
+    from fgloc.runner import find_beside
+
+    file = config_file or find_beside(bag, "robot.yaml")
+    config = Config() if file is None else load_config(file)
+    if model is None:
+        return config
+    return config.model_copy(update={"motion": config.motion.model_copy(update={"model": model, "use": True})})

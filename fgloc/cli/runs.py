@@ -1,0 +1,162 @@
+"""Commands of one run: ``demo``, ``smooth``, ``online`` and ``map``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+import fgloc
+from fgloc.cli.options import (
+    Bag,
+    Bags,
+    ConfigOption,
+    MapOption,
+    ModelOption,
+    Out,
+    SchedulerOption,
+    WorkersOption,
+    configured,
+)
+from fgloc.cli.sweeps import smooth_many
+from fgloc.cli.terminal import EXIT_LOST, columns, exit_if_lost, number, run_bar, typed
+from fgloc.errors import RecordingError
+from fgloc.types import Mode, RunResult
+
+if TYPE_CHECKING:
+    from fgloc.evaluation.metrics import Metrics
+
+SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run" / "bag"
+
+
+class Speed(StrEnum):
+    """How fast a recording is replayed."""
+
+    REAL_TIME = "1"
+    MAX = "max"
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results")] = Path("demo-out"),
+) -> None:
+    """Smooth the bundled recording and replay it online; say where the reports are."""
+    if not SAMPLE.is_dir():
+        raise RecordingError(
+            f"{SAMPLE}: the bundled recording is not here; it comes with a source checkout: clone the repository and "
+            "run `make demo` there"
+        )
+    runs: list[tuple[str, Metrics]] = []
+    lost = False
+    for mode, command in (("batch", "smooth"), ("online", "online")):
+        folder = out / mode
+        text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
+        result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
+        runs.append((mode, metrics))
+        lost = lost or Mode.LOST in result.modes
+    typer.echo(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
+    typer.echo(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
+    typer.echo("")
+    for mode, _ in runs:
+        typer.echo(f"{mode:<8}{out / mode / 'report.html'}")
+    if lost:
+        raise typer.Exit(EXIT_LOST)
+
+
+def smooth(
+    bags: Bags,
+    out: Out,
+    map_file: MapOption = None,
+    model: ModelOption = None,
+    config: ConfigOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+) -> None:
+    """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
+    if len(bags) > 1:
+        smooth_many(bags, out, map_file, model, config, workers, scheduler)
+        return
+    (bag,) = bags
+    _finish(*_localise(bag, map_file, model, config, out, "batch", typed()), out)
+
+
+def online(
+    bag: Bag,
+    out: Out,
+    map_file: MapOption = None,
+    model: ModelOption = None,
+    config: ConfigOption = None,
+    speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
+) -> None:
+    """Replay the recording as a live robot would hear it; each pose knows only what came before."""
+    pace = 1.0 if speed is Speed.REAL_TIME else None
+    _finish(*_localise(bag, map_file, model, config, out, "online", typed(), pace), out)
+
+
+def make_map(
+    bag: Bag,
+    out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", help="map file to be written")],
+    model: ModelOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Survey the landmarks of a recording; the first pose is the map's origin."""
+    from fgloc.runner import run
+    from fgloc.sensors.maps import write_map
+
+    with run_bar(bag.name) as progress:
+        result = run(bag, None, configured(bag, config, model), "batch", progress)
+    if result.landmarks is None or not len(result.landmarks):
+        raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
+    write_map(result.landmarks, out)
+    typer.echo(f"{len(result.landmarks)} landmarks in {out}")
+    exit_if_lost(result.modes)
+
+
+def _localise(
+    bag: Path,
+    map_file: Path | None,
+    model: Path | None,
+    config_file: Path | None,
+    out: Path,
+    mode: Literal["batch", "online"],
+    command: str,
+    pace: float | None = None,
+) -> tuple[RunResult, Metrics]:
+    """Run one recording and write its results."""
+    # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
+    from fgloc.assembly import resolved
+    from fgloc.evaluation.report import write_results
+    from fgloc.recording.outputs import sha256_of
+    from fgloc.runner import find_beside, run
+
+    map_path = map_file or find_beside(bag, "map.yaml")
+    config = resolved(configured(bag, config_file, model), map_path)
+    with run_bar(mode) as progress:
+        result = run(bag, map_path, config, mode, progress, pace)
+    return result, write_results(result, config, out, command, sha256_of(bag))
+
+
+def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
+    """Say what came out."""
+    rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
+    if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
+        rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]
+    if metrics.nees_over_3 is not None:
+        rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
+    rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
+    typer.echo(columns(None, rows))
+    for note in result.notes:
+        typer.echo(f"note: {note}")
+    exit_if_lost(result.modes)
+
+
+def _demo_row(mode: str, metrics: Metrics) -> tuple[str, ...]:
+    return (
+        mode,
+        number(metrics.ate_mean_m, "{:.4f} m"),
+        number(metrics.ate_rmse_m, "{:.4f} m"),
+        number(metrics.yaw_mae_deg, "{:.3f} deg"),
+        number(metrics.nees_over_3, "{:.2f}"),
+        number(metrics.real_time_factor, "{:.1f} x"),
+    )

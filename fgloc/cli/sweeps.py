@@ -1,0 +1,94 @@
+"""Commands of many runs: ``ablate``, and ``smooth`` of several bags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, typed
+
+if TYPE_CHECKING:
+    from fgloc.ablation.records import Record
+
+
+def ablate(
+    suite: Annotated[Path, typer.Argument(metavar="SUITE.yaml", help="see ablations/")],
+    out: Out,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
+) -> None:
+    """Tell what the failure of each sensor costs; a killed sweep goes on where it was."""
+    from fgloc.ablation.jobs import make_jobs
+    from fgloc.ablation.report import failed, write_report
+    from fgloc.ablation.suite import expand, load_suite
+    from fgloc.ablation.sweep import sweep
+
+    plan = load_suite(suite)
+    jobs = make_jobs(expand(plan, suite.parent))
+    with jobs_bar("runs", len(jobs)) as show:
+        records = sweep(jobs, out, workers, scheduler, retry, show)
+    for sentence in write_report(plan, jobs, records, out, typed()):
+        typer.echo(sentence)
+    without = failed(jobs, records)
+    if without:
+        typer.echo(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    typer.echo(f"report: {out / 'report.html'}")
+
+
+def smooth_many(
+    bags: Sequence[Path],
+    out: Path,
+    map_file: Path | None,
+    model: Path | None,
+    config_file: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Smooth each bag into a folder of its own; one that fails is listed and tried again next time."""
+    from fgloc.ablation.bags import plan_bags
+    from fgloc.ablation.sweep import sweep
+
+    if config_file is not None:
+        configured(bags[0], config_file, model)  # a wrong one is wrong for all
+    plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
+    with jobs_bar("bags", len(plan.jobs)) as show:
+        records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
+    by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
+    head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
+    typer.echo(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
+    errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
+    for name in plan.names:
+        if name in errors:
+            typer.echo(f"{name}: {errors[name]}", err=True)
+    typer.echo(f"reports: {out / '*' / 'report.html'}")
+    if errors:
+        typer.echo(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
+    if any(record.modes.get("LOST") for record in by_name.values()):
+        typer.echo("LOST for part of a run: do not trust it there", err=True)
+        raise typer.Exit(EXIT_LOST)
+
+
+def _reason(record: Record) -> str:
+    """The message of a refused run; the last line of a crashed one's traceback."""
+    return record.error if record.outcome == "refused" else record.error.strip().splitlines()[-1]
+
+
+def _row(name: str, record: Record | None) -> tuple[str, ...]:
+    if record is None or record.outcome != "done":
+        return name, *("-" for _ in range(5)), "failed"
+    figures = record.figures
+    return (
+        name,
+        f"{figures['duration_s']:.1f} s",
+        str(figures["keyframes"]),
+        number(figures["ate_mean_m"], "{:.4f} m"),
+        number(figures["yaw_mae_deg"], "{:.3f} deg"),
+        number(figures["nees_over_3"], "{:.2f}"),
+        f"{100.0 * record.modes.get('LOST', 0.0):.1f} %",
+    )

@@ -1,0 +1,72 @@
+"""What the commands say: tables, progress bars, exit codes."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+from tqdm import tqdm
+
+from fgloc.types import Mode
+
+if TYPE_CHECKING:
+    from fgloc.runner import Progress
+
+EXIT_BAD_INPUT = 1
+EXIT_LOST = 3
+
+
+def typed() -> str:
+    """The command as the user typed it."""
+    return shlex.join(["fgloc", *sys.argv[1:]])
+
+
+def exit_if_lost(modes: Sequence[Mode]) -> None:
+    """End with code 3 if a part of the run is not to be trusted."""
+    lost = sum(mode is Mode.LOST for mode in modes)
+    if lost:
+        typer.echo(f"LOST for {lost} of {len(modes)} poses: do not trust them", err=True)
+        raise typer.Exit(EXIT_LOST)
+
+
+@contextmanager
+def run_bar(label: str) -> Iterator[Progress]:
+    """Seconds of one recording: a bar on a terminal, nothing on a pipe."""
+    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}]"
+    with tqdm(desc=label, total=1.0, disable=None, bar_format=form, file=sys.stderr, leave=False) as bar:
+
+        def show(done_s: float, length_s: float) -> None:
+            if not bar.disable:
+                bar.total = length_s
+                bar.update(done_s - bar.n)
+
+        yield show
+
+
+@contextmanager
+def jobs_bar(label: str, count: int) -> Iterator[Callable[[int, int], None]]:
+    """Jobs of a sweep, with an estimate of the time left: a bar on a terminal, nothing on a pipe."""
+    with tqdm(desc=label, total=count, disable=None, file=sys.stderr, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def number(value: float | None, form: str) -> str:
+    """A figure, or a dash where there is none."""
+    return "-" if value is None else form.format(value)
+
+
+def columns(head: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
+    """A plain table: the first column to the left, the others to the right; without a head all to the left."""
+    lines = [head, *rows] if head else list(rows)
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    pad = str.rjust if head else str.ljust
+    return "\n".join("  ".join([line[0].ljust(widths[0]), *map(pad, line[1:], widths[1:])]).rstrip() for line in lines)
