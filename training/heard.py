@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fgloc.buffers import EventBuffer
 from fgloc.config import Config, GyroConfig, WheelsConfig
@@ -22,18 +23,23 @@ class Heard:
 
     Attributes:
         commands: in order of stamp.
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame.
         wheels: how the robot's wheels are read.
     """
 
-    def __init__(self, events: Iterable[Event], config: Config | None = None) -> None:
+    def __init__(
+        self, events: Iterable[Event], config: Config | None = None, imu_up: ArrayLike = (0.0, 0.0, 1.0)
+    ) -> None:
         """Keep what a motion model may read.
 
         Args:
             events: of any kind, in any order.
             config: the robot's.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame.
         """
         config = Config() if config is None else config
         self.wheels: WheelsConfig = config.wheels
+        self.imu_up = imu_up
         self._commands: EventBuffer[CommandEvent] = EventBuffer()
         self._imu: EventBuffer[ImuEvent] = EventBuffer()
         self._joints: EventBuffer[JointsEvent] = EventBuffer()
@@ -92,14 +98,16 @@ class Heard:
 
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
-        return signals_of(wanted, _all(self._imu), _all(self._joints), self.joints, origin_ns, self._biases)
+        return signals_of(
+            wanted, _all(self._imu), _all(self._joints), self.joints, origin_ns, self._biases, self.imu_up
+        )
 
     def _gyro_biases(self, config: GyroConfig) -> FloatArray:
         """Bias at each IMU message, by the filter that the localizer uses; nothing but rests teaches it here."""
         stamps = self._imu.stamps
         if not stamps:
             return np.zeros(0)
-        gyro, wheels = Gyro(config), WheelMotion(self.wheels) if self.has_wheels else None
+        gyro, wheels = Gyro(config, self.imu_up), WheelMotion(self.wheels) if self.has_wheels else None
         at, biases = [stamps[0]], [0.0]
         for start in range(stamps[0], stamps[-1], _STEP_NS):
             step = self.step(start, start + _STEP_NS)

@@ -69,7 +69,7 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
     Raises:
         ModelError: a prediction is not finite.
     """
-    reader = SignalReader(model.card)
+    reader = SignalReader(model.card, run.heard.imu_up)
     velocity: FloatArray | None = None
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:

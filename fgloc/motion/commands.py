@@ -28,13 +28,12 @@ class CommandTrack:
         capacity = max(_MIN_CAPACITY, 2 * n)
         self._events = list(commands)
         self._times = np.empty(capacity)
-        self._integrals = np.zeros((2, capacity))
+        self._integrals = np.zeros(capacity, dtype=np.complex128)  # of v + iω: both by one interpolation
         times = self._times[:n]
         times[:] = [c.stamp_ns - self.origin_ns for c in commands]
         times *= 1e-9
         steps = np.diff(times)
-        np.cumsum(np.multiply([c.v for c in commands[:-1]], steps), out=self._integrals[0, 1:n])
-        np.cumsum(np.multiply([c.omega for c in commands[:-1]], steps), out=self._integrals[1, 1:n])
+        np.cumsum(np.multiply([complex(c.v, c.omega) for c in commands[:-1]], steps), out=self._integrals[1:n])
         self._extend(())
 
     def following(self, commands: tuple[CommandEvent, ...]) -> CommandTrack:
@@ -51,13 +50,10 @@ class CommandTrack:
         return self
 
     def integrals(self, times_s: FloatArray) -> FloatArray:
-        """Integrals of v and ω ``(2, ...)`` up to times ``(...)`` since the origin."""
+        """Integrals of v and ω ``(..., 2)`` up to times ``(...)`` since the origin."""
         n = len(self._events) + 1
-        known = self._times[:n]
-        out = np.empty((2, *times_s.shape))
-        out[0] = np.interp(times_s, known, self._integrals[0, :n])
-        out[1] = np.interp(times_s, known, self._integrals[1, :n])
-        return out
+        integrals = np.interp(times_s, self._times[:n], self._integrals[:n])
+        return integrals.view(np.float64).reshape(*times_s.shape, 2)
 
     def means(self, limits_s: FloatArray) -> FloatArray:
         """Mean (v, ω) between neighboring limits.
@@ -68,22 +64,21 @@ class CommandTrack:
         Returns:
             ``(..., m - 1, 2)``.
         """
-        means = np.diff(self.integrals(limits_s)) / np.diff(limits_s)
-        return np.ascontiguousarray(np.moveaxis(means, 0, -1))
+        return np.asarray(np.diff(self.integrals(limits_s), axis=-2) / np.diff(limits_s)[..., None])
 
     def _extend(self, events: tuple[CommandEvent, ...]) -> None:
         """Append, then one more entry, overwritten by the next command: the last one holds.
 
         In plain floats: reading single elements of arrays would take most of the time.
         """
-        times, (integral_v, integral_omega) = self._times, self._integrals
+        times, integrals = self._times, self._integrals
         k, last = len(self._events), self._events[-1]
-        t, v, omega = float(times[k - 1]), float(integral_v[k - 1]), float(integral_omega[k - 1])
+        t, integral = float(times[k - 1]), complex(integrals[k - 1])
         for event in events:
             now = (event.stamp_ns - self.origin_ns) * 1e-9
-            v, omega, t = v + last.v * (now - t), omega + last.omega * (now - t), now
-            times[k], integral_v[k], integral_omega[k] = t, v, omega
+            integral, t = integral + complex(last.v, last.omega) * (now - t), now
+            times[k], integrals[k] = t, integral
             k, last = k + 1, event
         self._events.extend(events)
         times[k] = t + _FOREVER_S
-        integral_v[k], integral_omega[k] = v + last.v * _FOREVER_S, omega + last.omega * _FOREVER_S
+        integrals[k] = integral + complex(last.v, last.omega) * _FOREVER_S

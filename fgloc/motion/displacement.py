@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fgloc.errors import ModelError
@@ -12,7 +14,7 @@ from fgloc.motion.network import Float32Array, Network
 from fgloc.motion.signals import Signal, Signals
 from fgloc.types import CommandEvent, FloatArray
 
-MIN_DENSITY = np.array([1e-4, 1e-4, 1e-4]) ** 2  # m²/s, m²/s, rad²/s: nobody knows motion better than this
+_MIN_DENSITY = 1e-8  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
 _DISAGREEMENT_S = 1.0  # members differ for about this long at a time: a rate of spread s has the density 2 s² times it
 
@@ -31,16 +33,16 @@ class DisplacementModel:
     """
 
     def __init__(self, card: ModelCard, network: Network) -> None:
-        """Take a checked card and its network."""
+        """Take a checked card and its network, which knows the card's scales of the outputs."""
         self.card = card
         self.joint = joint_of(card)
         self._network = network
-        self._scale = np.array(card.output_scale)
         self._gains = gains(card.kinematics)
         self._ages = np.array(card.edges_s)
         self._widths = np.diff(self._ages)
         self._signal_edges = np.array(card.signal_edges_s)
-        self._log_scale = np.log(card.variance_scale)
+        self._n_inputs = card.n_inputs
+        self._reads_velocity = "velocity" in card.inputs
         self._spread_gain = 2.0 * _DISAGREEMENT_S * np.array(card.variance_scale)
         self._n_bins = 2 * len(self._widths)
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
@@ -62,36 +64,43 @@ class DisplacementModel:
         base, x = self._inputs(track, (start_ns - track.origin_ns) * 1e-9, dt, n)
         if self.card.measured:
             self._measured(base, x, signals, start_ns, dt)
-        if "velocity" in self.card.inputs:
-            innovation = np.zeros(2) if velocity is None else np.asarray(velocity) - base[0, ::2]
+        if self._reads_velocity:
+            innovation = np.zeros(2) if velocity is None else np.asarray(velocity) - base[0, ::2] / dt
             ages = dt * (np.arange(n) + 0.5)
             x[:, -2:] = np.exp(-ages / self.card.velocity_decay_s)[:, None] * innovation
-        y = self._network(x).astype(np.float64)
-        if not np.isfinite(y).all():
-            return None
-        residuals, log_variances = y[..., :3], y[..., 3:]
-        log_variances += self._log_scale
-        np.minimum(log_variances, _MAX_LOG_VARIANCE, out=log_variances)
-        variances = np.exp(log_variances)
+        y: Float32Array | FloatArray = self._network(x)
         if self.card.members > 1:
-            spread = self._scale * residuals.std(axis=0)
-            residuals = residuals.mean(axis=0)
-            variances = variances.mean(axis=0) + self._spread_gain * spread**2
-        np.maximum(variances, MIN_DENSITY, out=variances)
-        twists = base + self._scale * residuals
-        return MotionPrediction(*composed(twists * dt, variances * dt), twists[-1, ::2])
+            if not np.isfinite(y).all():
+                return None
+            y = self._pooled(y)
+        twists, variances = [], []
+        for (along, left, turn), (vx, vy, rate, log_x, log_y, log_yaw) in zip(base.tolist(), y.tolist(), strict=True):
+            if not math.isfinite(vx + vy + rate + log_x + log_y + log_yaw):
+                return None
+            twists.append((along + vx * dt, left + vy * dt, turn + rate * dt))
+            variances.append((_variance(log_x) * dt, _variance(log_y) * dt, _variance(log_yaw) * dt))
+        along, _, turn = twists[-1]
+        return MotionPrediction(*composed(twists, variances), np.array([along / dt, turn / dt]))
+
+    def _pooled(self, y: Float32Array | FloatArray) -> FloatArray:
+        """Mean and log-variances ``(n, 6)`` of the members' answers ``(members, n, 6)``."""
+        answers = y.astype(np.float64)
+        spread = answers[..., :3].std(axis=0)
+        variances = np.exp(np.minimum(answers[..., 3:], _MAX_LOG_VARIANCE)).mean(axis=0)
+        pooled = answers.mean(axis=0)
+        np.log(variances + self._spread_gain * spread**2, out=pooled[:, 3:])
+        return np.asarray(pooled)
 
     def _inputs(self, track: CommandTrack, start: float, dt: float, n: int) -> tuple[FloatArray, Float32Array]:
-        """By the commands: twists ``(n, 3)`` of the calibrated kinematics and inputs ``(n, ·)``, one row a sub-step."""
+        """By the commands, one row a sub-step: twists of the calibrated kinematics times dt ``(n, 3)``, inputs."""
         plan = self._plans.get(n)
         if plan is None:
             plan = self._plans[n] = self._plan(n)
         slope, offset, means_of = plan
-        means = means_of @ track.integrals(slope * dt + (offset + start)).T
-        base = means[:n] @ self._gains / dt
-        x = np.empty((n, self.card.n_inputs), dtype=np.float32)
+        means = means_of @ track.integrals(slope * dt + (offset + start))
+        x = np.empty((n, self._n_inputs), dtype=np.float32)
         x[:, : self._n_bins] = means[n:].reshape(n, -1)
-        return base, x
+        return means[:n] @ self._gains, x
 
     def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
         """Let the signals say what they know better than the commands, and hand them to the network."""
@@ -106,7 +115,9 @@ class DisplacementModel:
             x[:, at : at + features.shape[1]] = features
             at += features.shape[1]
         if signals is not None:
+            base /= dt
             measured_twists(base, self.card.wheel_kinematics, signals, starts, dt)
+            base *= dt
 
     def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """How to ask a track once for all of n sub-steps.
@@ -127,6 +138,10 @@ class DisplacementModel:
                 first = n + 1 + i * (bins + 1) + j
                 means_of[n + i * bins + j, [first, first + 1]] = 1.0 / width, -1.0 / width
         return slope, offset, means_of
+
+
+def _variance(log_variance: float) -> float:
+    return max(_MIN_DENSITY, math.exp(min(log_variance, _MAX_LOG_VARIANCE)))
 
 
 def signal_features(signal: Signal, starts: FloatArray, dt: float, edges: FloatArray) -> FloatArray:

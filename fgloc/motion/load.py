@@ -33,7 +33,11 @@ def load_model(path: Path) -> MotionModel:
     """
     tensors, card = read_model(path)
     layers = _layers(tensors, card, path)
-    network = Network(layers, np.array(card.input_mean), np.array(card.input_std))
+    scale = offset = None
+    if card.kind == "displacement":
+        scale = np.array([*card.output_scale, 1.0, 1.0, 1.0])
+        offset = np.array([0.0, 0.0, 0.0, *np.log(card.variance_scale)])
+    network = Network(layers, np.array(card.input_mean), np.array(card.input_std), scale, offset)
     try:
         return VelocityModel(card, network) if card.kind == "velocity" else DisplacementModel(card, network)
     except CovarianceError as error:

@@ -9,10 +9,10 @@ Float32Array = NDArray[np.float32]
 
 
 class Network:
-    """``y = W_n relu(... relu(W_0 (x - mean) / std + b_0) ...) + b_n`` for a batch of rows.
+    """``y = scale (W_n relu(... relu(W_0 (x - mean) / std + b_0) ...) + b_n) + offset`` for a batch of rows.
 
-    The normalization is folded into the first layer. The members of an ensemble, stacked, answer in one call. Not for
-    concurrent use: calls share buffers.
+    What is not a layer is folded into the first and the last. The members of an ensemble, stacked, answer in one call.
+    Not for concurrent use: calls share buffers.
     """
 
     def __init__(
@@ -20,6 +20,8 @@ class Network:
         layers: list[tuple[Float32Array, Float32Array]],
         mean: NDArray[np.float64],
         std: NDArray[np.float64],
+        scale: NDArray[np.float64] | None = None,
+        offset: NDArray[np.float64] | None = None,
     ) -> None:
         """Take the layers.
 
@@ -27,13 +29,21 @@ class Network:
             layers: (weight (out, in), bias (out,)) from input to output, of an ensemble each with a first axis more.
             mean: ``(in,)`` of the inputs.
             std: ``(in,)`` of the inputs.
+            scale: ``(out,)`` of the outputs; None: 1.
+            offset: ``(out,)`` added to the outputs after that; None: 0.
         """
-        first = layers[0][0] / std
+        weights = [w.astype(np.float64) for w, _ in layers]
+        biases = [b.astype(np.float64) for _, b in layers]
+        weights[0] /= std
+        biases[0] -= weights[0] @ mean
+        if scale is not None:
+            weights[-1] *= scale[:, None]
+            biases[-1] *= scale
+        if offset is not None:
+            biases[-1] += offset
         with np.errstate(over="ignore"):
-            weights = [first.astype(np.float32), *(w for w, _ in layers[1:])]
-            biases = [(layers[0][1] - first @ mean).astype(np.float32), *(b for _, b in layers[1:])]
-        self._weights = [np.ascontiguousarray(w.swapaxes(-1, -2)) for w in weights]
-        self._biases = [b[..., None, :] for b in biases]
+            self._weights = [np.ascontiguousarray(w.swapaxes(-1, -2), dtype=np.float32) for w in weights]
+            self._biases = [b[..., None, :].astype(np.float32) for b in biases]
         self._buffers: dict[int, list[Float32Array]] = {}
 
     def __call__(self, x: Float32Array) -> Float32Array:

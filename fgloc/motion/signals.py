@@ -94,8 +94,9 @@ class SignalReader:
     first value is taken to have held.
     """
 
-    def __init__(self, card: ModelCard) -> None:
-        """Read what the card's model needs."""
+    def __init__(self, card: ModelCard, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Read what the card's model needs; ``imu_up`` is the base's z axis in the IMU's frame."""
+        self._up = np.asarray(imu_up, dtype=float)
         self._wanted = card.measured
         self._joints = card.joints
         self._back_ns = round((card.signal_edges_s[-1] + card.wheel_kinematics.delay_s) * 1e9)
@@ -114,7 +115,9 @@ class SignalReader:
         oldest = step.start_ns - self._back_ns
         _follow(self._imu_events, step.imu, oldest)
         _follow(self._joints_events, step.joints, oldest)
-        found = signals_of(self._wanted, self._imu_events, self._joints_events, self._joints, step.start_ns, gyro_bias)
+        found = signals_of(
+            self._wanted, self._imu_events, self._joints_events, self._joints, step.start_ns, gyro_bias, self._up
+        )
         for name in self._wanted:
             signal = found.named(name)
             if signal is None or not signal.covers(0.0, step.dt):
@@ -129,9 +132,20 @@ def signals_of(
     wheel_joints: WheelJoints | None,
     origin_ns: int,
     gyro_bias: ArrayLike = 0.0,
+    imu_up: ArrayLike = (0.0, 0.0, 1.0),
 ) -> Signals:
-    """The wanted signals, as far as the events hold them."""
-    gyro = _gyro(imu, origin_ns, gyro_bias) if "gyro" in wanted else None
+    """The wanted signals, as far as the events hold them.
+
+    Args:
+        wanted: names of inputs.
+        imu: in order of stamp.
+        joints: in order of stamp.
+        wheel_joints: which of the joints are the wheels.
+        origin_ns: time zero of the signals.
+        gyro_bias: one number, or one for each IMU event [rad/s].
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+    """
+    gyro = _gyro(imu, origin_ns, gyro_bias, imu_up) if "gyro" in wanted else None
     effort = wheels = None
     if wheel_joints is not None:
         effort = _effort(joints, origin_ns, wheel_joints) if "effort" in wanted else None
@@ -149,9 +163,8 @@ def _follow(events: list[_E], new: Sequence[_E], oldest_ns: int) -> None:
     del events[:first]
 
 
-def _gyro(events: Sequence[ImuEvent], origin_ns: int, bias: ArrayLike) -> Signal | None:
-    """``bias`` [rad/s] is one number, or one for each event."""
-    rates = np.array([float(e.angular_velocity[2]) for e in events]) - np.asarray(bias)
+def _gyro(events: Sequence[ImuEvent], origin_ns: int, bias: ArrayLike, up: ArrayLike) -> Signal | None:
+    rates = np.array([e.angular_velocity for e in events]).reshape(-1, 3) @ np.asarray(up) - np.asarray(bias)
     return _of_samples([e.stamp_ns for e in events], rates[None], origin_ns)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from numpy.typing import ArrayLike
+
 from fgloc.config import MotionConfig
 from fgloc.motion.forms import MotionModel
 from fgloc.motion.signals import SignalReader
@@ -22,12 +24,18 @@ class LearnedMotion:
             signal that the model reads was silent.
     """
 
-    def __init__(self, model: MotionModel, config: MotionConfig) -> None:
-        """Take a loaded model."""
+    def __init__(self, model: MotionModel, config: MotionConfig, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Take a loaded model.
+
+        Args:
+            model: the model.
+            config: whether it is used.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+        """
         self.model = model
         self.rejections: Counter[str] = Counter()
         self._use = config.use
-        self._reader = SignalReader(model.card)
+        self._reader = SignalReader(model.card, imu_up)
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 

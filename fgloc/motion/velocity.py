@@ -66,7 +66,7 @@ class VelocityModel:
         twists = np.zeros((len(middles), 3))
         twists[:, 0], twists[:, 2] = middles[:, 0] * dt, middles[:, 1] * dt
         variances = np.array([noise_density(self._noise, v, omega) for v, omega in middles.tolist()]) * dt
-        return MotionPrediction(*composed(twists, variances), states[-1])
+        return MotionPrediction(*composed(twists.tolist(), variances.tolist()), states[-1])
 
     def _roll(self, track: CommandTrack, start: float, duration: float, velocity: FloatArray) -> FloatArray:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
