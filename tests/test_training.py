@@ -12,12 +12,14 @@ import yaml
 from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, ModelError
 from fgloc.motion import load_model, save_model
 from fgloc.motion.card import Input, Split
 from fgloc.motion.load import read_model
 from training import evaluate as evaluation
+from training import optimize
 from training import train as training
+from training.checkpoint import Checkpoint, Checkpoints
 from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
 from training.data import Run
 from training.export import card_of, tensors_of
@@ -171,10 +173,56 @@ def test_cross_calibration_hears_every_recording_but_the_tested(runs: dict[str, 
     alone = training.train(plain, split, runs, path, "a test")
     weights = read_model(path)[0]
     together = training.train(crossed, split, runs, path, "a test")
-    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.losses.png", "model.safetensors"]
     for name, tensor in read_model(path)[0].items():
         np.testing.assert_array_equal(tensor, weights[name])
     assert together.variance_scale != alone.variance_scale
+
+
+@pytest.mark.parametrize("stage", ["rollout_loss", "composed_nll"])
+def test_killed_training_goes_on_and_ends_at_the_same_bytes(
+    stage: str, runs: dict[str, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = tiny_config("displacement", list(runs))
+    short = base.optimization.model_copy(update=dict(iterations=60, validate_every=20, variance_iterations=60))
+    config = base.model_copy(update=dict(optimization=short))
+    split = training.leave_one_out(list(runs))[0]
+    training.train(config, split, runs, tmp_path / "whole.safetensors", "a test")
+    real, calls = getattr(optimize, stage), 0
+
+    def dies(*arguments: object) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        if calls == 45:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    path, kept = tmp_path / "model.safetensors", Checkpoints(tmp_path / "kept")
+    with monkeypatch.context() as patched:
+        patched.setattr(optimize, stage, dies)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(config, split, runs, path, "a test", kept)
+    assert not path.exists()
+    counted = 0
+
+    def counts(*arguments: object) -> torch.Tensor:
+        nonlocal counted
+        counted += 1
+        return real(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(optimize, stage, counts)
+        training.train(config, split, runs, path, "a test", kept)
+    assert 0 < counted < 45
+    assert path.read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+    kept.clear()
+    assert not (tmp_path / "kept").exists()
+
+
+def test_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+    (tmp_path / "c.pt").write_bytes(b"PK not a checkpoint")
+    with pytest.raises(ModelError, match=r"c\.pt: not a sound checkpoint"):
+        Checkpoint(tmp_path / "c.pt").load()
 
 
 def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,7 +236,8 @@ def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     arguments = [str(tmp_path / "config.yaml"), "--data", str(tmp_path), "--out", str(tmp_path / "models")]
     assert training.main(arguments) == 0
     made = sorted(p.name for p in (tmp_path / "models").iterdir())
-    assert made == ["all.safetensors", *(f"without_run{i}.safetensors" for i in range(3))]
+    names = ("all", *(f"without_run{i}" for i in range(3)))
+    assert made == sorted(f"{name}.{end}" for name in names for end in ("safetensors", "losses.png"))
     from_all = load_model(tmp_path / "models" / "all.safetensors").card
     assert from_all.split.train == ("run0", "run1", "run2")
     assert from_all.joint is not None

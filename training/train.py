@@ -2,19 +2,18 @@
 
 Read from top to bottom: fit the known kinematics, train the mean on rolled-out trajectories with early stopping on
 validation recordings, train the variance with the mean frozen, calibrate it on the validation recordings, export.
+A run that was killed goes on from its last checkpoint when the same command is given again, and ends at the same files.
 """
 
 from __future__ import annotations
 
 import argparse
-import copy
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from fgloc.errors import FglocError, RecordingError
@@ -22,31 +21,41 @@ from fgloc.motion.card import Kinematics, ModelCard, Split
 from fgloc.motion.load import Tensors, load_model, read_model, save_model
 from fgloc.motion.signals import Signal
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
-from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
+from training.checkpoint import Checkpoints, Curve
+from training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
-from training.losses import composed_nll, end_errors, rollout_loss
-from training.models import DisplacementNet, MotionNet, Samples, VelocityNet, relative
+from training.models import DisplacementNet, MotionNet, VelocityNet
+from training.optimize import train_mean, train_variance
+from training.plots import draw_losses
 from training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
 
-_VALIDATION_S = (10.0, 30.0)
 _SEEDS_APART = 1_000  # between the members of an ensemble
+_NOTHING_KEPT = Checkpoints()
 HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
 
 
-def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str) -> ModelCard:
-    """Train one model, calibrate it on its validation recordings, write it.
+def train(
+    config: TrainConfig,
+    split: Split,
+    runs: dict[str, Run],
+    path: Path,
+    made_by: str,
+    checkpoints: Checkpoints = _NOTHING_KEPT,
+) -> ModelCard:
+    """Train one model, calibrate it on its validation recordings, write it, and the curves of its losses beside it.
 
     Without validation recordings the training runs its full length and the covariance stays uncalibrated.
     """
     validation = [runs[name] for name in split.validation]
-    tensors, card = train_uncalibrated(config, split, runs, path, made_by)
+    tensors, card, curves = train_uncalibrated(config, split, runs, path, made_by, checkpoints)
+    draw_losses(path.with_name(f"{path.stem}.losses.png"), curves)
     if not validation:
         return card
     held_out = held_out_rollouts(path, card, validation)
     if config.calibration.cross:
-        held_out += cross_rollouts(config, split, runs, path, made_by)
+        held_out += cross_rollouts(config, split, runs, path, made_by, checkpoints)
     card = calibrate(card, held_out, config.calibration)
     tested = [runs[name] for name in split.test] or validation
     save_model(path, tensors, card)
@@ -56,16 +65,20 @@ def train(config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, m
 
 
 def train_uncalibrated(
-    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str
-) -> tuple[Tensors, ModelCard]:
+    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str, checkpoints: Checkpoints
+) -> tuple[Tensors, ModelCard, dict[str, Curve]]:
     """Train all members and write them with a card that knows no calibration yet."""
-    training = [runs[name] for name in split.train]
-    validation = [runs[name] for name in split.validation]
-    nets = [train_member(config, training, validation, member) for member in range(config.network.members)]
+    nets, curves = [], {}
+    for member in range(config.network.members):
+        net, found = train_member(config, split, runs, member, checkpoints)
+        nets.append(net)
+        curves |= {
+            f"{stage}, member {member}" if config.network.members > 1 else stage: c for stage, c in found.items()
+        }
     tensors, card = tensors_of(nets), card_of(nets[0], config, split, made_by)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_model(path, tensors, card)
-    return tensors, card
+    return tensors, card, curves
 
 
 def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tuple[Rollout, Rollout]]:
@@ -79,27 +92,31 @@ def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tupl
 
 
 def cross_rollouts(
-    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str
+    config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str, checkpoints: Checkpoints
 ) -> list[tuple[Rollout, Rollout]]:
     """Over each training recording, by a model that left it out. These models are not kept."""
     found, scratch = [], path.with_name(path.name + ".fold")
     for name in split.train:
         fold = split.model_copy(update={"train": tuple(n for n in split.train if n != name)})
-        _, card = train_uncalibrated(config, fold, runs, scratch, made_by)
+        _, card, _ = train_uncalibrated(config, fold, runs, scratch, made_by, checkpoints)
         found += held_out_rollouts(scratch, card, [runs[name]])
         scratch.unlink()
     return found
 
 
-def train_member(config: TrainConfig, training: list[Run], validation: list[Run], member: int) -> MotionNet:
-    """One network; the members of an ensemble differ by their seed."""
+def train_member(
+    config: TrainConfig, split: Split, runs: dict[str, Run], member: int, checkpoints: Checkpoints
+) -> tuple[MotionNet, dict[str, Curve]]:
+    """One network and how its stages went; the members of an ensemble differ by their seed."""
     optimization = config.optimization.model_copy(update={"seed": config.optimization.seed + _SEEDS_APART * member})
+    training, validation = ([runs[name] for name in names] for names in (split.train, split.validation))
+    kept = {stage: checkpoints.of(config, split, runs, member, stage) for stage in ("mean", "variance")}
     torch.manual_seed(optimization.seed)
     net = new_net(config.network, training)
-    train_mean(net, training, validation, optimization)
+    curves = {"mean": train_mean(net, training, validation, optimization, kept["mean"])}
     if isinstance(net, DisplacementNet):
-        train_variance(net, training, validation, optimization)
-    return net
+        curves["variance"] = train_variance(net, training, validation, optimization, kept["variance"])
+    return net, curves
 
 
 def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
@@ -118,95 +135,6 @@ def _wheels_of(run: Run) -> Signal:
             f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"
         )
     return wheels
-
-
-def train_mean(net: MotionNet, training: list[Run], validation: list[Run], config: OptimizationConfig) -> None:
-    """Adam on the multi-step loss; keeps the weights that were best on the validation recordings."""
-    rng = torch.Generator().manual_seed(config.seed)
-    samples = net.samples(training)
-    steps = round(config.horizon_s / samples.dt_s)
-    starts = window_starts(training, steps)
-    held_out = net.samples(validation) if validation else None
-    optimizer = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.iterations)
-    best, best_state, waited = np.inf, copy.deepcopy(net.state_dict()), 0
-    with tqdm(total=config.iterations, desc="mean", disable=None, leave=False) as bar:
-        for i in range(1, config.iterations + 1):
-            chosen = starts[torch.randint(len(starts), (config.batch,), generator=rng)]
-            truth = samples.poses[chosen[:, None] + torch.arange(steps + 1)]
-            loss = rollout_loss(net.roll(samples, chosen, steps, rng), truth, samples.dt_s, config)
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-            optimizer.step()
-            schedule.step()
-            bar.update()
-            if held_out is None or i % config.validate_every:
-                continue
-            score = validate(net, held_out, validation)
-            bar.set_postfix(validation=f"{score:.2f} %")
-            waited += 1
-            if score < best:
-                best, best_state, waited = score, copy.deepcopy(net.state_dict()), 0
-            if waited >= config.patience:
-                break
-    if held_out is not None:
-        net.load_state_dict(best_state)
-
-
-def validate(net: MotionNet, samples: Samples, runs: list[Run]) -> float:
-    """Drift [%] of free rollouts, averaged over the horizons that the runs allow."""
-    drifts = []
-    for horizon in _VALIDATION_S:
-        steps = round(horizon / samples.dt_s)
-        starts = window_starts(runs, steps, stride=round(1.0 / samples.dt_s))
-        if not len(starts):
-            continue
-        with torch.no_grad():
-            predicted = net.roll(samples, starts, steps)[:, -1]
-        truth = samples.poses[starts[:, None] + torch.arange(steps + 1)]
-        error = predicted - relative(truth[:, 0], truth[:, -1])
-        distance = truth[:, 1:, :2].sub(truth[:, :-1, :2]).norm(dim=-1).sum()
-        drifts.append(100.0 * float(error[:, :2].norm(dim=-1).sum() / distance))
-    if not drifts:
-        raise FglocError(
-            f"the validation recordings hold no {_VALIDATION_S[0]:.0f} s of unbroken truth; give longer ones"
-        )
-    return float(np.mean(drifts))
-
-
-def train_variance(
-    net: DisplacementNet, training: list[Run], validation: list[Run], config: OptimizationConfig
-) -> None:
-    """Likelihood of the composed errors over windows; only the variance head learns."""
-    rng = torch.Generator().manual_seed(config.seed)
-    samples = net.samples(training)
-    steps = round(config.variance_horizon_s / samples.dt_s)
-    starts = window_starts(training, steps)
-    held_out = net.samples(validation) if validation else None
-    optimizer = torch.optim.Adam(net.variance_head.parameters(), lr=config.learning_rate)
-    best, best_state = np.inf, copy.deepcopy(net.variance_head.state_dict())
-
-    def loss_of(on: Samples, chosen: Tensor) -> Tensor:
-        with torch.no_grad():
-            _, hidden = net.hidden(on, chosen, steps, None)
-            truth = on.poses[chosen[:, None] + torch.arange(steps + 1)]
-            error, adjoints = end_errors(net.roll(on, chosen, steps), truth)
-        return composed_nll(error, adjoints, net.variance_head(hidden), on.dt_s)
-
-    for i in tqdm(range(1, config.variance_iterations + 1), desc="variance", disable=None, leave=False):
-        loss = loss_of(samples, starts[torch.randint(len(starts), (config.batch,), generator=rng)])
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.variance_head.parameters(), 5.0)
-        optimizer.step()
-        if held_out is not None and i % 25 == 0:
-            with torch.no_grad():
-                score = float(loss_of(held_out, window_starts(validation, steps, stride=round(1.0 / samples.dt_s))))
-            if score < best:
-                best, best_state = score, copy.deepcopy(net.variance_head.state_dict())
-    if held_out is not None:
-        net.variance_head.load_state_dict(best_state)
 
 
 def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: CalibrationConfig) -> ModelCard:
@@ -236,17 +164,17 @@ def leave_one_out(names: list[str]) -> list[Split]:
     return splits
 
 
-def window_starts(runs: list[Run], steps: int, stride: int = 1) -> Tensor:
-    """Rows of `Samples` from which a window of steps has truth throughout."""
-    offsets = np.concatenate([[0], np.cumsum([len(run.poses) for run in runs])])
-    parts = [run.starts(steps, stride) + offset for run, offset in zip(runs, offsets, strict=False)]
-    return torch.from_numpy(np.concatenate(parts))
-
-
-def _from_all(config: TrainConfig, runs: dict[str, Run], folds: list[ModelCard], path: Path, made_by: str) -> ModelCard:
+def _from_all(
+    config: TrainConfig,
+    runs: dict[str, Run],
+    folds: list[ModelCard],
+    path: Path,
+    made_by: str,
+    checkpoints: Checkpoints,
+) -> ModelCard:
     """A model from every recording, calibrated and judged by the models that left one out."""
     split = Split(train=tuple(runs), validation=())
-    card = train(config, split, runs, path, made_by)
+    card = train(config, split, runs, path, made_by, checkpoints)
     scale = np.exp(np.mean([np.log(c.variance_scale) for c in folds], axis=0))
     update: dict[str, object] = {
         "variance_scale": tuple(float(s) for s in scale),
@@ -282,15 +210,19 @@ def main(arguments: list[str] | None = None) -> int:
             name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data)
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
+        checkpoints = Checkpoints(options.out / ".checkpoints")
         if config.split is not None:
-            _report("model", train(config, config.split, runs, options.out / "model.safetensors", made_by))
+            path = options.out / "model.safetensors"
+            _report(path.stem, train(config, config.split, runs, path, made_by, checkpoints))
+            checkpoints.clear()
             return 0
         folds = []
         for split in leave_one_out(list(runs)):
             path = options.out / f"without_{split.test[0]}.safetensors"
-            folds.append(train(config, split, runs, path, made_by))
+            folds.append(train(config, split, runs, path, made_by, checkpoints))
             _report(path.stem, folds[-1])
-        _report("all", _from_all(config, runs, folds, options.out / "all.safetensors", made_by))
+        _report("all", _from_all(config, runs, folds, options.out / "all.safetensors", made_by, checkpoints))
+        checkpoints.clear()
     except FglocError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -1,0 +1,189 @@
+"""The two descents of a training: the mean on rolled-out trajectories, then the variance on their likelihood."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from fgloc.errors import FglocError
+from training.checkpoint import Checkpoint, Curve
+from training.config import OptimizationConfig
+from training.data import Run
+from training.losses import composed_nll, end_errors, rollout_loss
+from training.models import DisplacementNet, MotionNet, Samples, relative
+
+_VALIDATION_S = (10.0, 30.0)
+_VARIANCE_EVERY = 25  # iterations between validations of the variance
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How long a descent goes on and how often it is judged."""
+
+    name: str
+    iterations: int
+    learning_rate: float
+    validate_every: int
+    patience: int | None  # validations without improvement after which to stop
+    anneal: bool  # lower the rate to nothing, as a cosine
+
+
+def descend(
+    plan: Plan,
+    module: nn.Module,
+    loss_of_batch: Callable[[torch.Generator], Tensor],
+    score: Callable[[], float] | None,
+    seed: int,
+    checkpoint: Checkpoint,
+) -> Curve:
+    """Adam on a module's parameters. Keeps the state with the least score, or the last if nothing is scored.
+
+    Interrupted and begun again with the same arguments it gives the same weights, bit for bit.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.Adam(module.parameters(), lr=plan.learning_rate)
+    half_wave = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, plan.iterations) if plan.anneal else None
+    best, best_state, waited, first = np.inf, copy.deepcopy(module.state_dict()), 0, 1
+    curve = Curve()
+
+    # 1. Go on where an earlier run was stopped
+    if (kept := checkpoint.load()) is not None:
+        module.load_state_dict(kept["module"])
+        optimizer.load_state_dict(kept["optimizer"])
+        if half_wave is not None:
+            half_wave.load_state_dict(kept["schedule"])
+        rng.set_state(kept["rng"])
+        best, best_state, waited, first = kept["best"], kept["best_state"], kept["waited"], kept["iteration"] + 1
+        curve = Curve(kept["losses"], [(int(i), float(s)) for i, s in kept["scores"]])
+
+    # 2. Descend, judge now and then, and note where we are
+    bar = tqdm(total=plan.iterations, initial=first - 1, desc=plan.name, disable=None, leave=False)
+    for i in range(first, plan.iterations + 1):
+        loss = loss_of_batch(rng)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 5.0)
+        optimizer.step()
+        if half_wave is not None:
+            half_wave.step()
+        curve.losses.append(float(loss.detach()))
+        bar.update()
+        if i % plan.validate_every and i < plan.iterations:
+            continue
+        if score is not None:
+            curve.scores.append((i, score()))
+            bar.set_postfix(validation=f"{curve.scores[-1][1]:.3f}")
+            waited += 1
+            if curve.scores[-1][1] < best:
+                best, best_state, waited = curve.scores[-1][1], copy.deepcopy(module.state_dict()), 0
+        tired = plan.patience is not None and waited >= plan.patience
+        checkpoint.save(
+            {
+                "iteration": plan.iterations if tired else i,
+                "module": module.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "schedule": {} if half_wave is None else half_wave.state_dict(),
+                "rng": rng.get_state(),
+                "best": best,
+                "best_state": best_state,
+                "waited": waited,
+                "losses": curve.losses,
+                "scores": curve.scores,
+            }
+        )
+        if tired:
+            break
+    bar.close()
+    if score is not None:
+        module.load_state_dict(best_state)
+    return curve
+
+
+def train_mean(
+    net: MotionNet,
+    training: list[Run],
+    validation: list[Run],
+    config: OptimizationConfig,
+    checkpoint: Checkpoint | None = None,
+) -> Curve:
+    """Adam on the multi-step loss; keeps the weights that were best on the validation recordings."""
+    samples = net.samples(training)
+    steps = round(config.horizon_s / samples.dt_s)
+    starts = window_starts(training, steps)
+    held_out = net.samples(validation) if validation else None
+
+    def loss_of_batch(rng: torch.Generator) -> Tensor:
+        chosen = starts[torch.randint(len(starts), (config.batch,), generator=rng)]
+        truth = samples.poses[chosen[:, None] + torch.arange(steps + 1)]
+        return rollout_loss(net.roll(samples, chosen, steps, rng), truth, samples.dt_s, config)
+
+    score = None if held_out is None else lambda: validate(net, held_out, validation)
+    plan = Plan("mean", config.iterations, config.learning_rate, config.validate_every, config.patience, anneal=True)
+    return descend(plan, net, loss_of_batch, score, config.seed, checkpoint or Checkpoint())
+
+
+def validate(net: MotionNet, samples: Samples, runs: list[Run]) -> float:
+    """Drift [%] of free rollouts, averaged over the horizons that the runs allow."""
+    drifts = []
+    for horizon in _VALIDATION_S:
+        steps = round(horizon / samples.dt_s)
+        starts = window_starts(runs, steps, stride=round(1.0 / samples.dt_s))
+        if not len(starts):
+            continue
+        with torch.no_grad():
+            predicted = net.roll(samples, starts, steps)[:, -1]
+        truth = samples.poses[starts[:, None] + torch.arange(steps + 1)]
+        error = predicted - relative(truth[:, 0], truth[:, -1])
+        distance = truth[:, 1:, :2].sub(truth[:, :-1, :2]).norm(dim=-1).sum()
+        drifts.append(100.0 * float(error[:, :2].norm(dim=-1).sum() / distance))
+    if not drifts:
+        raise FglocError(
+            f"the validation recordings hold no {_VALIDATION_S[0]:.0f} s of unbroken truth; give longer ones"
+        )
+    return float(np.mean(drifts))
+
+
+def train_variance(
+    net: DisplacementNet,
+    training: list[Run],
+    validation: list[Run],
+    config: OptimizationConfig,
+    checkpoint: Checkpoint | None = None,
+) -> Curve:
+    """Likelihood of the composed errors over windows; only the variance head learns."""
+    samples = net.samples(training)
+    steps = round(config.variance_horizon_s / samples.dt_s)
+    starts = window_starts(training, steps)
+    held_out = net.samples(validation) if validation else None
+    judged = window_starts(validation, steps, stride=round(1.0 / samples.dt_s)) if validation else starts
+
+    def loss_of(on: Samples, chosen: Tensor) -> Tensor:
+        with torch.no_grad():
+            _, hidden = net.hidden(on, chosen, steps, None)
+            truth = on.poses[chosen[:, None] + torch.arange(steps + 1)]
+            error, adjoints = end_errors(net.roll(on, chosen, steps), truth)
+        return composed_nll(error, adjoints, net.variance_head(hidden), on.dt_s)
+
+    def loss_of_batch(rng: torch.Generator) -> Tensor:
+        return loss_of(samples, starts[torch.randint(len(starts), (config.batch,), generator=rng)])
+
+    @torch.no_grad()
+    def score() -> float:
+        return float(loss_of(samples if held_out is None else held_out, judged))
+
+    plan = Plan("variance", config.variance_iterations, config.learning_rate, _VARIANCE_EVERY, None, anneal=False)
+    judge = score if validation else None
+    return descend(plan, net.variance_head, loss_of_batch, judge, config.seed, checkpoint or Checkpoint())
+
+
+def window_starts(runs: list[Run], steps: int, stride: int = 1) -> Tensor:
+    """Rows of `Samples` from which a window of steps has truth throughout."""
+    offsets = np.concatenate([[0], np.cumsum([len(run.poses) for run in runs])])
+    parts = [run.starts(steps, stride) + offset for run, offset in zip(runs, offsets, strict=False)]
+    return torch.from_numpy(np.concatenate(parts))
