@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc.config import Config
+from fgloc.config import Config, Role
+from fgloc.diagnosis import Diagnosis
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, rpy_matrix
 from fgloc.gate import Gate
@@ -57,6 +58,7 @@ class Assembly:
     landmarks: LandmarkSensor
     learned: LearnedMotion | None
     localizer: Localizer
+    diagnosis: Diagnosis
     notes: tuple[str, ...]
 
 
@@ -99,10 +101,10 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         learned = LearnedMotion(model, config.motion)
         joint = model.joint if config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
-    gyro = (
-        Gyro(config.gyro, _imu_up(recording, config, first)) if "imu" in recording.roles and config.gyro.use else None
-    )
+    imu_up = _imu_up(recording, config, first) if "imu" in recording.roles and config.gyro.use else None
+    gyro = None if imu_up is None else Gyro(config.gyro, imu_up)
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
+    seen_by: Role = "sightings" if detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     return Assembly(
         config=config,
@@ -115,6 +117,7 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         landmarks=landmarks,
         learned=learned,
         localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro),
+        diagnosis=Diagnosis(config, landmark_map, camera, T_base_sensor, seen_by, imu_up),
         notes=tuple(notes),
     )
 

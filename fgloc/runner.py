@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
-from fgloc.config import Config, TruthConfig
+from fgloc.attendance import Attendance
+from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError
 from fgloc.hints import image_hints
 from fgloc.recording.reader import open_recording
-from fgloc.recording.truth import base_pose
+from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
 from fgloc.sensors.remembered import RememberedDetections
 from fgloc.smoothing import smooth_run
@@ -24,7 +25,7 @@ from fgloc.types import (
     Decision,
     Estimate,
     Event,
-    FloatArray,
+    Heard,
     ImageEvent,
     LandmarkMap,
     RunResult,
@@ -81,19 +82,28 @@ def run(
         detector: Detector | None = parts.detector
         if parts.detector is not None and detections is not None:
             detector = RememberedDetections(detections, parts.detector)
-        replay = _Replay(parts, detector, recording.duration_s, progress, pace, sightings)
+        replay = _Replay(parts, recording.roles, detector, recording.duration_s, progress, pace, sightings)
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
             replay.record(estimate, (time.perf_counter() - start) * 1e3)
+            parts.diagnosis.observe(step, parts.wheels.measure(step))
             if on_step is not None:
                 on_step(step, estimate)
         if isinstance(detector, RememberedDetections):
             detector.save()
-        hints: tuple[str, ...] = ()
+        hints = (*parts.diagnosis.notes(parts.wheels.source), *replay.attendance.missing())
         if parts.detector is not None and not parts.localizer.counts["corners"]:
-            hints = image_hints(recording, parts.detector)
-        notes = (*hints, *recording.notes, *parts.notes, *parts.gate.notes, *parts.stepper.notes, *parts.wheels.notes)
+            hints = (*image_hints(recording, parts.detector), *hints)
+        notes = (
+            *hints,
+            *recording.notes,
+            *parts.notes,
+            *parts.gate.notes,
+            *parts.stepper.notes,
+            *parts.wheels.notes,
+            *parts.localizer.notes,
+        )
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
     if not replay.estimates:
@@ -118,7 +128,7 @@ def run(
         notes=tuple(dict.fromkeys(map(_sentence, notes))),
         step_ms=np.array(replay.step_ms),
         wall_s=time.perf_counter() - began,
-        truth=replay.truth(parts.config.truth),
+        truth=replay.truth.trajectory(),
         landmarks=landmarks,
         spans=replay.spans(),
         source=recording_path,
@@ -131,6 +141,7 @@ class _Replay:
     def __init__(
         self,
         parts: Assembly,
+        roles: Mapping[Role, str],
         detector: Detector | None,
         duration_s: float,
         progress: Progress | None,
@@ -144,9 +155,9 @@ class _Replay:
         self._pace = pace
         self._sightings = sightings if sightings is not None else iter
         self._image_rejections: Counter[str] = Counter()
-        self._truth: list[TruthEvent] = []
-        self._heard: dict[str, list[int]] = {}
         self._first_ns: int | None = None
+        self.attendance = Attendance(roles)
+        self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
         self.decisions: list[Decision] = []
         self.step_ms: list[float] = []
@@ -159,7 +170,7 @@ class _Replay:
             found = detect_stream(self._gated(events), self._detector, self._image_rejections)
             gated = self._regated(self._sightings(found))
         for event in gated:
-            self._heard.setdefault(event.topic, []).append(event.stamp_ns)
+            self.attendance.hear(event.topic, event.stamp_ns)
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
@@ -188,29 +199,9 @@ class _Replay:
             total.update(source)
         return total
 
-    def truth(self, config: TruthConfig) -> Trajectory | None:
-        """The truth of the base as a planar trajectory with increasing stamps; None if there is none."""
-        back_ns = round(self._parts.config.gate.clock_back_s * 1e9)
-        rows: dict[int, FloatArray] = {}
-        newest = set_back = 0
-        for e in self._truth:
-            if e.stamp_ns >= newest - back_ns:
-                newest, set_back = max(newest, e.stamp_ns), 0
-            elif set_back:  # twice running: no stray stamp, the clock was set back; the later pass is kept
-                rows = {stamp: pose for stamp, pose in rows.items() if stamp <= set_back}
-                newest, set_back = e.stamp_ns, 0
-            else:
-                set_back = e.stamp_ns
-            rows[e.stamp_ns] = base_pose(e, config)
-        if len(rows) < 2:
-            return None
-        stamps = np.array(sorted(rows), dtype=np.int64)
-        return Trajectory(stamps, np.array([rows[int(s)] for s in stamps]))
-
-    def spans(self) -> dict[str, FloatArray]:
-        """Times [s from the first estimate] at which each topic was heard."""
-        origin = self.estimates[0].stamp_ns if self.estimates else 0
-        return {topic: (np.array(stamps) - origin) * 1e-9 for topic, stamps in sorted(self._heard.items())}
+    def spans(self) -> dict[str, Heard]:
+        """When each topic was heard, from the first estimate on."""
+        return self.attendance.spans(self.estimates[0].stamp_ns if self.estimates else 0)
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
@@ -224,7 +215,8 @@ class _Replay:
                 self._progress(elapsed, self._duration_s)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
-                self._truth.append(passed)
+                self.truth.add(passed)
+                self.attendance.present(passed.topic)
             elif passed is not None:
                 yield passed
 
@@ -262,7 +254,7 @@ def _trajectory(estimates: list[Estimate]) -> Trajectory:
 
 
 def _never_found(replay: _Replay, rejections: Counter[str]) -> str:
-    heard = ", ".join(f"{topic} {len(spans)}" for topic, spans in replay.spans().items()) or "nothing"
+    heard = ", ".join(f"{topic} {span.count}" for topic, span in replay.spans().items()) or "nothing"
     why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
     return (
         f"the first pose was never found in {len(replay.step_ms)} steps. Heard: {heard}. Rejected: {why}. "

@@ -373,6 +373,19 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Heard:
+    """When a topic was heard.
+
+    ``times`` are in seconds from the first estimate; of very many only one in ``every`` is kept.
+    """
+
+    times: FloatArray  # (n,)
+    count: int
+    every: int
+    longest_silence_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
     """A whole run, ready to be evaluated and written."""
 
@@ -386,5 +399,5 @@ class RunResult:
     wall_s: float
     truth: Trajectory | None = None
     landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
-    spans: Mapping[str, FloatArray] = field(default_factory=dict)  # sensor -> (n,) s from start
+    spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None

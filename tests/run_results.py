@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fgloc.se2 import rotate_cov, wrap_array
-from fgloc.types import Decision, Landmark, LandmarkMap, Mode, RunResult, Trajectory
+from fgloc.types import Decision, Heard, Landmark, LandmarkMap, Mode, RunResult, Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -42,7 +42,10 @@ def figure_eight(seed=0, n=300, truth=True, modes=None):
         landmarks=LandmarkMap(
             {0: _standing(0, 4.0, 0.0, np.pi), 7: Landmark(7, np.array([0.0, 2.6, 0.0]), np.eye(3), 0.0)}
         ),
-        spans={"/odom": np.arange(0.0, 30.0, 0.05), "/camera": np.r_[np.arange(0, 10, 0.1), np.arange(20, 30, 0.1)]},
+        spans={
+            "/odom": Heard(np.arange(0.0, 30.0, 0.05), 600, 1, 0.05),
+            "/camera": Heard(np.r_[np.arange(0, 10, 0.1), np.arange(20, 30, 0.1)], 200, 1, 10.1),
+        },
         source=Path("first_run"),
     )
 

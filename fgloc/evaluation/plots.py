@@ -130,7 +130,7 @@ def plot_timeline(result: RunResult) -> Figure:
         (rejected[_rejection(decision)] if decision.weight == 0 else fused[decision.kind]).append(decision.stamp_ns)
     common = sorted(rejected, key=lambda reason: -len(rejected[reason]))[:_MAX_REASONS]
     groups = [
-        ("heard", _GREY, dict(result.spans)),
+        ("heard", _GREY, {topic: heard.times for topic, heard in result.spans.items()}),
         ("fused", _BLUE, {kind: _seconds(result, stamps) for kind, stamps in sorted(fused.items())} | keyframes),
         ("rejected", _RED, {reason: _seconds(result, rejected[reason]) for reason in common}),
     ]

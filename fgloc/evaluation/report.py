@@ -170,10 +170,10 @@ def _figures(metrics: Metrics) -> str:
 
 def _sensors(result: RunResult) -> str:
     rows = []
-    for name, times in result.spans.items():
-        steps = np.diff(np.sort(times))
+    for name, heard in result.spans.items():
+        steps = np.diff(np.sort(heard.times)) / heard.every
         rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
-        rows.append((name, len(times), rate, f"{steps.max():.2f}" if len(steps) else "–"))
+        rows.append((name, heard.count, rate, f"{heard.longest_silence_s:.2f}" if heard.count > 1 else "–"))
     return table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
 
 

@@ -2,13 +2,57 @@
 
 from __future__ import annotations
 
+from array import array
+
+import numpy as np
+
 from fgloc import se2
 from fgloc.config import TruthConfig
 from fgloc.frames import quaternion_yaw
-from fgloc.types import FloatArray, TruthEvent
+from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
 
 def base_pose(event: TruthEvent, config: TruthConfig) -> FloatArray:
     """Planar pose ``(3,)`` of the base, from that of the body which the system tracks."""
     T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
     return se2.compose((event.position[0], event.position[1], quaternion_yaw(event.orientation)), T_body_base)
+
+
+class TruthTrack:
+    """Collects the base's true poses, compactly. Where the clock was set back the later pass is kept."""
+
+    def __init__(self, config: TruthConfig, clock_back_s: float) -> None:
+        """``clock_back_s``: a step back longer than this, twice running, is the clock's and no stray stamp's."""
+        self._config = config
+        self._back_ns = round(clock_back_s * 1e9)
+        self._newest_ns = 0
+        self._set_back_ns = 0
+        self._stamps = array("q")
+        self._poses = array("d")
+
+    def add(self, event: TruthEvent) -> None:
+        """Take in one pose."""
+        stamp = event.stamp_ns
+        if stamp >= self._newest_ns - self._back_ns:
+            self._newest_ns, self._set_back_ns = max(self._newest_ns, stamp), 0
+        elif self._set_back_ns:
+            self._forget_after(self._set_back_ns)
+            self._newest_ns, self._set_back_ns = stamp, 0
+        else:
+            self._set_back_ns = stamp
+        self._stamps.append(stamp)
+        self._poses.extend(base_pose(event, self._config).tolist())
+
+    def trajectory(self) -> Trajectory | None:
+        """Poses with increasing stamps, the last one of each stamp; None if there are fewer than two."""
+        stamps, poses = self._arrays()
+        stamps, last = np.unique(stamps[::-1], return_index=True)
+        return None if len(stamps) < 2 else Trajectory(stamps, poses[::-1][last])
+
+    def _forget_after(self, stamp_ns: int) -> None:
+        stamps, poses = self._arrays()
+        kept = stamps <= stamp_ns
+        self._stamps, self._poses = array("q", stamps[kept].tolist()), array("d", poses[kept].ravel().tolist())
+
+    def _arrays(self) -> tuple[IntArray, FloatArray]:
+        return np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 3)

@@ -61,6 +61,11 @@ class WheelMotion:
         self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
 
     @property
+    def source(self) -> str:
+        """Where the motion comes from: "ticks", "odometry" or "command"; empty before anything was heard."""
+        return self._chosen
+
+    @property
     def stands_in(self) -> bool:
         """Whether there are no wheels to hear, and commands stand in for them."""
         return self._chosen == "command"

@@ -1,0 +1,86 @@
+"""Which topics speak, and when: in bounded memory, for recordings and live streams alike."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+
+import numpy as np
+
+from fgloc.config import Role
+from fgloc.types import Heard
+
+_MOST = 100_000  # times kept of a topic; of more, every second is dropped
+
+
+class Attendance:
+    """Notes who was heard. A topic that is expected and never speaks is the trace of a mismatch that nobody reports.
+
+    Example:
+        >>> attendance = Attendance({"imu": "/imu", "odometry": "/odom"})
+        >>> attendance.hear("/odom", 1_000_000_000)
+        >>> [sentence.split(":")[0] for sentence in attendance.missing()]
+        ['/imu (imu)']
+    """
+
+    def __init__(self, expected: Mapping[Role, str]) -> None:
+        """``expected``: topic of each role that is to be used."""
+        self._expected = dict(expected)
+        self._topics: dict[str, _Times] = {}
+        self._silent = set(expected.values())
+
+    def hear(self, topic: str, stamp_ns: int) -> None:
+        """Note a message that could be used."""
+        times = self._topics.get(topic)
+        if times is None:
+            times = self._topics[topic] = _Times()
+            self._silent.discard(topic)
+        times.add(stamp_ns)
+
+    def present(self, topic: str) -> None:
+        """Note that a topic speaks without keeping when."""
+        self._silent.discard(topic)
+
+    def missing(self) -> tuple[str, ...]:
+        """A sentence for each expected topic of which nothing usable was heard so far.
+
+        A live adapter asks this once the streams should have begun (a few seconds after subscribing), and again at the
+        end.
+        """
+        return tuple(
+            f"{topic} ({role}): nothing usable was heard of it. It is not published, all of it was rejected, or (live, "
+            "and when recording) the quality of service does not match: subscribe with reliability best effort and "
+            "durability volatile."
+            for role, topic in self._expected.items()
+            if topic in self._silent
+        )
+
+    def spans(self, origin_ns: int) -> dict[str, Heard]:
+        """When each topic was heard, in seconds from a time."""
+        return {topic: times.heard(origin_ns) for topic, times in sorted(self._topics.items())}
+
+
+class _Times:
+    """Stamps of one topic: all, until they are too many."""
+
+    def __init__(self) -> None:
+        self._kept = array("q")
+        self._every = 1
+        self._count = 0
+        self._newest = 0
+        self._longest = 0
+
+    def add(self, stamp_ns: int) -> None:
+        if self._count and stamp_ns > self._newest:
+            self._longest = max(self._longest, stamp_ns - self._newest)
+        self._newest = max(self._newest, stamp_ns)
+        if self._count % self._every == 0:
+            self._kept.append(stamp_ns)
+        self._count += 1
+        if len(self._kept) > _MOST:
+            self._kept = self._kept[::2]
+            self._every *= 2
+
+    def heard(self, origin_ns: int) -> Heard:
+        seconds = np.asarray((np.array(self._kept, dtype=np.int64) - origin_ns) * 1e-9, dtype=np.float64)
+        return Heard(seconds, self._count, self._every, self._longest * 1e-9)
