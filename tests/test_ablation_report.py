@@ -172,3 +172,8 @@ def test_document_names_every_failure_and_its_suite_loads(tmp_path):
 @pytest.mark.parametrize("path", sorted((ROOT / "ablations").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_suites_load(path):
     assert load_suite(path).failures
+
+
+def test_every_kind_of_failure_is_in_the_suite_of_all():
+    named = {failure.kind for entry in load_suite(ROOT / "ablations" / "every.yaml").failures for failure in entry.chain}
+    assert named == {c.model_fields["kind"].default for c in typing.get_args(typing.get_args(AnyFailure)[0])}
