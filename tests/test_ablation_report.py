@@ -1,6 +1,7 @@
 """The report says what the records say: means, spreads, counts, costs, and what gave no result."""
 
 import csv
+import hashlib
 import json
 import typing
 from pathlib import Path
@@ -62,6 +63,7 @@ def made(bag):
                     seed=seed,
                     bag=bag,
                     map=None,
+                    config_file=None,
                     config=Config(),
                     mode="online",
                     start="configured",
@@ -118,7 +120,7 @@ def test_report_files_agree(bag, tmp_path):
     assert "http" not in page.replace("http-equiv", "")
     content = json.loads((out / "ablation.json").read_text())
     assert content["sentences"] == sentences
-    assert content["recordings"]["a"]["sha256"]
+    assert content["inputs"] == {"a": {str(bag): hashlib.sha256(b"stands for a recording").hexdigest()}}
     with (out / "matrix.csv").open() as file:
         table = list(csv.DictReader(file))
     assert len(table) == len(content["matrix"]) == 4 * 2 * 5
@@ -175,5 +177,7 @@ def test_shipped_suites_load(path):
 
 
 def test_every_kind_of_failure_is_in_the_suite_of_all():
-    named = {failure.kind for entry in load_suite(ROOT / "ablations" / "every.yaml").failures for failure in entry.chain}
+    named = {
+        failure.kind for entry in load_suite(ROOT / "ablations" / "every.yaml").failures for failure in entry.chain
+    }
     assert named == {c.model_fields["kind"].default for c in typing.get_args(typing.get_args(AnyFailure)[0])}

@@ -63,6 +63,7 @@ def plan_bags(bags: Sequence[Path], map_file: Path | None, configure: Callable[[
                 seed=0,
                 bag=bag,
                 map=map_file or find_beside(bag, "map.yaml"),
+                config_file=None,
                 config=config,
                 mode="batch",
                 start="configured",

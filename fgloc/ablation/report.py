@@ -32,13 +32,12 @@ def write_report(
     runs = join(jobs, records)
     entries = matrix(suite, runs)
     sentences = [sentence(suite, runs, failure.name) for failure in suite.failures]
-    bags = {job.cell.recording: job.cell.bag for job in jobs}
     provenance: dict[str, Any] = {
         "command": command,
         "code_sha256": code_hash(),
         "versions": {name: version(name) for name in ("fgloc", "gtsam", "numpy")}
         | {"python": platform.python_version()},
-        "recordings": {name: {"path": str(bag), "sha256": sha256_of(bag)} for name, bag in bags.items()},
+        "inputs": _inputs(jobs),
         "suite": suite.model_dump(mode="json"),
     }
     with atomic_folder(out) as stage:
@@ -52,6 +51,16 @@ def write_report(
 def failed(jobs: Sequence[Job], records: Mapping[str, Record]) -> list[Run]:
     """Runs that gave no result: refused for their input, or crashed and quarantined."""
     return [run for run in join(jobs, records) if run.record.outcome != "done"]
+
+
+def _inputs(jobs: Sequence[Job]) -> dict[str, dict[str, str]]:
+    """SHA-256 of every file that the runs of a recording read."""
+    files: dict[str, dict[Path, None]] = {}
+    for cell in (job.cell for job in jobs):
+        read = (cell.bag, cell.map, cell.config_file, cell.config.camera.file, cell.config.motion.model)
+        files.setdefault(cell.recording, {}).update(dict.fromkeys(path for path in read if path is not None))
+    digests = {path: sha256_of(path) for path in {path for paths in files.values() for path in paths}}
+    return {name: {str(path): digests[path] for path in paths} for name, paths in files.items()}
 
 
 def _as_json(

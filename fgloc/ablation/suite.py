@@ -114,6 +114,7 @@ class Cell(Section):
     seed: int
     bag: Path
     map: Path | None
+    config_file: Path | None
     config: Config
     mode: RunMode
     start: Literal["configured", "truth"]
@@ -162,6 +163,7 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
             variant=variant.name,
             bag=bag,
             map=map_file,
+            config_file=config_file,
             config=_varied(base, entry, variant, folder),
             mode=variant.mode or suite.mode,
             start=variant.start,
