@@ -6,18 +6,23 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 from run_results import figure_eight
 
 from fgloc.config import Config
 from fgloc.errors import OutputError
-from fgloc.evaluation import plots, report
+from fgloc.evaluation import plots, report, style, timeline
 from fgloc.evaluation.metrics import compute_metrics, match_result
+from fgloc.evaluation.timeline import plot_timeline
 from fgloc.recording.outputs import read_tum
-from fgloc.types import Mode, Trajectory
+from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import true_slips
+from fgloc.types import Decision, Mode, Trajectory
 
 FILES = {
     "trajectory.tum",
@@ -84,7 +89,7 @@ def test_every_picture_is_drawn(change):
     for figure in (
         plots.plot_trajectory(result, matched),
         plots.plot_error(result, matched),
-        plots.plot_timeline(result),
+        plot_timeline(result, matched),
     ):
         image = pixels(figure)
         assert image.shape[1] == 990
@@ -124,13 +129,74 @@ def test_error_is_not_drawn_where_there_is_no_truth():
     assert len(x) == len(matched.stamps_ns) + 1
 
 
-def test_timeline_shows_silence_and_every_rejection():
+def panel(figure, label):
+    """The axes of a panel by its label."""
+    return next(axes for axes in figure.axes if axes.get_ylabel().replace("\n", " ").startswith(label))
+
+
+def names(axes):
+    return [text.get_text() for text in axes.get_yticklabels()]
+
+
+def test_timeline_shows_silence_and_every_flag():
+    figure = plot_timeline(figure_eight())
+    assert names(panel(figure, "heard")) == ["/odom (600)", "/camera (200)"]
+    assert [len(bars.get_paths()) for bars in panel(figure, "heard").collections] == [1, 2]
+    assert names(panel(figure, "flags")) == ["corners: gate (30)"]
+    assert len(panel(figure, "flags").collections[0].get_paths()) == 30
+
+
+def test_timeline_draws_each_source_at_its_weight_as_last_judged():
+    base = figure_eight()
+    stamps = base.trajectory.stamps_ns
+    gyro = [Decision(k, int(stamps[k]), "gyro", -1, 0.1, 0.01, 3, 0.25 if k < 100 else 1.0, "") for k in range(300)]
+    taken_back = [Decision(k, int(stamps[k]), "wheels", -1, 9.0, 81.0, 3, 0.0, "slip") for k in range(50, 60)]
+    figure = plot_timeline(replace(base, decisions=(*base.decisions, *gyro, *taken_back)))
+    axes = panel(figure, "weight")
+    assert names(axes) == ["wheels (310)", "gyro (300)"]
+    wheels, inflated = axes.patches[:300], axes.patches[300:]
+    off = [i for i, bar in enumerate(wheels) if bar.get_facecolor() == to_rgba(style.RED)]
+    assert off == list(range(50, 60))
+    heights = np.array([bar.get_height() for bar in inflated])
+    np.testing.assert_allclose(heights[:100] / heights[100:200], 0.25)
+    assert "wheels: slip (10)" in names(panel(figure, "flags"))
+
+
+def test_timeline_shows_the_fit_of_every_sighting_and_who_was_refused():
+    base = figure_eight()
+    fine = tuple(Decision(k, int(base.trajectory.stamps_ns[k]), "corners", 5, 2.0, 4.0, 8, 1.0, "") for k in range(9))
+    figure = plot_timeline(replace(base, decisions=(*base.decisions, *fine)))
+    believed, refused = panel(figure, "NIS").lines[:2]
+    np.testing.assert_allclose(believed.get_ydata(), 0.5)
+    np.testing.assert_allclose(refused.get_ydata(), 81.0 / 8.0)
+    assert names(panel(figure, "landmark")) == ["0", "1", "2", "5"]
+
+
+def test_timeline_shows_the_true_error_within_its_bounds_and_the_true_slip():
     result = figure_eight()
-    heard, fused, rejected = plots.plot_timeline(result).axes
-    labels = [[text.get_text() for text in axes.get_yticklabels()] for axes in (heard, fused, rejected)]
-    assert labels == [["/odom (600)", "/camera (200)"], ["wheels (300)", "keyframes (300)"], ["corners: gate (30)"]]
-    assert [len(bars.get_paths()) for bars in heard.collections] == [1, 2]
-    assert len(rejected.collections[0].get_paths()) == 30
+    matched = match_result(result, CONFIG)
+    start = int(result.trajectory.stamps_ns[0])
+    figure = plot_timeline(result, matched, np.array([[start + 10**9, start + 3 * 10**9]]))
+    axes = panel(figure, "position error")
+    assert np.nanmax(axes.lines[0].get_ydata()) == pytest.approx(matched.distances.max())
+    three, one = (c.get_datalim(axes.transData).y1 for c in axes.collections[:2])
+    assert three == pytest.approx(3.0 * one)
+    (slip,) = [patch for patch in axes.patches if patch.get_facecolor()[:3] == to_rgba(timeline.SLIP)[:3]]
+    assert slip.get_x() == pytest.approx(1.0)
+    assert slip.get_width() == pytest.approx(2.0)
+
+
+def test_the_simulators_slip_is_read_from_the_recording():
+    sample = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+    counts = {}
+    for name in ("first_run", "patches_run"):
+        with open_recording(sample / name / "bag", CONFIG.recording) as recording:
+            spans = true_slips(recording)
+        assert (spans[:, 1] > spans[:, 0]).all()
+        assert (spans[1:, 0] > spans[:-1, 1]).all()
+        counts[name] = np.sum(spans[:, 1] - spans[:, 0]) * 1e-9
+    assert counts["first_run"] < 1.0
+    assert counts["patches_run"] > 5.0
 
 
 def test_all_files_are_written(written):

@@ -16,7 +16,8 @@ import yaml
 from fgloc.config import Config
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
-from fgloc.evaluation.plots import plot_error, plot_timeline, plot_trajectory, png
+from fgloc.evaluation.plots import plot_error, plot_trajectory, png
+from fgloc.evaluation.timeline import plot_timeline
 from fgloc.recording.outputs import (
     atomic_folder,
     write_bytes,
@@ -26,8 +27,14 @@ from fgloc.recording.outputs import (
     write_text,
     write_tum,
 )
-from fgloc.types import Mode, RunResult
+from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import true_slips
+from fgloc.types import IntArray, Mode, RunResult
 
+_TIMELINE = (
+    "What was heard; each motion source at the height of its weight, red where it was not believed; why; the "
+    "sightings' fit to the prediction (1 is expected); every landmark, red where it was refused; the true errors."
+)
 _PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
 
 
@@ -60,7 +67,7 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
     pictures = {
         "trajectory": png(plot_trajectory(result, matched)),
         "error": png(plot_error(result, matched)),
-        "timeline": png(plot_timeline(result)),
+        "timeline": png(plot_timeline(result, matched, _slips(result, config))),
     }
     with atomic_folder(out) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)
@@ -72,6 +79,14 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
         write_bytes(stage / "timeline.png", pictures["timeline"])
         write_text(stage / "report.html", render(result, metrics, matched, pictures, provenance))
     return metrics
+
+
+def _slips(result: RunResult, config: Config) -> IntArray | None:
+    """When a wheel truly slipped, if the recording is still there and tells."""
+    if result.source is None or not result.source.exists():
+        return None
+    with open_recording(result.source, config.recording) as recording:
+        return true_slips(recording)
 
 
 def render(
@@ -95,7 +110,7 @@ def render(
         "<h2>Error and its 3σ band</h2>",
         picture(pictures["error"], "Error", "In the map frame. An honest band holds 99.7 % of the errors."),
         "<h2>Timeline</h2>",
-        picture(pictures["timeline"], "Timeline", "What was heard, fused and rejected, with the number of items."),
+        picture(pictures["timeline"], "Timeline", _TIMELINE),
         "<h2>Figures</h2>",
         _figures(metrics),
         '<div class="columns">',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -121,9 +121,9 @@ class Recording:
         for message in self._storage.messages(role_of.keys()):
             yield from self.decode(message, role_of[message[0]])
 
-    def messages(self) -> Iterator[RawMessage]:
-        """All messages, serialized, in order of receive time."""
-        return self._storage.messages()
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages of these topics (None: of all), serialized, in order of receive time."""
+        return self._storage.messages(topics)
 
     def decode(self, message: RawMessage, role: Role | None) -> list[Event]:
         """Events of one message in a role (None: tf); empty, and counted, if it cannot be decoded."""

@@ -9,13 +9,33 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import TruthConfig
 from fgloc.frames import quaternion_yaw
+from fgloc.recording.reader import Recording
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
+
+SLIPPING_TOPIC = "/truth/slipping"
+"""Whether a wheel slips, in recordings of the simulator (std_msgs/Bool, stamped by its receipt)."""
 
 
 def base_pose(event: TruthEvent, config: TruthConfig) -> FloatArray:
     """Planar pose ``(3,)`` of the base, from that of the body which the system tracks."""
     T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
     return se2.compose((event.position[0], event.position[1], quaternion_yaw(event.orientation)), T_body_base)
+
+
+def true_slips(recording: Recording) -> IntArray:
+    """Stamps ``(n, 2)`` between which a wheel truly slipped, as a simulator told; none in other recordings."""
+    spans: list[list[int]] = []
+    slipping = False
+    for topic, message_type, received_ns, raw in recording.messages({SLIPPING_TOPIC}):
+        if topic != SLIPPING_TOPIC or not message_type.endswith("/Bool"):
+            continue
+        now = bool(raw[-1])  # however it is serialized, the flag is the last byte
+        if now and not slipping:
+            spans.append([received_ns, received_ns])
+        elif slipping:
+            spans[-1][1] = received_ns
+        slipping = now
+    return np.array(spans, dtype=np.int64).reshape(-1, 2)
 
 
 class TruthTrack:

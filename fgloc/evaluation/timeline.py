@@ -1,0 +1,217 @@
+"""What a run made of what it heard, over time: sources and their weights, sightings and their fit, flags, errors."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from fgloc.evaluation.metrics import Matched
+from fgloc.evaluation.style import (
+    BLUE,
+    GAP_S,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    SKY,
+    TEXT,
+    WIDTH,
+    broken,
+    legend,
+    mode_handles,
+    seconds,
+    shade_modes,
+    tidy,
+)
+from fgloc.types import Decision, FloatArray, IntArray, RunResult
+
+_MAX_FLAGS = 12
+_MAX_LANDMARKS = 20
+_ROW_IN = 0.24  # inches
+_FULL = 0.995  # a weight above this is drawn as 1
+SLIP = "#b8a9c9"
+_SMALL_M = 0.1  # smaller errors are drawn in millimetres
+
+Panel = tuple[float, Callable[[Axes], None]]  # height in rows, and what draws it
+
+
+def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: IntArray | None = None) -> Figure:
+    """The timeline of a run; panels of which there is nothing to show are left out.
+
+    Args:
+        result: the run.
+        matched: estimate and truth, for the errors.
+        slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator told.
+    """
+    motions = [d for d in result.decisions if d.landmark_id < 0]
+    sightings = [d for d in result.decisions if d.landmark_id >= 0]
+    flags = _flags(result, result.decisions)
+    known = [d for d in sightings if math.isfinite(d.nis) and d.dof > 0]
+    panels: list[Panel] = []
+    if result.spans:
+        heard = {f"{topic} ({h.count})": h.times for topic, h in result.spans.items()}
+        panels.append((len(heard), lambda axes: _activity(axes, "heard", heard, GREY, bridge=True)))
+    if motions:
+        panels.append((1.5 * len({d.kind for d in motions}), lambda axes: _weights(axes, result, motions)))
+    if flags:
+        panels.append((len(flags), lambda axes: _activity(axes, "flags", flags, RED, bridge=False)))
+    if known:
+        panels.append((5.0, lambda axes: _fit(axes, result, known)))
+    if sightings:
+        rows = min(len({d.landmark_id for d in sightings}), _MAX_LANDMARKS)
+        panels.append((0.8 * rows, lambda axes: _landmarks(axes, result, sightings)))
+    if matched is not None:
+        panels += [(4.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in (False, True)]  # type: ignore[misc]
+    if not panels:
+        panels.append((1.0, lambda axes: _activity(axes, "keyframes", {"all": _poses(result)}, BLUE, bridge=True)))
+    heights = [height + 0.8 for height, _ in panels]
+    figure = Figure(figsize=(WIDTH, 0.9 + _ROW_IN * sum(heights)), dpi=110, layout="constrained")
+    axes_of: list[Axes] = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[
+        :, 0
+    ].tolist()
+    slips = np.empty((0, 2)) if slips_ns is None else seconds(result, slips_ns)
+    for axes, (_, draw) in zip(axes_of, panels, strict=True):
+        draw(axes)
+        shade_modes(axes, result)
+        for start, end in slips:
+            axes.axvspan(float(start), float(end), facecolor=SLIP, alpha=0.45, lw=0, zorder=-1)
+    poses = _poses(result)
+    axes_of[-1].set_xlim(float(poses[0]) - 0.5, float(poses[-1]) + 0.5)
+    axes_of[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes_of)
+    legend(figure, _handles(result, motions, bool(known), matched is not None, len(slips) > 0))
+    return figure
+
+
+def _poses(result: RunResult) -> FloatArray:
+    return seconds(result, result.trajectory.stamps_ns)
+
+
+def _handles(result: RunResult, motions: Sequence[Decision], known: bool, truth: bool, slips: bool) -> list[Any]:
+    handles: list[Any] = []
+    if motions:
+        handles.append(Patch(color=BLUE, label="used as given"))
+    if any(0.0 < d.weight <= _FULL for d in motions):
+        handles.append(Patch(color=ORANGE, label="inflated"))
+    handles.append(Patch(color=RED, label="not believed"))
+    if known:
+        handles.append(Line2D([], [], color=BLUE, marker=".", linestyle="none", label="sighting believed"))
+    if truth:
+        handles += [Patch(color=SKY, alpha=0.55, label="1σ"), Patch(color=SKY, alpha=0.25, label="3σ")]
+    if slips:
+        handles.append(Patch(color=SLIP, alpha=0.45, label="a wheel slips (truth)"))
+    return handles + mode_handles(result)
+
+
+def _flags(result: RunResult, decisions: Sequence[Decision]) -> dict[str, FloatArray]:
+    """When each reason was given, the most frequent ones, by the order of kinds."""
+    found: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for d in decisions:
+        if d.reason or d.weight == 0.0:
+            found[d.kind, d.reason or "weight 0"].append(d.stamp_ns)
+    common = sorted(found, key=lambda key: -len(found[key]))[:_MAX_FLAGS]
+    return {
+        f"{kind}: {reason} ({len(found[kind, reason])})": seconds(result, found[kind, reason])
+        for kind, reason in sorted(common)
+    }
+
+
+def _activity(axes: Axes, title: str, rows: Mapping[str, FloatArray], color: str, bridge: bool) -> None:
+    """One row a name: bars where items came at a steady rate (`bridge`), else a tick each."""
+    everything = np.concatenate(list(rows.values()))
+    span = max(float(np.ptp(everything)), 1.0)
+    for row, times in enumerate(rows.values()):
+        axes.broken_barh(_bars(np.unique(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
+    _rows(axes, title, list(rows))
+
+
+def _rows(axes: Axes, title: str, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), list(names), **TEXT | {"fontsize": 8})
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_ylabel(title, fontsize=9)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(left=False, labelsize=8)
+    axes.grid(axis="x", color="#dddddd", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, float]]:
+    """Start and width of the stretches without a silence; a lone item is wide enough to be seen."""
+    if len(times) == 0:
+        return []
+    steps = np.diff(times)
+    silence = min(3.0 * float(np.median(steps)), GAP_S) if bridge and len(steps) else 0.0
+    cuts = np.flatnonzero(steps > max(silence, span / 600.0)) + 1
+    return [(float(part[0]), float(np.ptp(part)) + span / 600.0) for part in np.split(times, cuts)]
+
+
+def _weights(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
+    """A row for each motion source: as high as its weight, and what was taken back at full height in red."""
+    kinds = list(dict.fromkeys(d.kind for d in decisions))
+    for row, kind in enumerate(kinds):
+        last = {d.step: d for d in decisions if d.kind == kind}  # a step that was judged again has several rows
+        held = sorted(last.values(), key=lambda d: d.stamp_ns)
+        ends = seconds(result, [d.stamp_ns for d in held])
+        width = float(np.median(np.diff(ends))) if len(ends) > 1 else 0.1
+        starts = np.concatenate([[ends[0] - width], np.maximum(ends[:-1], ends[1:] - GAP_S)])
+        weights = np.array([d.weight for d in held])
+        heights = np.where(weights > 0.0, np.clip(weights, 0.12, 1.0), 1.0) * 0.7
+        colors = [BLUE if w > _FULL else ORANGE if w > 0.0 else RED for w in weights]
+        axes.bar(starts, heights, ends - starts, row + 0.35 - heights, align="edge", color=colors, linewidth=0)
+    _rows(axes, "weight", [f"{kind} ({sum(d.kind == kind for d in decisions)})" for kind in kinds])
+
+
+def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
+    """NIS of the sightings over its expected value."""
+    for believed, color, marker in ((True, BLUE, "."), (False, RED, "x")):
+        chosen = [d for d in decisions if (d.weight > 0.0) == believed]
+        ratio = np.clip([d.nis / d.dof for d in chosen], 1e-2, 1e4)
+        times = seconds(result, [d.stamp_ns for d in chosen])
+        axes.plot(times, ratio, color=color, marker=marker, markersize=4, mew=0.9, linestyle="none")
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    axes.set_yscale("log")
+    axes.set_ylabel("NIS / dof", fontsize=9)
+    tidy(axes)
+
+
+def _landmarks(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
+    """A row for each landmark: when it was believed, and when not."""
+    seen = Counter(d.landmark_id for d in decisions)
+    ids = sorted(i for i, _ in seen.most_common(_MAX_LANDMARKS))
+    span = max(float(np.ptp(_poses(result))), 1.0)
+    for row, landmark_id in enumerate(ids):
+        for believed, color in ((True, BLUE), (False, RED)):
+            stamps = [d.stamp_ns for d in decisions if d.landmark_id == landmark_id and (d.weight > 0.0) == believed]
+            bars = _bars(np.unique(seconds(result, stamps)), span, bridge=False)
+            axes.broken_barh(bars, (row - 0.35, 0.7), color=color, lw=0)
+    _rows(axes, "landmark", [str(i) for i in ids])
+    axes.tick_params(axis="y", labelsize=7)
+
+
+def _error(axes: Axes, result: RunResult, matched: Matched, yaw: bool) -> None:
+    """Distance from the truth, or yaw error, with what the covariance makes of it."""
+    covs = result.trajectory.covs
+    error = np.abs(matched.errors[:, 2]) if yaw else matched.distances
+    sigma = None if covs is None else np.sqrt(covs[:, 2, 2] if yaw else covs[:, 0, 0] + covs[:, 1, 1])
+    unit, name = (math.degrees(1.0), "°") if yaw else (1.0, "m")
+    top = max(float(error.max()), 1e-9 if sigma is None else 3.0 * float(np.percentile(sigma, 95)))
+    if not yaw and top < _SMALL_M:
+        unit, name = 1e3, "mm"
+    if sigma is not None:
+        stamps = result.trajectory.stamps_ns
+        t, one = broken(stamps, np.column_stack([_poses(result), unit * sigma])).T
+        axes.fill_between(t, 0.0, 3.0 * one, color=SKY, alpha=0.25, lw=0)
+        axes.fill_between(t, 0.0, one, color=SKY, alpha=0.4, lw=0)
+    t, line = broken(matched.stamps_ns, np.column_stack([seconds(result, matched.stamps_ns), unit * error])).T
+    axes.plot(t, line, color=GREEN, lw=1.1)
+    axes.set(ylim=(0.0, 1.1 * unit * top))
+    axes.set_ylabel(f"{'yaw' if yaw else 'position'}\nerror [{name}]", fontsize=9)
+    tidy(axes)
