@@ -142,7 +142,7 @@ def load(floor: Floor, split: Split, seed: int) -> Recorded:
 
 
 def slip_intervals(recorded: Recorded, least_s: float = 0.1, join_s: float = 0.3) -> list[tuple[float, float]]:
-    """When wheels slipped, by the simulator [s from the start]; closer than ``join_s`` is one, short ones are left out."""
+    """When wheels slipped, by the simulator [s from the start]; closer than ``join_s`` is one, short ones go."""
     out: list[tuple[float, float]] = []
     for t, slips in zip(recorded.slip_s.tolist(), recorded.slipping.tolist(), strict=True):
         if slips:

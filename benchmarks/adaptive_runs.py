@@ -1,7 +1,7 @@
 """One cell of the benchmark of adaptive weights: a failure on a floor, replayed for some seeds with some configuration.
 
-    >>> from benchmarks.adaptive_runs import ORACLE, OURS, cell
-    >>> cell("slip", (22, 23), OURS, split="validation")  # doctest: +SKIP
+    >>> from benchmarks.adaptive_runs import cell
+    >>> cell("slip", (22, 23), {"weights": {"alarm": 20.0}}, split="validation")  # doctest: +SKIP
 
 Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch
 come from the same replay.
@@ -10,7 +10,7 @@ come from the same replay.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,14 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
+from benchmarks.adaptive_scores import Figures, lost, score
 from fgloc.ablation.failures import AnyFailure, Failure, Scene, generators, spoil
+from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
-from fgloc.evaluation.metrics import Metrics, compute_metrics
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import CornersEvent, Estimate, FloatArray, RunResult, Step, Trajectory
+from fgloc.types import CornersEvent, Estimate, Event, Step, Trajectory
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]
@@ -34,7 +35,6 @@ FAILED_S = (30.0, 50.0)  # when encoders fail
 KIDNAPPED_S, KIDNAPPED_M = 30.0, 3.0
 MOVED_M = 0.5
 _FAILURE = TypeAdapter(AnyFailure)
-_OFF_M, _OFF_RAD = 0.3, 0.2  # nearer to the truth than this, a kidnapped robot is found again
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,37 +85,6 @@ CASES: dict[str, Case] = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """One run: its figures online and, if it was smoothed, in batch."""
-
-    recorded: Recorded
-    online: RunResult
-    metrics: Metrics
-    batch: Metrics | None
-    step_ms: FloatArray
-
-    @property
-    def ate_m(self) -> float:
-        """Mean distance from the truth, online [m]."""
-        return _known(self.metrics.ate_mean_m)
-
-    @property
-    def nees_over_3(self) -> float:
-        """Of the online estimates."""
-        return _known(self.metrics.nees_over_3)
-
-    @property
-    def batch_ate_m(self) -> float:
-        """Mean distance from the truth of the smoothed trajectory [m]; NaN if it was not smoothed."""
-        return np.nan if self.batch is None else _known(self.batch.ate_mean_m)
-
-    @property
-    def batch_nees_over_3(self) -> float:
-        """Of the smoothed trajectory; NaN if it was not smoothed."""
-        return np.nan if self.batch is None else _known(self.batch.nees_over_3)
-
-
 def cell(
     name: str,
     seeds: Iterable[int],
@@ -124,7 +93,7 @@ def cell(
     oracle: bool = False,
     batch: bool = False,
     split: Split = "test",
-) -> list[Outcome]:
+) -> list[Figures]:
     """Replay a case for each seed.
 
     Args:
@@ -136,30 +105,37 @@ def cell(
         split: of the simulated suite.
     """
     case = CASES[name]
-    outcomes = []
+    out = []
     for seed in seeds:
         recorded = load(case.floor, split, seed)
         chain = [_FAILURE.validate_python(failure) for failure in case.chain(recorded)]
         config = changed(recorded.config, changes or {})
         if oracle:
             config = changed(config, distrusting(case.wheels_wrong(recorded)))
-        outcomes.append(replay(recorded, config, chain, seed, batch))
-    return outcomes
+        out.append(replay(recorded, config, chain, seed, batch))
+    return out
 
 
-def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Outcome:
+def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Figures:
     """One run of a recording with failures.
 
     Raises:
-        FglocError: no pose was ever found, or the configuration does not fit.
+        FglocError: the configuration does not fit the recording.
     """
     ids = tuple(sorted(recorded.landmarks.landmarks))
     scenes = [Scene(recorded.start_ns, recorded.duration_s, config, ids, rng) for rng in generators(len(chain), seed)]
     estimates: list[Estimate] = []
+    given: list[Event] = []
 
     def note(_: Step, estimate: Estimate | None) -> None:
         if estimate is not None:
             estimates.append(estimate)
+
+    def keep(events: Iterator[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, CornersEvent):
+                given.append(event)
+            yield event
 
     with tempfile.TemporaryDirectory() as folder:
         map_path, landmarks = recorded.map_path, recorded.landmarks
@@ -168,15 +144,20 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
         if landmarks is not recorded.landmarks:
             map_path = Path(folder) / "map.yaml"
             write_map(landmarks, map_path)
-        result = run(
-            recorded.bag,
-            map_path,
-            config,
-            "batch" if batch else "online",
-            on_step=note,
-            events=lambda _: spoil(chain, "recorded", iter(recorded.events), scenes),
-            sightings=lambda events: spoil(chain, "sightings", events, scenes),
-        )
+        try:
+            result = run(
+                recorded.bag,
+                map_path,
+                config,
+                "batch" if batch else "online",
+                on_step=note,
+                events=lambda _: spoil(chain, "recorded", iter(recorded.events), scenes),
+                sightings=lambda events: keep(spoil(chain, "sightings", events, scenes)),
+            )
+        except EstimatorError:
+            if estimates:
+                raise
+            return lost(seed)
     online = replace(
         result,
         trajectory=Trajectory(
@@ -186,8 +167,8 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
         ),
         modes=tuple(e.mode for e in estimates),
     )
-    smoothed = compute_metrics(result, config) if batch else None
-    return Outcome(recorded, online, compute_metrics(online, config), smoothed, result.step_ms)
+    kidnapped = [failure.when.intervals[0][0] for failure in chain if isinstance(failure, Kidnap)]
+    return score(recorded, seed, config, online, result if batch else None, kidnapped[0] if kidnapped else None, given)
 
 
 def changed(config: Config, changes: Changes) -> Config:
@@ -209,9 +190,3 @@ def moved_id(recorded: Recorded) -> int:
     seen = [s.marker_id for e in recorded.events if isinstance(e, CornersEvent) for s in e.sightings]
     ids, counts = np.unique(seen, return_counts=True)
     return int(ids[int(np.argmax(counts))])
-
-
-def _known(value: float | None) -> float:
-    if value is None:
-        raise EstimatorError("the run and the truth have no time in common; nothing can be compared")
-    return value

@@ -1,0 +1,174 @@
+"""What one run shows of the adaptive weights: errors, honesty, detected slip, named markers, the way back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from benchmarks.adaptive_recordings import Recorded, slip_intervals
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.types import CornersEvent, Decision, Event, FloatArray, Mode, RunResult
+
+_NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
+_NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")
+_LINGER_S = 0.5  # a slip that is flagged so long after its end was still found
+_WINDOW_S = 1.0  # a flag may speak of a slip that ended so long before it
+_STEP_S = 0.45  # flagged steps closer than this are of one flag
+_OFF_M, _OFF_RAD = 0.3, 0.2  # nearer to the truth than this, a kidnapped robot is found again ...
+_STAYS_S = 1.0  # ... if it stays so for this long
+
+
+@dataclass(frozen=True, slots=True)
+class Slips:
+    """What the slip detector did in one run.
+
+    Attributes:
+        delays_s: from the true onset to the flag, of each slip that was found.
+        found_m: distance that the wheels slipped, of each slip that was found.
+        missed_m: likewise, of each that was not.
+        false_alarms: flags without a slip.
+        path_m: distance travelled.
+    """
+
+    delays_s: tuple[float, ...]
+    found_m: tuple[float, ...]
+    missed_m: tuple[float, ...]
+    false_alarms: int
+    path_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Figures:
+    """One run. Where no pose was ever found the errors are infinite."""
+
+    seed: int
+    ate_m: float  # mean distance from the truth, online
+    yaw_deg: float
+    nees_over_3: float
+    batch_ate_m: float  # NaN if it was not smoothed
+    batch_nees_over_3: float
+    step_ms: FloatArray  # of the steps after the first pose
+    named: frozenset[int]  # markers that the run says do not stand where the map has them
+    slips: Slips | None
+    found_again_s: float | None  # of a kidnapped robot
+    rejections: Mapping[str, int]
+
+
+def lost(seed: int) -> Figures:
+    """Figures of a run that never found its first pose."""
+    inf = float("inf")
+    return Figures(seed, inf, inf, inf, inf, inf, np.zeros(0), frozenset(), None, None, {})
+
+
+def score(
+    recorded: Recorded,
+    seed: int,
+    config: Config,
+    online: RunResult,
+    batch: RunResult | None,
+    kidnapped_s: float | None,
+    events: Sequence[Event],
+) -> Figures:
+    """Figures of a run.
+
+    Args:
+        recorded: what was replayed.
+        seed: of the failures.
+        config: of the run.
+        online: the estimates as they were made, with all decisions.
+        batch: the smoothed run, if there is one.
+        kidnapped_s: when the robot was carried away [s from the recording's first message]; None: never.
+        events: that the localizer was given; only the sightings are looked at.
+    """
+    metrics = compute_metrics(online, config)
+    smoothed = compute_metrics(batch, config) if batch is not None else None
+    return Figures(
+        seed=seed,
+        ate_m=_known(metrics.ate_mean_m),
+        yaw_deg=_known(metrics.yaw_mae_deg),
+        nees_over_3=_known(metrics.nees_over_3),
+        batch_ate_m=_batch(smoothed, "ate_mean_m"),
+        batch_nees_over_3=_batch(smoothed, "nees_over_3"),
+        step_ms=online.step_ms[len(online.step_ms) - len(online.trajectory) + 1 :],
+        named=frozenset(int(i) for note in online.notes for i in _NAMED.findall(note)),
+        slips=slips(recorded, online),
+        found_again_s=None if kidnapped_s is None else found_again(recorded, online, kidnapped_s, events),
+        rejections=online.rejections,
+    )
+
+
+def slips(recorded: Recorded, online: RunResult) -> Slips:
+    """Compare the flags with the simulator's word on slip."""
+    rises = flags(recorded, online.decisions)
+    true = slip_intervals(recorded)
+    delays, found, missed = [], [], []
+    for start, end in true:
+        inside = (recorded.slip_s >= start) & (recorded.slip_s <= end)
+        way = float(np.trapezoid(np.abs(recorded.slip[inside, 0]), recorded.slip_s[inside]))
+        raised = [max(rise - start, 0.0) for rise, fall in rises if fall >= start and rise <= end + _LINGER_S]
+        if raised:
+            delays.append(min(raised))
+            found.append(way)
+        else:
+            missed.append(way)
+    false = sum(all(end < rise - _WINDOW_S or start > fall for start, end in true) for rise, fall in rises)
+    return Slips(tuple(delays), tuple(found), tuple(missed), false, recorded.path_m)
+
+
+def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float, float]]:
+    """When the wheels were not believed, because other motion sources spoke against them [s from the start].
+
+    A flag counts from the step that raised it, not from the earlier ones that it revised.
+    """
+    raised, newest = [], 0
+    for d in decisions:
+        if d.kind != "wheels" or d.stamp_ns <= newest:
+            continue  # an earlier step that is judged again
+        newest = d.stamp_ns
+        if d.reason not in _NOT_FOUND_BY_MOTION:
+            raised.append(newest)
+    out: list[tuple[float, float]] = []
+    for stamp in raised:
+        t = (stamp - recorded.start_ns) * 1e-9
+        if out and t - out[-1][1] <= _STEP_S:
+            out[-1] = (out[-1][0], t)
+        else:
+            out.append((t, t))
+    return out
+
+
+def found_again(recorded: Recorded, online: RunResult, kidnapped_s: float, events: Sequence[Event]) -> float:
+    """From the first marker in view after the robot was carried away until the estimate is right and stays so [s].
+
+    If that never happens: until the end of the run.
+    """
+    at_ns = recorded.start_ns + round(kidnapped_s * 1e9)
+    seen = min(e.stamp_ns for e in events if isinstance(e, CornersEvent) and e.sightings and e.stamp_ns > at_ns)
+    assert online.truth is not None
+    truth = se2.interpolate(online.truth.stamps_ns, online.truth.poses, online.trajectory.stamps_ns)
+    error = online.trajectory.poses - truth
+    near = (np.hypot(*error[:, :2].T) < _OFF_M) & (np.abs(se2.wrap_array(error[:, 2])) < _OFF_RAD)
+    near &= np.array([mode is not Mode.LOST for mode in online.modes])
+    stamps = online.trajectory.stamps_ns
+    bad = [int(a) for a, good in zip(stamps, near, strict=True) if a >= seen and not good]
+    runs = [seen - 1, *bad, int(stamps[-1])]  # between two bad estimates lies a stretch of good ones
+    for a, b in pairwise(runs):
+        if b - a > _STAYS_S * 1e9:
+            return (int(stamps[np.searchsorted(stamps, a, side="right")]) - seen) * 1e-9
+    return float(stamps[-1] - seen) * 1e-9
+
+
+def _batch(metrics: Metrics | None, name: str) -> float:
+    return float("nan") if metrics is None else _known(getattr(metrics, name))
+
+
+def _known(value: float | None) -> float:
+    if value is None:
+        raise ValueError("the run and the truth have no time in common; nothing can be compared")
+    return value
