@@ -14,9 +14,10 @@ from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import NoiseDensity
-from fgloc.errors import RecordingError
+from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.motion.card import ErrorMemory, Kinematics
-from fgloc.types import CommandEvent
+from fgloc.recording.outputs import write_covariance_csv, write_tum
+from fgloc.types import CommandEvent, Trajectory
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig
 from training.data import Run, cut, load_run, make_run
@@ -65,6 +66,51 @@ def test_samples_are_cut_at_gaps_of_the_truth() -> None:
     starts = run.starts(20)
     assert len(starts)
     assert not any(9.73 < t < 11.26 for k in starts for t in at[k : k + 21])
+
+
+def test_samples_are_cut_where_the_truth_jumps_sideways() -> None:
+    commands, stamps, poses = drive(np.random.default_rng(0), 30.0)
+    jumped = poses.copy()
+    after = stamps >= T0 + 10 * SECOND
+    jumped[after, 1] += 0.05 * np.cos(poses[after, 2])
+    jumped[after, 0] -= 0.05 * np.sin(poses[after, 2])
+    believing = make_run("r", commands, stamps, jumped, 0.1, 2.0, DataConfig())
+    assert believing.valid.all()
+    run = make_run("r", commands, stamps, jumped, 0.1, 2.0, DataConfig(max_sideways_mps=0.05))
+    at = run.times + (run.origin_ns - T0) * 1e-9
+    assert not run.valid[np.abs(at - 10.0) < 0.25].any()
+    assert run.valid[np.abs(at - 10.0) > 0.75].all()
+
+
+def test_smoothed_trajectory_stands_in_for_the_truth(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", 4, 20.0)
+    _, stamps, poses = drive(np.random.default_rng(4), 20.0)
+    keyframes = slice(None, None, 20)
+    stamps, poses = stamps[keyframes], poses[keyframes] + [1.0, 2.0, 0.0]  # in another map
+    covs = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (len(stamps), 1, 1))
+    lost = (stamps > T0 + 8 * SECOND) & (stamps < T0 + 11 * SECOND)
+    covs[lost] *= 100.0
+    poses[lost] += 3.0
+    folder = tmp_path / "smoothed"
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, poses))
+    config = DataConfig(max_truth_gap_s=0.35)
+    with_lost = load_run(tmp_path / "bag", "b", 0.1, 2.0, config, folder)
+    assert with_lost.valid.all()
+    write_covariance_csv(folder / "covariance.csv", Trajectory(stamps, poses, covs))
+    run = load_run(tmp_path / "bag", "b", 0.1, 2.0, config, folder)
+    at = run.times + (run.origin_ns - T0) * 1e-9
+    assert not run.valid[(at > 8.0) & (at < 11.0)].any()
+    assert run.valid[(at < 7.4) | (at > 11.6)].all()
+    own = load_run(tmp_path / "bag", "b", 0.1, 2.0, config)
+    picked = [np.interp(at[run.valid], own.times + (own.origin_ns - T0) * 1e-9, column) for column in own.poses.T]
+    np.testing.assert_allclose(run.poses[run.valid] - [1.0, 2.0, 0.0], np.column_stack(picked), atol=0.02)
+    with pytest.raises(TrajectoryError, match=r"no pose is known to 0\.01 m, the best to 0\.014 m"):
+        load_run(tmp_path / "bag", "b", 0.1, 2.0, DataConfig(max_truth_sigma_m=0.01), folder)
+    with pytest.raises(TrajectoryError, match="cannot be read"):
+        load_run(tmp_path / "bag", "b", 0.1, 2.0, config, tmp_path / "elsewhere")
+    (folder / "covariance.csv").write_text("stamp,xx\n1.0,oops\n")
+    with pytest.raises(TrajectoryError, match="not a table of covariances"):
+        load_run(tmp_path / "bag", "b", 0.1, 2.0, config, folder)
 
 
 def test_part_of_a_run_equals_the_run() -> None:

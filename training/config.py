@@ -18,6 +18,15 @@ class DataConfig(Section):
 
     smoothing_s: float = Field(0.5, gt=0, description="window of the local cubic fit that smooths the truth")
     max_truth_gap_s: float = Field(0.15, gt=0, description="the samples are cut where the truth is silent for longer")
+    max_sideways_mps: float | None = Field(
+        None,
+        gt=0,
+        description="the samples are cut where the truth slides sideways faster than this, as wheels do not: there the "
+        "positioning system jumped. null: the robot may slide",
+    )
+    max_truth_sigma_m: float | None = Field(
+        0.05, gt=0, description="a smoothed trajectory is believed as truth where its position is known this well"
+    )
     margin_s: float = Field(0.5, ge=0, description="left out at both ends")
 
 
@@ -89,6 +98,11 @@ class TrainConfig(Section):
 
     robot: str
     recordings: dict[str, Path] = Field(description="bags by name, relative to --data")
+    truth: dict[str, Path] = Field(
+        {},
+        description="by name of recording, the folder that `fgloc smooth` wrote for it, relative to --data: believed "
+        "in place of the bag's truth",
+    )
     leave_one_out: bool = Field(False, description="a model per recording left out, and one from all")
     split: Split | None = None
     data: DataConfig = DataConfig()
@@ -100,6 +114,8 @@ class TrainConfig(Section):
     def _one_split(self) -> TrainConfig:
         if self.leave_one_out == (self.split is not None):
             raise ValueError("give either leave_one_out: true or a split")
+        if unknown := set(self.truth) - set(self.recordings):
+            raise ValueError(f"truth is given for {sorted(unknown)}, recordings are {sorted(self.recordings)}")
         if self.leave_one_out and len(self.recordings) < 3:
             raise ValueError(f"leave_one_out needs at least 3 recordings, got {sorted(self.recordings)}")
         if self.split is not None:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from fgloc.config import Config, load_config
-from fgloc.errors import RecordingError
+from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.motion.commands import CommandTrack
+from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.types import CommandEvent, Event, FloatArray, TruthEvent
@@ -34,7 +35,7 @@ class Run:
     dt_s: float
     poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
-    valid: NDArray[np.bool_]  # (n,) the truth was heard around this time
+    valid: NDArray[np.bool_]  # (n,) the truth was heard around this time, and can be true
     heard: Heard
     track: CommandTrack  # time zero is origin_ns
 
@@ -55,7 +56,9 @@ class Run:
         return k[broken[k + steps + 1] == broken[k]]
 
 
-def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataConfig) -> Run:
+def load_run(
+    path: Path, name: str, dt_s: float, history_s: float, config: DataConfig, truth_from: Path | None = None
+) -> Run:
     """Read a bag. A ``robot.yaml`` beside it says how.
 
     Args:
@@ -64,9 +67,12 @@ def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataC
         dt_s: time step of the samples.
         history_s: commands wanted before the first sample.
         config: smoothing and cutting.
+        truth_from: what `fgloc smooth` wrote for this bag, to be believed in place of the bag's own truth: its folder
+            or a TUM file. Poses whose covariance beside it says too little are left out.
 
     Raises:
         RecordingError: it cannot be read, or has no commands, no truth or too little of both.
+        TrajectoryError: the trajectory cannot be read.
     """
     settings = _settings(path)
     truth: list[TruthEvent] = []
@@ -75,11 +81,14 @@ def load_run(path: Path, name: str, dt_s: float, history_s: float, config: DataC
         for event in recording.events():
             (truth if isinstance(event, TruthEvent) else sensed).append(event)
     heard = Heard(sensed, settings)
-    for kind, count in (("commands", len(heard.commands)), ("truth", len(truth))):
+    if truth_from is None:
+        stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
+    else:
+        stamps, rows = smoothed_truth(truth_from, config)
+    for kind, count in (("commands", len(heard.commands)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
-    rows = np.array([base_pose(e, settings.truth) for e in truth])
-    return make_run(name, heard, np.array([e.stamp_ns for e in truth]), rows, dt_s, history_s, config)
+    return make_run(name, heard, stamps, rows, dt_s, history_s, config)
 
 
 def make_run(
@@ -117,10 +126,40 @@ def make_run(
         dt_s=dt_s,
         poses=poses,
         velocities=velocities,
-        valid=_heard(t_truth, times, config),
+        valid=_heard(t_truth, times, config) & _possible(velocities, dt_s, config),
         heard=heard,
         track=CommandTrack(commands, first),
     )
+
+
+def smoothed_truth(path: Path, config: DataConfig) -> tuple[NDArray[np.int64], FloatArray]:
+    """Stamps and poses ``(m, 3)`` of a smoothed trajectory, without those that its covariance says little of.
+
+    Args:
+        path: a folder that `fgloc smooth` wrote, or a TUM file; ``covariance.csv`` beside the file is read if there.
+        config: ``max_truth_sigma_m`` bounds the standard deviation of the position.
+
+    Raises:
+        TrajectoryError: it cannot be read, or nothing is left.
+    """
+    tum = path / "trajectory.tum" if path.is_dir() else path
+    trajectory = read_tum(tum)
+    table = tum.with_name("covariance.csv")
+    if config.max_truth_sigma_m is None or not table.is_file():
+        return trajectory.stamps_ns, trajectory.poses
+    try:
+        variances = np.loadtxt(table, delimiter=",", skiprows=1, usecols=(1, 4), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise TrajectoryError(f"{table}: not a table of covariances ({error}); write it with `fgloc smooth`") from error
+    if len(variances) != len(trajectory):
+        raise TrajectoryError(f"{table}: {len(variances)} rows, {tum} has {len(trajectory)}; both come from one run")
+    known = variances.sum(axis=1) <= config.max_truth_sigma_m**2
+    if not known.any():
+        raise TrajectoryError(
+            f"{tum}: no pose is known to {config.max_truth_sigma_m} m, the best to "
+            f"{np.sqrt(variances.sum(axis=1).min()):.3f} m; raise data.max_truth_sigma_m"
+        )
+    return trajectory.stamps_ns[known], trajectory.poses[known]
 
 
 def cut(run: Run, name: str, first: int, last: int) -> Run:
@@ -160,6 +199,15 @@ def _heard(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArra
     for k in gaps:
         heard[(times > t_truth[k] - reach) & (times < t_truth[k + 1] + reach)] = False
     return heard
+
+
+def _possible(velocities: FloatArray, dt_s: float, config: DataConfig) -> NDArray[np.bool_]:
+    """Whether the smoothing window around each time is free of motion that wheels do not make."""
+    if config.max_sideways_mps is None:
+        return np.ones(len(velocities), dtype=bool)
+    reach = round(0.5 * config.smoothing_s / dt_s)
+    slid = np.abs(velocities[:, 1]) > config.max_sideways_mps
+    return np.convolve(slid, np.ones(2 * reach + 1), "same") < 0.5
 
 
 def _settings(path: Path) -> Config:

@@ -206,8 +206,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = load_train_config(options.config)
         made_by = f"python -m training.train {options.config.as_posix()}; {config.model_dump_json()}"
+        smoothed = {name: options.data / folder for name, folder in config.truth.items()}
         runs = {
-            name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data)
+            name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data, smoothed.get(name))
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
         checkpoints = Checkpoints(options.out / ".checkpoints")
