@@ -205,6 +205,9 @@ class EstimatorConfig(Section):
         20, gt=0, description="consecutive rejected sightings, of two landmarks or more, that mean LOST"
     )
     dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
+    motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
+        "none", description="robust kernel on the wheels' factors of a graph, for comparison: it cannot locate a slip"
+    )
 
 
 class Distrust(Section):
@@ -241,6 +244,11 @@ class BatchConfig(Section):
 
     outer_iterations: int = Field(2, ge=1, description="learned motion is re-evaluated at the smoothed velocities")
     max_iterations: int = Field(50, ge=1, description="of Levenberg–Marquardt, each")
+    robust: Literal["none", "gnc", "gnc_all"] = Field(
+        "none",
+        description="graduated non-convexity: gnc weighs wheels and landmarks anew, other motion is believed; "
+        "gnc_all weighs every factor, for comparison",
+    )
 
 
 class TruthConfig(Section):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import gtsam
 import numpy as np
 import pytest
@@ -113,6 +115,25 @@ def test_motion_factor_has_zero_residual_at_truth():
     values.insert(pose_key(1), gtsam.Pose2(*b))
     motion = MotionMeasurement("wheels", 0, 1, se2.between(a, b), np.eye(3) * 1e-4)
     assert motion_factor(1, motion).error(values) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "expected"),
+    [
+        ("none", 0.5 * 10.0**2),
+        ("huber", 1.345 * (10.0 - 0.5 * 1.345)),
+        ("cauchy", 0.5 * 2.385**2 * math.log1p((10.0 / 2.385) ** 2)),
+        ("dcs", (3.0 * 10.0**2 - 1.0) / (2.0 * (10.0**2 + 1.0))),  # the integral of r times its weight
+    ],
+)
+def test_motion_kernel_is_on_the_wheels_alone(kernel, expected):
+    values = gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose2(*POSES[0]))
+    values.insert(pose_key(1), gtsam.Pose2(1.0, 0.0, 0.0))
+    cov = np.eye(3) * 0.1**2  # the motion is one metre too long: ten sigmas
+    wheels, learned = (MotionMeasurement(source, 0, 1, np.zeros(3), cov) for source in ("wheels", "learned"))
+    assert motion_factor(1, learned, kernel).error(values) == pytest.approx(50.0)
+    assert motion_factor(1, wheels, kernel).error(values) == pytest.approx(expected, rel=1e-6)
 
 
 def test_marker_pose_prior_carries_the_lever_arm():

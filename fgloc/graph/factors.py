@@ -27,6 +27,13 @@ from fgloc.types import (
     RangeBearingMeasurement,
 )
 
+# Usual constants, of whitened residuals. Sources: Zhang 1997, "Parameter estimation techniques"; Agarwal et al. 2013,
+# "Robust map optimization using dynamic covariance scaling".
+_KERNELS = {
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create(2.385),
+    "dcs": gtsam.noiseModel.mEstimator.DCS.Create(1.0),
+}
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
@@ -59,9 +66,12 @@ def robust(noise: gtsam.noiseModel.Base, cauchy_k: float | None) -> gtsam.noiseM
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_k), noise)
 
 
-def motion_factor(k: int, m: MotionMeasurement) -> gtsam.NonlinearFactor:
-    """Between-factor from keyframe k - 1 to k."""
-    return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), gaussian(m.cov))
+def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
+    """Between-factor from keyframe k - 1 to k; a kernel other than "none" is put on the wheels' alone."""
+    noise = gaussian(m.cov)
+    if m.source == "wheels" and kernel != "none":
+        noise = gtsam.noiseModel.Robust.Create(_KERNELS[kernel], noise)
+    return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), noise)
 
 
 def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFactor:
@@ -119,6 +129,13 @@ class LandmarkFactors:
         ad = se2.adjoint(m.pose)  # perturbation of T_base_marker, moved to the robot's side
         noise = robust(gaussian(_symmetric(ad @ m.cov @ ad.T)), cauchy_k)
         return [gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), noise)]
+
+    def distance(self, landmark_id: int, pose: FloatArray) -> float:
+        """How far [m] a known landmark is from the base at this pose, in the plane."""
+        if self._known is None:
+            raise EstimatorError("the distance of a landmark needs a known map")
+        x, y = self._known[landmark_id].position[:2] - pose[:2]
+        return math.hypot(x, y)
 
     def depth(self, m: CornerMeasurement, pose: FloatArray) -> float:
         """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""

@@ -116,7 +116,7 @@ class IncrementalEstimator(Estimator):
         for frame in frames:
             slots += self._slots[frame.k][1]
             for motion in frame.motions:
-                graph.add(motion_factor(frame.k, motion))
+                graph.add(motion_factor(frame.k, motion, self._config.motion_kernel))
         try:
             new = backend.swap(graph, slots) if frames else []
             newest.belief = Belief(backend.pose(newest.k), backend.covariance(newest.k))
@@ -166,7 +166,7 @@ class IncrementalEstimator(Estimator):
             graph.add(prior_factor(frame.k, prior.pose, prior.cov))
         else:
             for motion in frame.motions:
-                graph.add(motion_factor(frame.k, motion))
+                graph.add(motion_factor(frame.k, motion, self._config.motion_kernel))
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial, values)
             for factor in sighting.factors:
