@@ -17,9 +17,10 @@ from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.assembly import given_pose
 from fgloc.attendance import Attendance
-from fgloc.config import load_config
+from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis import Diagnosis
 from fgloc.frames import yaw_quaternion
+from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import find_beside, run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.wheels import WheelMotion
@@ -317,6 +318,14 @@ def test_fault_69_topics_that_never_speak_are_named():
     assert "quality of service" in note
     attendance.hear("/camera/image", START)
     assert attendance.missing() == ()
+
+
+def test_fault_69_a_topic_recorded_without_messages_is_named():
+    image = TopicInfo("/camera/image_raw", "sensor_msgs/msg/Image", 0)
+    (note,) = select_roles((image, TopicInfo("/odom", "nav_msgs/msg/Odometry", 10)), TopicsConfig()).notes
+    assert note.startswith("No image: /camera/image_raw holds no message")
+    assert "quality of service" in note
+    assert select_roles((image,), TopicsConfig(image="none")).notes == ()
 
 
 def test_fault_24_attendance_stays_bounded_and_keeps_count():

@@ -52,7 +52,7 @@ class Renderer:
         """
         self._scene, self._data = scene, mujoco.MjData(scene.model)
         assert scene.scenario.camera is not None
-        self._width, self._height, self._focal = render_size(scene.scenario.camera)
+        self._width, self._height, _ = render_size(scene.scenario.camera)
         try:
             self._renderer = mujoco.Renderer(scene.model, self._height, self._width)
         except Exception as error:  # every backend raises its own kind, down to AttributeError

@@ -33,6 +33,7 @@ from fgloc.evaluation.style import (
 )
 from fgloc.types import Decision, FloatArray, IntArray, RunResult
 
+_SOURCES = ("wheels", "learned", "gyro", "unknown")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20
 _ROW_IN = 0.24  # inches
@@ -51,7 +52,7 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
         matched: estimate and truth, for the errors.
         slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator told.
     """
-    motions = [d for d in result.decisions if d.landmark_id < 0]
+    motions = [d for d in result.decisions if d.kind in _SOURCES]
     sightings = [d for d in result.decisions if d.landmark_id >= 0]
     flags = _flags(result, result.decisions)
     known = [d for d in sightings if math.isfinite(d.nis) and d.dof > 0]
@@ -155,7 +156,7 @@ def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, flo
 
 def _weights(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
     """A row for each motion source: as high as its weight, and what was taken back at full height in red."""
-    kinds = list(dict.fromkeys(d.kind for d in decisions))
+    kinds = [source for source in _SOURCES if any(d.kind == source for d in decisions)]
     for row, kind in enumerate(kinds):
         last = {d.step: d for d in decisions if d.kind == kind}  # a step that was judged again has several rows
         held = sorted(last.values(), key=lambda d: d.stamp_ns)

@@ -107,7 +107,20 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
             f"{roles.pop(spare)} is not used as {spare}, because {roles[kept]} tells of the markers already "
             f"(to use both: name both in recording.topics; to use it alone: recording.topics.{kept}: none)."
         )
-    return Selection(roles, tuple(notes), tuple(problems))
+    notes += [_empty(role, topics) for role in ROLES if role not in roles and getattr(config, role) is None]
+    return Selection(roles, tuple(note for note in notes if note), tuple(problems))
+
+
+def _empty(role: Role, topics: Iterable[TopicInfo]) -> str:
+    """What a topic without messages, for a role that no other plays, is the trace of; empty if there is none."""
+    names = [topic.name for topic in topics if topic.count == 0 and role != "truth" and _fits(role, topic)]
+    if not names:
+        return ""
+    return (
+        f"No {role}: {', '.join(names)} holds no message. Nothing was published, or recorder and publisher had no "
+        "matching quality of service: `ros2 topic info -v` shows both, `ros2 bag record --qos-profile-overrides-path` "
+        "settles it."
+    )
 
 
 def _by_dependence(role: Role) -> int:
