@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
@@ -17,11 +18,11 @@ from training.config import CalibrationConfig
 from training.data import Run
 from training.rollouts import Rollout
 
-Bases = Callable[[Rollout, float], list[FloatArray]]
 _ALMOST_ONE = 0.999
 _FIELDS = tuple(NoiseDensity.model_fields)
 _MIN_STEP_VARIANCE = 1e-12  # keeps a covariance definite where the robot rests
 _MIN_DENSITY = 1e-4
+_MIN_FACTOR = 1e-4
 _FIT_WINDOW_S = 2.0
 
 
@@ -85,31 +86,46 @@ def fit_lag(runs: list[Run], kinematics: Kinematics) -> Lag:
 
 def fit_noise(rollouts: list[Rollout], config: CalibrationConfig) -> NoiseDensity:
     """Noise densities under which the errors over the calibration's horizons are most likely."""
+    errors, parts = [], []
+    for rollout in rollouts:
+        for horizon in config.horizons_s:
+            errors.append(rollout.errors(horizon))
+            parts.append(np.stack([rollout.composed(b, horizon) for b in _noise_bases(rollout)], axis=1))
     start = np.full(len(_FIELDS), 1e-4)
-    variances, _ = _most_likely(rollouts, lambda rollout, _: _noise_bases(rollout), start, config.horizons_s)
+    variances, _ = _most_likely(np.concatenate(errors), np.concatenate(parts), start)
     return NoiseDensity(**{n: max(_MIN_DENSITY, float(np.sqrt(v))) for n, v in zip(_FIELDS, variances, strict=True)})
 
 
 def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Row, ErrorMemory]:
     """Factors on the predicted variances of x, y and yaw, and the memory under which the errors are most likely.
 
-    White and slow variance add up, so for a given time constant the likelihood has two coefficients for each axis.
-    The rollouts' steps must be single sub-steps, whose covariance is diagonal.
+    What short and what long windows show add up, so for given time constants the likelihood has two coefficients for
+    each axis. The rollouts' steps must be single sub-steps, whose covariance is diagonal.
     """
+    errors, composed, lengths = [], [], []
+    for rollout in rollouts:
+        for horizon in (*config.short_s, *config.horizons_s):
+            errors.append(rollout.errors(horizon))
+            of_axes = [rollout.composed(_diagonal(rollout.covs[:, i, i], [i]), horizon) for i in range(3)]
+            composed.append(np.stack(of_axes, axis=1))
+            lengths.append(np.full(len(errors[-1]), horizon))
+    e, basis, (window_s, of_window) = np.concatenate(errors), np.concatenate(composed), _distinct(lengths)
 
-    def fitted(time_s: float) -> tuple[FloatArray, float]:
-        slow = ErrorMemory(time_s=time_s, share=(_ALMOST_ONE,) * 3)
+    def fitted(times_s: tuple[float, ...], start: FloatArray) -> tuple[FloatArray, float]:
+        all_hidden = ErrorMemory(time_s=_row(np.array(times_s)), share=(_ALMOST_ONE,) * 3)
+        shown = np.array([all_hidden.growth(horizon) for horizon in window_s])[of_window, :, None, None]
+        return _most_likely(e, np.concatenate([shown * basis, (1.0 - shown) * basis], axis=1), start)
 
-        def bases(rollout: Rollout, horizon_s: float) -> list[FloatArray]:
-            white = [_diagonal(rollout.covs[:, i, i], [i]) for i in range(3)]
-            return white + [g * basis for g, basis in zip(slow.growth(horizon_s), white, strict=True)]
-
-        return _most_likely(rollouts, bases, np.full(6, 0.5), (config.short_s, *config.horizons_s))
-
-    time_s = min(config.memory_s, key=lambda time_s: fitted(time_s)[1])
-    white, slow = fitted(time_s)[0].reshape(2, 3)
-    share = np.minimum(slow / (white + slow), _ALMOST_ONE)
-    return _row(white + slow), ErrorMemory(time_s=time_s, share=_row(share))
+    # The best time constant for all axes, then each axis' own
+    start = np.full(6, 0.5)
+    times_s = min(((t, t, t) for t in config.memory_s), key=lambda times_s: fitted(times_s, start)[1])
+    for axis in range(3):
+        tried = [(*times_s[:axis], t, *times_s[axis + 1 :]) for t in config.memory_s]
+        times_s = min(tried, key=lambda times_s: fitted(times_s, start)[1])
+    best, _ = fitted(times_s, start)
+    long, short = np.maximum(best, _MIN_FACTOR).reshape(2, 3)
+    share = np.minimum(1.0 - short / long, _ALMOST_ONE)
+    return _row(long), ErrorMemory(time_s=_row(np.array(times_s)), share=_row(share))
 
 
 def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: CalibrationConfig) -> JointErrors:
@@ -144,33 +160,35 @@ def nis(errors: FloatArray, covs: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mi,mi->m", errors, np.linalg.solve(covs, errors[..., None])[..., 0]))
 
 
-def _most_likely(
-    rollouts: list[Rollout], bases: Bases, start: FloatArray, horizons_s: tuple[float, ...]
-) -> tuple[FloatArray, float]:
-    """Non-negative coefficients of the bases' covariances that maximize the likelihood of the windows' errors.
+def _most_likely(e: FloatArray, basis: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
+    """Non-negative coefficients ``(p,)`` of covariances that maximize the likelihood of errors.
 
-    Also the negative log-likelihood.
+    Args:
+        e: ``(m, 3)`` errors.
+        basis: ``(m, p, 3, 3)`` what a unit of each coefficient adds to the covariance of each error.
+        start: ``(p,)`` to start from, positive.
+
+    Returns:
+        The coefficients and the mean negative log-likelihood.
     """
-    errors, parts = [], []
-    for rollout in rollouts:
-        for horizon in horizons_s:
-            step_bases = bases(rollout, horizon)
-            errors.append(rollout.errors(horizon))
-            parts.append(np.stack([rollout.composed(b, horizon) for b in step_bases], axis=1))
-    e, basis = np.concatenate(errors), np.concatenate(parts)
 
     def loss(log_parameters: FloatArray) -> tuple[float, FloatArray]:
         parameters = np.exp(log_parameters)
-        cov = np.einsum("p,mpij->mij", parameters, basis) + _MIN_STEP_VARIANCE * np.eye(3)
+        cov = np.tensordot(parameters, basis, axes=(0, 1)) + _MIN_STEP_VARIANCE * np.eye(3)
         inverse = np.linalg.inv(cov)
-        white = np.einsum("mij,mj->mi", inverse, e)
+        white = (inverse @ e[:, :, None])[:, :, 0]
         value = 0.5 * (np.einsum("mi,mi->m", e, white) + np.linalg.slogdet(cov)[1]).mean()
         outer = inverse - white[:, :, None] * white[:, None, :]
-        gradient = 0.5 * np.einsum("mij,mpij->p", outer, basis) / len(e) * parameters
+        gradient = 0.5 * np.einsum("mij,mpij->p", outer, basis, optimize=True) / len(e) * parameters
         return float(value), gradient
 
     result = minimize(loss, np.log(start), jac=True, method="L-BFGS-B", bounds=[(-30.0, 10.0)] * len(start))
     return np.asarray(np.exp(result.x)), float(result.fun)
+
+
+def _distinct(parts: list[FloatArray]) -> tuple[FloatArray, NDArray[np.intp]]:
+    values, index = np.unique(np.concatenate(parts), return_inverse=True)
+    return values, index
 
 
 def _noise_bases(rollout: Rollout) -> list[FloatArray]:

@@ -34,7 +34,7 @@ class NetworkConfig(Section):
     """Form and size of the model."""
 
     kind: Literal["velocity", "displacement"] = "displacement"
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (128, 128)
     members: int = Field(1, ge=1, le=64, description="displacement: networks trained from different seeds and averaged")
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
@@ -64,15 +64,20 @@ class OptimizationConfig(Section):
 
     seed: int = 0
     horizon_s: float = Field(2.0, gt=0, description="length of the rollouts in the loss")
-    batch: int = Field(256, gt=0)
-    iterations: int = Field(1500, gt=0)
-    validate_every: int = Field(125, gt=0)
+    batch: int = Field(128, gt=0)
+    iterations: int = Field(1000, gt=0)
+    validate_every: int = Field(100, gt=0)
     patience: int = Field(6, gt=0, description="validations without improvement after which to stop")
-    learning_rate: float = Field(2e-3, gt=0)
+    learning_rate: float = Field(3e-3, gt=0)
     position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")
     yaw_sigma_rad: float = Field(0.05, gt=0, description="yaw errors weigh in this unit")
     variance_horizon_s: float = Field(
         1.0, gt=0, description="length of the rollouts whose likelihood sets the variance"
+    )
+    variance_piece_s: float = Field(
+        0.2,
+        gt=0,
+        description="the same rollouts in pieces of this length count as much: they show which steps are sure",
     )
     variance_iterations: int = Field(300, ge=0)
 
@@ -86,10 +91,10 @@ class CalibrationConfig(Section):
         "as robots do, one alone says little of the next",
     )
     horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
-    short_s: float = Field(
-        1.0, gt=0, description="windows that, beside the horizons', tell slow errors from white ones"
+    short_s: tuple[float, ...] = Field(
+        (0.2, 1.0), description="windows that, beside the horizons', tell lasting errors from passing ones"
     )
-    memory_s: tuple[float, ...] = Field((0.5, 1.0, 2.0), description="time constants tried for slow errors")
+    memory_s: tuple[float, ...] = Field((0.2, 0.5, 1.0, 2.0), description="time constants tried for lasting errors")
     window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
 
 

@@ -156,9 +156,11 @@ def train_variance(
     config: OptimizationConfig,
     checkpoint: Checkpoint | None = None,
 ) -> Curve:
-    """Likelihood of the composed errors over windows; only the variance head learns."""
+    """Likelihood of the composed errors over windows and over pieces of them; only the variance head learns."""
     samples = net.samples(training)
-    steps = round(config.variance_horizon_s / samples.dt_s)
+    piece = max(1, round(config.variance_piece_s / samples.dt_s))
+    steps = piece * max(1, round(config.variance_horizon_s / samples.dt_s / piece))
+    lengths = sorted({piece, steps})
     starts = window_starts(training, steps)
     held_out = net.samples(validation) if validation else None
     judged = window_starts(validation, steps, stride=round(1.0 / samples.dt_s)) if validation else starts
@@ -166,9 +168,10 @@ def train_variance(
     def loss_of(on: Samples, chosen: Tensor) -> Tensor:
         with torch.no_grad():
             _, hidden = net.hidden(on, chosen, steps, None)
+            poses = torch.cat([torch.zeros(len(chosen), 1, 3), net.roll(on, chosen, steps)], dim=1)
             truth = on.poses[chosen[:, None] + torch.arange(steps + 1)]
-            error, adjoints = end_errors(net.roll(on, chosen, steps), truth)
-        return composed_nll(error, adjoints, net.variance_head(hidden), on.dt_s)
+        log_density = net.variance_head(hidden)
+        return sum(_nll_of_pieces(poses, truth, log_density, length, on.dt_s) for length in lengths)
 
     def loss_of_batch(rng: torch.Generator) -> Tensor:
         return loss_of(samples, starts[torch.randint(len(starts), (config.batch,), generator=rng)])
@@ -180,6 +183,16 @@ def train_variance(
     plan = Plan("variance", config.variance_iterations, config.learning_rate, _VARIANCE_EVERY, None, anneal=False)
     judge = score if validation else None
     return descend(plan, net.variance_head, loss_of_batch, judge, config.seed, checkpoint or Checkpoint())
+
+
+def _nll_of_pieces(poses: Tensor, truth: Tensor, log_density: Tensor, length: int, dt_s: float) -> Tensor:
+    """`composed_nll` of windows ``(b, n + 1, 3)`` cut into pieces of ``length`` steps."""
+    firsts = torch.arange(0, log_density.shape[1], length)
+    rows = firsts[:, None] + torch.arange(length + 1)
+    told, actual = (whole[:, rows].flatten(0, 1) for whole in (poses, truth))
+    with torch.no_grad():
+        error, adjoints = end_errors(relative(told[:, :1], told[:, 1:]), actual)
+    return composed_nll(error, adjoints, log_density.reshape(-1, length, 3), dt_s)
 
 
 def window_starts(runs: list[Run], steps: int, stride: int = 1) -> Tensor:

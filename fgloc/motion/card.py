@@ -18,7 +18,7 @@ Matrix = tuple[Row, Row, Row]
 Input = Literal["commands", "velocity", "gyro", "effort", "wheels"]
 CHANNELS: dict[str, int] = {"gyro": 1, "effort": 2, "wheels": 2}  # of the measured inputs, in the network's order
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
+Share = Annotated[FiniteFloat, Field(lt=1)]
 
 
 def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
@@ -62,20 +62,21 @@ class WheelJoints(Section):
 
 
 class ErrorMemory(Section):
-    """Errors of neighboring steps go together: of the variance density of each axis a share is slow, the rest white.
+    """How the errors of neighboring steps go together, axis by axis.
 
-    The model's densities are those of long windows, because a chain of steps composes them as if independent. The slow
-    share is an Ornstein-Uhlenbeck rate; over a window shorter than its time constant less of it has shown.
+    The model's densities are those of long windows, because a chain of steps composes them as if independent. Of each
+    density a share is slow, an Ornstein-Uhlenbeck rate: over a window shorter than its time constant less of it has
+    shown. A negative share is what cancels again, as a command obeyed too late or the noise of a truth does: over a
+    short window there is more of it.
     """
 
-    time_s: Positive = Field(description="time constant of the slow share")
+    time_s: tuple[Positive, Positive, Positive] = Field(description="time constants of x, y and yaw")
     share: tuple[Share, Share, Share] = Field(description="of x, y and yaw")
 
     def growth(self, window_s: float) -> Row:
         """Factors on the densities of x, y and yaw with which the covariance composed over such a window holds."""
-        u = window_s / self.time_s
-        hidden = -math.expm1(-u) / u
-        x, y, yaw = (1.0 - share * hidden for share in self.share)
+        hidden = (-math.expm1(-window_s / time_s) * time_s / window_s for time_s in self.time_s)
+        x, y, yaw = (1.0 - share * part for share, part in zip(self.share, hidden, strict=True))
         return x, y, yaw
 
 
