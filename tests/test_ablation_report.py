@@ -99,7 +99,7 @@ def test_matrix_holds_mean_spread_and_counts(bag):
 def test_sentences_say_the_cost_and_its_limits(bag):
     runs = join(*made(bag))
     blind = sentence(SUITE, runs, "blind")
-    assert blind.startswith("Blind at 2 s raises the mean error of 'full' from 10 to 150 mm over 2 runs")
+    assert blind.startswith("Blind at 2 s: the mean error of 'full' rises from 10 to 150 mm over 2 runs")
     assert "1 of 3 runs gave no figure" in blind
     assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they say nothing about it."
 
@@ -152,7 +152,7 @@ def test_command_writes_the_report_and_repeats_it(tmp_path):
         return done.stdout
 
     said = ablate()
-    assert said.splitlines()[0].startswith("Short ")
+    assert said.splitlines()[0].startswith("Short: ")
     assert said.splitlines()[-1] == f"report: {out / 'report.html'}"
     before = (out / "matrix.csv").read_bytes()
     assert ablate() == said

@@ -42,6 +42,7 @@ METRICS = (
     Metric("coverage.3", "within 3σ [%]", 100.0, ".1f"),
 )
 ATE = METRICS[0]
+_NOTHING = 0.005  # a change of the error by a smaller share is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +145,14 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     if not pairs:
         return f"{name}{at} left no run of '{variant}' with a figure ({len(here)} asked for)."
     before, after = np.mean(pairs, axis=0)
-    if after >= before:
-        change = f"raises the mean error of '{variant}' from {before:.3g} to {after:.3g} mm"
+    change = f"the mean error of '{variant}' "
+    if abs(after - before) < _NOTHING * before:
+        change += f"stays at {after:.3g} mm"
     else:
-        change = f"does not harm '{variant}': its mean error goes from {before:.3g} to {after:.3g} mm"
+        change += f"{'rises' if after > before else 'falls'} from {before:.3g} to {after:.3g} mm"
     more = np.array([b - a for a, b in pairs])
     spread = f" (change {more.mean():+.3g} ± {more.std(ddof=1):.3g} mm)" if len(more) > 1 else ""
-    return f"{name}{at} {change} over {len(pairs)} run{'s' if len(pairs) > 1 else ''}{spread}{lost}."
+    return f"{name}{at}: {change} over {len(pairs)} run{'s' if len(pairs) > 1 else ''}{spread}{lost}."
 
 
 def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
