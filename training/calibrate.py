@@ -37,7 +37,7 @@ class MeanTwists(Protocol):
 def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
-    Over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
+    If the runs are as long as that; over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
     """
 
     def residuals(parameters: FloatArray) -> FloatArray:
@@ -50,7 +50,8 @@ def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambd
             parts += [(v - actual[:, 0]) / v_unit, (omega - actual[:, 1]) / omega_unit]
         return np.concatenate(parts)
 
-    steps = round(_FIT_WINDOW_S / runs[0].dt_s)
+    longest = max(len(run.poses) for run in runs) - 1
+    steps = min(round(_FIT_WINDOW_S / runs[0].dt_s), max(1, 3 * longest // 4))
     windows = []
     for run in runs:
         k = run.starts(steps)

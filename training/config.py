@@ -28,6 +28,7 @@ class DataConfig(Section):
         0.05, gt=0, description="a smoothed trajectory is believed as truth where its position is known this well"
     )
     margin_s: float = Field(0.5, ge=0, description="left out at both ends")
+    shortest_s: float = Field(10.0, gt=0, description="a recording that is shorter is refused")
 
 
 class NetworkConfig(Section):
@@ -67,6 +68,7 @@ class OptimizationConfig(Section):
     batch: int = Field(128, gt=0)
     iterations: int = Field(1000, gt=0)
     validate_every: int = Field(100, gt=0)
+    validation_s: tuple[float, ...] = Field((10.0, 30.0), description="windows whose mean drift is validated")
     patience: int = Field(6, gt=0, description="validations without improvement after which to stop")
     learning_rate: float = Field(3e-3, gt=0)
     position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")

@@ -112,10 +112,10 @@ def make_run(
     first = max(int(truth_ns[0]) + round(config.margin_s * 1e9), commands[0].stamp_ns + round(history_s * 1e9))
     last = min(int(truth_ns[-1]), commands[-1].stamp_ns) - round(config.margin_s * 1e9)
     n = int((last - first) * 1e-9 / dt_s) + 1
-    if n < 100:
+    if n * dt_s < config.shortest_s:
         raise RecordingError(
             f"{name}: commands and truth overlap for {max(0.0, (last - first) * 1e-9):.1f} s; expected at least "
-            f"{100 * dt_s:.0f} s; check the stamps with `fgloc info`"
+            f"{config.shortest_s:g} s; check the stamps with `fgloc info`"
         )
     t_truth = (truth_ns - first) * 1e-9
     times = np.arange(n) * dt_s
@@ -180,11 +180,12 @@ def _smooth(
 ) -> tuple[FloatArray, FloatArray]:
     """Poses ``(n, 3)`` and body velocities ``(n, 3)`` at the times, from local cubic fits."""
     window = max(5, 2 * round(window_s / _FINE_S / 2) + 1)
-    fine = np.arange(times[0] - window * _FINE_S, times[-1] + window * _FINE_S, _FINE_S)
+    first, last = max(times[0] - window * _FINE_S, t_truth[0]), min(times[-1] + window * _FINE_S, t_truth[-1])
+    fine = np.linspace(first, last, max(window, 1 + round((last - first) / _FINE_S)))
     yaw = np.unwrap(truth[:, 2])
     raw = np.column_stack([np.interp(fine, t_truth, c) for c in (truth[:, 0], truth[:, 1], yaw)])
     smooth = savgol_filter(raw, window, 3, axis=0)
-    rates = savgol_filter(raw, window, 3, deriv=1, delta=_FINE_S, axis=0)
+    rates = savgol_filter(raw, window, 3, deriv=1, delta=fine[1] - fine[0], axis=0)
     poses, rates = (np.column_stack([np.interp(times, fine, c) for c in part.T]) for part in (smooth, rates))
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     body = np.column_stack([c * rates[:, 0] + s * rates[:, 1], c * rates[:, 1] - s * rates[:, 0], rates[:, 2]])

@@ -18,7 +18,6 @@ from training.data import Run
 from training.losses import composed_nll, end_errors, rollout_loss
 from training.models import DisplacementNet, MotionNet, Samples, relative
 
-_VALIDATION_S = (10.0, 30.0)
 _VARIANCE_EVERY = 25  # iterations between validations of the variance
 
 
@@ -123,15 +122,15 @@ def train_mean(
         truth = samples.poses[chosen[:, None] + torch.arange(steps + 1)]
         return rollout_loss(net.roll(samples, chosen, steps, rng), truth, samples.dt_s, config)
 
-    score = None if held_out is None else lambda: validate(net, held_out, validation)
+    score = None if held_out is None else lambda: validate(net, held_out, validation, config.validation_s)
     plan = Plan("mean", config.iterations, config.learning_rate, config.validate_every, config.patience, anneal=True)
     return descend(plan, net, loss_of_batch, score, config.seed, checkpoint or Checkpoint())
 
 
-def validate(net: MotionNet, samples: Samples, runs: list[Run]) -> float:
+def validate(net: MotionNet, samples: Samples, runs: list[Run], horizons_s: tuple[float, ...]) -> float:
     """Drift [%] of free rollouts, averaged over the horizons that the runs allow."""
     drifts = []
-    for horizon in _VALIDATION_S:
+    for horizon in horizons_s:
         steps = round(horizon / samples.dt_s)
         starts = window_starts(runs, steps, stride=round(1.0 / samples.dt_s))
         if not len(starts):
@@ -143,9 +142,7 @@ def validate(net: MotionNet, samples: Samples, runs: list[Run]) -> float:
         distance = truth[:, 1:, :2].sub(truth[:, :-1, :2]).norm(dim=-1).sum()
         drifts.append(100.0 * float(error[:, :2].norm(dim=-1).sum() / distance))
     if not drifts:
-        raise FglocError(
-            f"the validation recordings hold no {_VALIDATION_S[0]:.0f} s of unbroken truth; give longer ones"
-        )
+        raise FglocError(f"the validation recordings hold no {min(horizons_s):g} s of unbroken truth; give longer ones")
     return float(np.mean(drifts))
 
 
