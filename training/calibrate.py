@@ -37,7 +37,8 @@ class MeanTwists(Protocol):
 def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
-    If the runs are as long as that; over shorter times the robot's lag, which these kinematics do not know, would pass for a smaller scale.
+    Shorter runs count whole. Over shorter times the robot's lag, which these kinematics do not know, would pass for a
+    smaller scale.
     """
 
     def residuals(parameters: FloatArray) -> FloatArray:
