@@ -28,6 +28,7 @@ _MIN_ARM_M = 0.05
 _SAME_SCALE = 0.02
 _MODEL_S, _MODEL_SHARE, _MODEL_DEG, _MODEL_M = 0.003, 0.002, 0.2, 0.005  # what this model of a robot leaves out
 _GROSS_SHARE, _GROSS_KEPT = 0.5, 6
+_ALL_GROSS = 0.8  # without an explanation fewer may be the wheels' slipping
 
 
 class Diagnosis:
@@ -125,13 +126,14 @@ class Diagnosis:
         if self._known is not None and self._gross_count > _GROSS_SHARE * max(self._tried, 3):
             found = explanation(self._gross, self._place, self._known, self._camera)
             share = f"in {self._gross_count} of {self._tried} stretches of the run"
-            if found is None:
+            if found is not None:
+                return (f"Map, sightings and wheel motion contradict each other {share}; they agree if {found}.",)
+            if self._gross_count > _ALL_GROSS * self._tried:
                 return (
                     f"Map, sightings and wheel motion contradict each other {share}, and no single mistake of the "
                     "set-up explains it: check the map's positions, the sensor's transform, the wheels' geometry, "
                     "and whether they slip.",
                 )
-            return (f"Map, sightings and wheel motion contradict each other {share}; they agree if {found}.",)
         faults = self._faults.constant()
         notes = [*self._clocks(faults, source), *self._first_pose()]
         if self._known is not None and not self._config.landmarks.self_calibrating:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -25,6 +25,8 @@ _NUDGE = 1e-5
 _POOR = 3.0  # median whitened residual above which other clock offsets are tried as starts
 _STARTS_S = (0.3, -0.3, 0.8, -0.8)
 _GROSS, _STRAINED = 4.0, 1.5
+_PLAIN = 1.5  # median whitened residual of a window that fits without any fault
+_NONE = 1e12  # information that leaves no fault
 _OWN_DOF = 4.0  # how much the assumed noise counts beside a window's own residuals
 
 
@@ -75,7 +77,8 @@ class Fit:
     Attributes:
         place: ``T_map_start (3,)`` of the window's first pose; zeros without a map.
         misfit: median whitened residual; about 0.7 for the noise assumed; infinite if no faults make it fit.
-        strain: length of the faults in units of how large they may be.
+        strain: length of the faults in units of how large they may be; 0 if the window fits as well without them, as
+            then it does not tell them (a robot that drives one circle, say).
         evidence: what the window says of the faults.
     """
 
@@ -110,6 +113,8 @@ def fit_window(
     best = problem.solve(0.0)
     if any_clock and best.misfit > _POOR:
         best = min([best, *map(problem.solve, _STARTS_S)], key=lambda fit: fit.misfit)
+    if best.strain > _STRAINED and problem.solve(0.0, faults=False).misfit < _PLAIN:
+        best = replace(best, strain=0.0)
     return best
 
 
@@ -172,12 +177,12 @@ class _Problem:
         far = np.hypot(arms[:, 0], arms[:, 1]) * math.exp(fault[Fault.SCALE]) - np.hypot(ahead, left)
         return np.concatenate([off / spots.sigmas[:, 0], far / spots.sigmas[:, 1]])
 
-    def solve(self, late_s: float) -> Fit:
-        """Gauss–Newton with Cauchy weights, from this clock offset."""
+    def solve(self, late_s: float, faults: bool = True) -> Fit:
+        """Gauss–Newton with Cauchy weights, from this clock offset; without ``faults`` only for the place."""
         n = len(self.local)
         x = np.concatenate([self.local, np.zeros(len(Fault))])
         x[n + Fault.LATE] = late_s
-        prior = np.concatenate([np.zeros(n), self.prior])
+        prior = np.concatenate([np.zeros(n), self.prior if faults else np.full(len(Fault), _NONE)])
         damping = 1e-9 * np.eye(len(x))
         for _ in range(_ITERATIONS):
             r, J = self._linearized(x)
