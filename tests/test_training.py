@@ -20,7 +20,15 @@ from training import evaluate as evaluation
 from training import optimize
 from training import train as training
 from training.checkpoint import Checkpoint, Checkpoints
-from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig, load_train_config
+from training.config import (
+    CalibrationConfig,
+    NetworkConfig,
+    OptimizationConfig,
+    SpeedLimits,
+    TrainConfig,
+    load_train_config,
+)
+from training.controls import controls, draw_controls
 from training.data import Run
 from training.export import card_of, tensors_of
 from training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
@@ -231,13 +239,15 @@ def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     config = tiny_config("displacement", ["run0", "run1", "run2"])
     settings = json.loads(config.model_dump_json(exclude={"split"}))
     settings["optimization"]["iterations"] = 50
+    settings["limits"] = {"v_mps": 0.5, "omega_radps": 0.6}
     settings["recordings"] = {f"run{i}": f"run{i}/bag" for i in range(3)}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
     arguments = [str(tmp_path / "config.yaml"), "--data", str(tmp_path), "--out", str(tmp_path / "models")]
     assert training.main(arguments) == 0
     made = sorted(p.name for p in (tmp_path / "models").iterdir())
     names = ("all", *(f"without_run{i}" for i in range(3)))
-    assert made == sorted(f"{name}.{end}" for name in names for end in ("safetensors", "losses.png"))
+    assert made == sorted(["controls.png", *(f"{n}.{end}" for n in names for end in ("safetensors", "losses.png"))])
+    assert "hold too little of v from 0.38 to 0.5 m/s: 0.0 s, want 5 s" in capsys.readouterr().err
     from_all = load_model(tmp_path / "models" / "all.safetensors").card
     assert from_all.split.train == ("run0", "run1", "run2")
     assert from_all.joint is not None
@@ -245,12 +255,27 @@ def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     capsys.readouterr()
     report = tmp_path / "figures.json"
     model = tmp_path / "models" / "without_run2.safetensors"
-    assert evaluation.main([str(model), str(tmp_path / "run2" / "bag"), "--json", str(report)]) == 0
+    others = ["--against", str(tmp_path / "models" / "all.safetensors"), "--plots", str(tmp_path / "plots")]
+    assert evaluation.main([str(model), str(tmp_path / "run2" / "bag"), "--json", str(report), *others]) == 0
+    assert sorted(p.name for p in (tmp_path / "plots").iterdir()) == ["calibration.png", "growth.png", "tracks.png"]
     assert "calibrated commands" in capsys.readouterr().out
     rows = json.loads(report.read_text())
-    assert {row["source"] for row in rows} == {"commands", "calibrated commands", "model"}
+    assert {row["source"] for row in rows} == {"commands", "calibrated commands", "model", "all"}
     assert evaluation.main([str(tmp_path / "config.yaml"), str(tmp_path / "run2" / "bag")]) == 1
     assert "not a sound safetensors file" in capsys.readouterr().err
+
+
+def test_controls_name_what_was_never_told(runs: dict[str, Run], tmp_path: Path) -> None:
+    every = list(runs.values())
+    assert controls(every, None).missing() == []
+    assert controls(every, SpeedLimits(v_mps=0.3, omega_radps=0.6)).missing() == []
+    found = controls(every, SpeedLimits(v_mps=0.3, omega_radps=1.2, reverse_mps=0.1))
+    assert found.seconds.sum() == pytest.approx(sum(run.valid.sum() * run.dt_s for run in every))
+    missing = "; ".join(found.missing())
+    for words in ("v from -0.1 to 0 m/s", "ω from -1.2 to -0.86 rad/s", "ω from 0.86 to 1.2 rad/s", "turning left"):
+        assert words in missing
+    draw_controls(tmp_path / "controls.png", found)
+    assert (tmp_path / "controls.png").stat().st_size > 10_000
 
 
 def test_coverage_of_a_right_covariance() -> None:

@@ -81,7 +81,7 @@ class OptimizationConfig(Section):
         gt=0,
         description="the same rollouts in pieces of this length count as much: they show which steps are sure",
     )
-    variance_iterations: int = Field(300, ge=0)
+    variance_iterations: int = Field(500, ge=0)
 
 
 class CalibrationConfig(Section):
@@ -100,6 +100,14 @@ class CalibrationConfig(Section):
     window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
 
 
+class SpeedLimits(Section):
+    """What the robot may be told, so that training can say what the recordings left out."""
+
+    v_mps: float = Field(gt=0, description="forward")
+    omega_radps: float = Field(gt=0, description="to either side")
+    reverse_mps: float = Field(0.0, ge=0, description="backward")
+
+
 class TrainConfig(Section):
     """One training run, or one per recording left out."""
 
@@ -112,6 +120,7 @@ class TrainConfig(Section):
     )
     leave_one_out: bool = Field(False, description="a model per recording left out, and one from all")
     split: Split | None = None
+    limits: SpeedLimits | None = Field(None, description="of the robot; null: unknown, and nothing is missed")
     data: DataConfig = DataConfig()
     network: NetworkConfig = NetworkConfig()
     optimization: OptimizationConfig = OptimizationConfig()

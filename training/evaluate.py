@@ -1,7 +1,9 @@
 """``python -m training.evaluate MODEL BAG...``: free rollouts against the truth.
 
 Drift is the summed end error over the summed distance of all windows; ATE and yaw MAE (paper eq. 11, 12) are means over
-the windows' poses; NIS/3 and coverage say whether the composed covariance holds. Windows start every second.
+the windows' poses; NIS/3 and coverage say whether the composed covariance holds: the share of errors inside the
+ellipsoids that hold 68.27, 95.45 and 99.73 % of a Gaussian in three dimensions (Mahalanobis distance against χ²).
+Windows start every second.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ from fgloc.types import FloatArray
 from training.calibrate import nis
 from training.config import DataConfig
 from training.data import Run, load_run
-from training.rollouts import Rollout, relative, roll_kinematics, roll_model
+from training.evaluation_plots import draw_calibration, draw_growth, draw_tracks
+from training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_wheels
 
 HORIZONS_S = (1.0, 5.0, 10.0, 30.0, 60.0)
 STEP_S = 0.2
+_SHARES = np.linspace(0.0, 0.999, 200)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +101,23 @@ def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in out.items()}
 
 
-def sources(model_path: Path, runs: list[Run]) -> dict[str, list[Rollout]]:
-    """Rollouts of the model and of what it has to beat: commands as given, and scaled and delayed."""
-    model = load_model(model_path)
-    kinds = {"commands": Kinematics(), "calibrated commands": model.card.kinematics}
+def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]]:
+    """Rollouts of the models by name, and of what they have to beat.
+
+    That is: commands as given; scaled and delayed as the first model knows; wheel odometry if every run has it.
+    """
+    loaded = {name: load_model(path) for name, path in models.items()}
+    kinds = {"commands": Kinematics(), "calibrated commands": next(iter(loaded.values())).card.kinematics}
     found = {name: [roll_kinematics(kinematics, run, STEP_S) for run in runs] for name, kinematics in kinds.items()}
-    return found | {"model": [roll_model(model, run, STEP_S) for run in runs]}
+    if all(run.heard.has_wheels for run in runs):
+        found["wheel odometry"] = [roll_wheels(run, STEP_S) for run in runs]
+    return found | {name: [roll_model(model, run, STEP_S) for run in runs] for name, model in loaded.items()}
+
+
+def calibration_curve(rollouts: list[Rollout], horizon_s: float, shares: FloatArray) -> FloatArray:
+    """Which share of errors lies inside the ellipsoids that should hold these shares of them."""
+    values = np.concatenate([nis(r.errors(horizon_s), r.end_covs(horizon_s)) for r in rollouts])
+    return np.asarray((values[:, None] < chi2.ppf(shares, 3)).mean(axis=0))
 
 
 def _coverage(values: FloatArray) -> tuple[float, float, float]:
@@ -137,10 +152,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("model", type=Path)
     parser.add_argument("bags", type=Path, nargs="+")
     parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="draw tracks, growth of errors and calibration here")
+    parser.add_argument(
+        "--against", type=Path, action="append", default=[], metavar="MODEL", help="another model, for comparison"
+    )
     options = parser.parse_args(arguments)
+    models = {"model": options.model} | {path.stem: path for path in options.against}
     try:
-        model = load_model(options.model)
-        found = sources(options.model, _runs(model.card, options.bags))
+        found = sources(models, _runs(load_model(options.model).card, options.bags))
         rows = [(name, figures) for name, rollouts in found.items() for figures in growth(rollouts)]
     except FglocError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -148,6 +167,15 @@ def main(arguments: list[str] | None = None) -> int:
     print(_table(rows))
     if options.json is not None:
         options.json.write_text(json.dumps([{"source": name, **asdict(f)} for name, f in rows], indent=1) + "\n")
+    if options.plots is not None:
+        draw_tracks(options.plots / "tracks.png", found["model"])
+        draw_growth(options.plots / "growth.png", rows)
+        curves = {
+            figures.horizon_s: calibration_curve(found["model"], figures.horizon_s, _SHARES)
+            for name, figures in rows
+            if name == "model" and figures.coverage is not None
+        }
+        draw_calibration(options.plots / "calibration.png", _SHARES, curves)
     return 0
 
 

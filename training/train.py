@@ -23,6 +23,7 @@ from fgloc.motion.signals import Signal
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from training.checkpoint import Checkpoints, Curve
 from training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
+from training.controls import controls, draw_controls
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
@@ -211,6 +212,8 @@ def main(arguments: list[str] | None = None) -> int:
             name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data, smoothed.get(name))
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
+        trained = list(runs) if config.split is None else config.split.train
+        _report_controls([runs[name] for name in trained], config, options.out)
         checkpoints = Checkpoints(options.out / ".checkpoints")
         if config.split is not None:
             path = options.out / "model.safetensors"
@@ -228,6 +231,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _report_controls(training: list[Run], config: TrainConfig, out: Path) -> None:
+    found = controls(training, config.limits)
+    draw_controls(out / "controls.png", found)
+    for missing in found.missing():
+        print(f"warning: the recordings hold too little of {missing}", file=sys.stderr)
 
 
 def _report(name: str, card: ModelCard) -> None:
