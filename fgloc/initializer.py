@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import Fit, joint_fit
+from fgloc.graph.weights import Fit, joint_fit, sighting_cost
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     CornerMeasurement,
@@ -34,6 +34,16 @@ _MARGIN = 9.0  # how much more a rival place has to cost (in units of squared si
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
 _MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
 _MAX_STEPS = 400
+_LEAST_SHARE = {
+    1: 0.8,
+    2: 0.6,
+}  # of the sightings that a place has to explain, by the number of landmarks they are of ...
+_LEAST_SHARE_OF_MANY = 0.52  # ... and of three or more: the rest have wrong ids, or were moved
+_WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to be known better:
+_PARTIAL_COST_PER_DOF = 1.5
+_PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
+_RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
+_TRIMS = 3
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
 _MAX_PLACES = 4  # that are fitted to the end
@@ -65,6 +75,33 @@ class Start:
     newest: Belief
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreed:
+    """A place, fitted to the sightings that it explains: their share of all, and of how many landmarks they are.
+
+    The share is of the information, because of what was carried far any place explains anything; that of a landmark
+    alone is of the number.
+    """
+
+    fit: Fit
+    share: float
+    landmarks: int
+
+    @property
+    def certain(self) -> bool:
+        """Whether it explains enough, well enough, and is known well enough."""
+        if self.share < _LEAST_SHARE.get(self.landmarks, _LEAST_SHARE_OF_MANY) or self.fit.dof < 4:
+            return False
+        whole = self.share >= _WHOLE_SHARE
+        cost, sigma = (_MAX_COST_PER_DOF, _MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
+        return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
+
+    def beats(self, other: _Agreed) -> bool:
+        """Whether a place that explains about as much is so much worse that it is none."""
+        worse = other.fit.cost > _MAX_COST_PER_DOF * other.fit.dof
+        return worse or (self.share == other.share and other.fit.cost > self.fit.cost + _MARGIN)
+
+
 class Initializer:
     """Collects steps while the pose is unknown.
 
@@ -84,12 +121,22 @@ class Initializer:
         self._steps.clear()
         self.waiting = True
 
+    @property
+    def searching(self) -> bool:
+        """Whether there is anything collected."""
+        return bool(self._steps)
+
+    def forget(self) -> None:
+        """What was collected is of no use any more: the robot is where it was believed to be."""
+        self._steps.clear()
+
     def collect(
         self,
         step: Step,
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkMeasurement],
         readings: Readings | None = None,
+        landmarks: int = 1,
     ) -> Start | None:
         """Add a step; return the start once one place explains what was seen and no other does.
 
@@ -98,12 +145,13 @@ class Initializer:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
+            landmarks: how many different ones a place has to explain.
         """
         self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
         while self._steps[0].step.stamp_ns < horizon:
             self._steps.popleft()
-        newest = self._solve() if sightings else None
+        newest = self._solve(landmarks) if sightings else None
         if newest is None:
             return None
         self.waiting = False
@@ -112,7 +160,7 @@ class Initializer:
         self._steps.clear()
         return Start(steps, Belief(se2.compose(newest.pose, back), _WEAK_PRIOR.copy()), newest)
 
-    def _solve(self) -> Belief | None:
+    def _solve(self, landmarks: int) -> Belief | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
         few = _spread(here, _MAX_ROUGH)
         rough = [fit for c in self._candidates(here) if (fit := self._fit(c, few, _ROUGH_ITERATIONS)) is not None]
@@ -120,19 +168,40 @@ class Initializer:
         for fit in sorted(rough, key=lambda fit: fit.cost):
             if len(places) < _MAX_PLACES and all(_apart(fit.pose, other) for other in places):
                 places.append(fit.pose)
-        attempts = [self._fit(place, here, _ITERATIONS) for place in places]
-        fits = sorted((fit for fit in attempts if fit is not None), key=lambda fit: fit.cost)
-        if not fits:
+        found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
+        found.sort(key=lambda agreed: (-agreed.share, agreed.fit.cost))
+        if not found:
             return None
-        best = fits[0]
-        rivals = [fit for fit in fits[1:] if _apart(best.pose, fit.pose)]
-        if best.dof < 4 or best.cost > _MAX_COST_PER_DOF * best.dof:
+        best = found[0]
+        rivals = [other for other in found[1:] if _apart(best.fit.pose, other.fit.pose)]
+        if best.landmarks < landmarks or not best.certain:
             return None
-        if (np.sqrt(np.diag(best.cov)) > _MAX_SIGMA).any():
+        if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None
-        if rivals and rivals[0].cost < best.cost + _MARGIN:
+        return Belief(best.fit.pose, best.fit.cov)
+
+    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> _Agreed | None:
+        """Fit a place to the sightings that it explains, as long as they get more."""
+        fit = self._fit(place, sightings, _ITERATIONS)
+        if fit is None:
             return None
-        return Belief(best.pose, best.cov)
+        agreeing = list(sightings)
+        for _ in range(_TRIMS):
+            before = agreeing
+            agreeing = [m for m in sightings if self._explains(fit.pose, m)]
+            if len(agreeing) == len(before):
+                break
+            trimmed = self._fit(fit.pose, agreeing, _ITERATIONS) if agreeing else None
+            if trimmed is None:
+                return None
+            fit = trimmed
+        share = sum(map(_information, agreeing)) / sum(map(_information, sightings))
+        landmarks = len({m.landmark_id for m in agreeing})
+        return _Agreed(fit, share if landmarks > 1 else len(agreeing) / len(sightings), landmarks)
+
+    def _explains(self, pose: FloatArray, m: LandmarkMeasurement) -> bool:
+        cost = sighting_cost(pose, m, self._factors, self._config)
+        return cost is not None and cost[0] < _MAX_COST_PER_DOF * cost[1]
 
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
         return joint_fit(start, sightings, self._factors, self._config, iterations)
@@ -183,3 +252,8 @@ def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[Lan
 def _apart(a: FloatArray, b: FloatArray) -> bool:
     """Whether two poses are two places."""
     return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())
+
+
+def _information(m: LandmarkMeasurement) -> float:
+    """What a sighting weighs, in comparison with others of its kind."""
+    return 1.0 / (m.sigma_px**2 if isinstance(m, CornerMeasurement) else float(np.trace(m.cov[:2, :2])))

@@ -17,8 +17,8 @@ from fgloc.graph.estimator import Estimator, fuse
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.interval import interval_scale
-from fgloc.graph.log import Belief
-from fgloc.graph.weights import Fit, Weights
+from fgloc.graph.log import Belief, Sighting
+from fgloc.graph.weights import NEAR_M, NEAR_RAD, Fit, Weights
 from fgloc.initializer import Initializer
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
@@ -163,8 +163,7 @@ class Localizer:
         if started is None:
             return self._advance(step, readings, ()) if self._lost else None
         if self._lost:
-            self._lost = False
-            return self._start(step, started.newest, ())
+            return self._found(step, started.newest)
         first, *rest = started.steps
         estimate = self._start(first.step, started.first, first.sightings)
         decisions = [*estimate.decisions]
@@ -192,15 +191,16 @@ class Localizer:
             trust = self.trust.judge(step, readings)
             decisions = self._revise(k, trust)
             motions = self.sources.combine(readings, trust.off)
-            if motions:
-                self.sources.told()
-            else:
+            if not motions:
                 motions = [self.sources.unknown(step)]
                 self.rejections["motion.silent"] += 1
             motions, returned = self._return(k, step, motions, sightings)
             decisions += returned
             predicted = self.estimator.predict(motions)
             believed, refused, weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+            found = self._search(step, readings, refused, believed)
+            if found is not None:
+                return self._found(step, found)
             fit = None if believed else self.weights.overruled(refused, weighed, predicted)
             if fit is not None:
                 motions = [doubted(m, predicted, fit) for m in motions]
@@ -223,7 +223,7 @@ class Localizer:
         self._count_landmarks(weighed)
         if believed:
             self._fixed()
-            self.sources.told(belief)
+        self.sources.went(readings, belief if believed else None)
         self._watch_for_loss(believed)
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off = readings, frozenset(trust.off)
@@ -269,6 +269,42 @@ class Localizer:
         residual = math.sqrt(max(nis, 0.0))
         return motions, [Decision(k, step.stamp_ns, "interval", -1, residual, nis, 3, 1.0 / scale, reason)]
 
+    def _search(
+        self, step: Step, readings: Readings, refused: Sequence[Sighting], believed: Sequence[Sighting]
+    ) -> Belief | None:
+        """While nothing is believed, look for another place that explains what is refused: the robot may be there.
+
+        Returns:
+            A place far from where the robot is believed to be, told by two landmarks or more; nearer ones are the
+            business of `Weights.overruled`.
+        """
+        if believed:
+            self._initializer.forget()
+        contrary = [s.raw for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)]
+        searching = bool(contrary) or self._initializer.searching
+        if (
+            believed
+            or not searching
+            or self._initializer.waiting
+            or not (self.config.weights.adaptive and self.factors.known)
+        ):
+            return None
+        started = self._initializer.collect(step, self.sources.combine(readings), contrary, readings, landmarks=2)
+        if started is None or self.estimator.belief is None:
+            return None
+        x, y, yaw = se2.between(self.estimator.belief.pose, started.newest.pose)
+        return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
+
+    def _found(self, step: Step, place: Belief) -> Estimate:
+        """Go on from a place that nothing connects with where the robot was believed to be."""
+        self._lost = False
+        self.rejections["motion.jump"] += 1
+        self.sources.begin_segment()
+        self.trust.reset()
+        self.weights.forget_refusals()
+        self._initializer.forget()
+        return self._start(step, place, ())
+
     def _fixed(self) -> None:
         """Sightings were believed at the newest keyframe."""
         self._last_fix_s, self._last_fix_elapsed_s = self._clock_s, self.estimator.elapsed_s
@@ -291,7 +327,7 @@ class Localizer:
     def _get_lost(self) -> None:
         self._lost = True
         self.weights.forget_refusals()
-        self._initializer.reset()
+        self._initializer.waiting = True
 
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
         mode = Mode.OK

@@ -72,7 +72,10 @@ class MotionSources:
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
-        return Readings(wheels, self._measure_learned(step, velocity), gyro)
+        readings = Readings(wheels, self._measure_learned(step, velocity), gyro)
+        if readings.wheels is not None or readings.learned is not None:
+            self._silent_s = 0.0
+        return readings
 
     def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -137,11 +140,24 @@ class MotionSources:
         cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
 
-    def told(self, belief: Belief | None = None) -> None:
-        """A motion source or, if a belief is given, a fix has told where the robot went."""
-        self._silent_s = 0.0
-        if belief is not None and self.gyro is not None:
-            self.gyro.fix(float(belief.pose[2]), float(belief.cov[2, 2]))
+    def went(self, readings: Readings, fix: Belief | None) -> None:
+        """The robot went on by a step.
+
+        Args:
+            readings: what the sources said of it.
+            fix: where sightings have it now; None if there were none.
+        """
+        if fix is not None:
+            self._silent_s = 0.0
+        if self.gyro is None:
+            return
+        if readings.gyro is None:
+            self.gyro.forget_fix()
+            return
+        turn = readings.gyro
+        self.gyro.turned(float(turn.motion[2]), (turn.stamp_ns - turn.start_ns) * 1e-9)
+        if fix is not None:
+            self.gyro.fix(float(fix.pose[2]), float(fix.cov[2, 2]))
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""

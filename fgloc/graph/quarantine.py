@@ -16,6 +16,7 @@ from fgloc.types import CornerMeasurement, FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark
 _AGREE_M, _AGREE_SHARE = 0.15, 0.3  # how far they may lie from their median: at least, and of the displacement
+_LEAST_M, _LEAST_SHARE = 0.05, 0.05  # nearer to its place, plus this share of the distance: ill seen, not moved
 _BELIEVED_COUNTS = 2.0  # a sighting that fits weighs as much as this many that do not
 _ITERATIONS = 4
 
@@ -26,6 +27,7 @@ class _Case:
 
     score: float = 0.0
     places: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    distances: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # that it was seen from [m]
     held: bool = False
     fitted: int = 0  # sightings in a row that fitted although it was held
 
@@ -86,6 +88,7 @@ class Quarantine:
             place = displacement(sighting, k, pose, factors)
             if place is not None:
                 case.places.append(place)
+                case.distances.append(factors.distance(sighting.measurement.landmark_id, pose))
             case.held = case.score >= self._after and self._moved(case)
 
     def _moved(self, case: _Case) -> bool:
@@ -94,8 +97,10 @@ class Quarantine:
         places = np.array(case.places)
         median = np.median(places, axis=0)
         apart = np.hypot(*(places - median).T)
-        near = max(_AGREE_M, _AGREE_SHARE * math.hypot(*median))
-        return bool(np.quantile(apart, 0.8) < near and math.hypot(*median) > np.median(apart))
+        moved = math.hypot(*median)
+        if moved < _LEAST_M + _LEAST_SHARE * float(np.median(case.distances)):
+            return False
+        return bool(np.quantile(apart, 0.8) < max(_AGREE_M, _AGREE_SHARE * moved) and moved > np.median(apart))
 
 
 def displacement(sighting: Sighting, k: int, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:

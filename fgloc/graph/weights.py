@@ -29,6 +29,8 @@ from fgloc.types import (
 
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _GAUSS_NEWTON_STEPS = 4
+_BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
+NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
 @lru_cache(maxsize=256)
@@ -73,7 +75,7 @@ class Weights:
         for given in measurements:
             raw, weight = self._share_information(self._with_map_error(given, predicted))
             m = raw if calibration is None else calibration.apply(raw)
-            sighting = self._factors.sighting(k, m, self._cauchy(m), raw)
+            sighting = self._factors.sighting(k, m, _cauchy_k(m, self._config), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
             if not reason:
                 self.quarantine.fits(m.landmark_id)
@@ -115,7 +117,7 @@ class Weights:
             self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
-        """The place that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
+        """The place nearby that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
 
         Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
         is taken back.
@@ -125,6 +127,9 @@ class Weights:
             return None
         fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
         if fit is None or fit.cost > chi2_bound(self._config.estimator.gate_probability, fit.dof):
+            return None
+        x, y, yaw = se2.between(predicted.pose, fit.pose)
+        if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
             return None
         self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
         self.rejections += Counter()  # drops the zeros
@@ -187,10 +192,6 @@ class Weights:
         self.refused_in_a_row = 0
         self._refused_ids.clear()
 
-    def _cauchy(self, m: LandmarkMeasurement) -> float:
-        section = self._config.markers if isinstance(m, CornerMeasurement) else self._config.landmarks
-        return section.cauchy_k
-
 
 def joint_nis(
     k: int, sighting: Sighting, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
@@ -237,12 +238,12 @@ def joint_fit(
         values = _values(0, pose)
         for m, unary in made:
             if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
-                return None
+                cost, dof = cost + _BEHIND_COST, dof + 8  # cannot be projected: as wrong as can be, and without a pull
+                continue
             r, J = whitened(unary, values, None)
-            k2 = (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k ** 2
-            square = float(r @ r) / len(r) * 2.0  # as if of one two-dimensional sighting
-            weight = k2 / (k2 + square)
-            cost += k2 * math.log1p(square / k2) * len(r) / 2.0
+            k = _cauchy_k(m, config)
+            weight = k**2 / (k**2 + float(r @ r) / len(r) * 2.0)  # as if of one two-dimensional sighting
+            cost += _robust_cost(r, k)
             dof += len(r)
             normal += weight * J.T @ J
             pull += weight * J.T @ r
@@ -254,6 +255,26 @@ def joint_fit(
         pose = se2.compose(pose, se2.exp(_solve(normal, -pull)))
     cov = np.linalg.inv(normal)
     return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
+
+
+def sighting_cost(
+    pose: FloatArray, m: LandmarkMeasurement, factors: LandmarkFactors, config: Config
+) -> tuple[float, int] | None:
+    """Robust cost and degrees of freedom of one sighting made from a pose; None if it cannot have been."""
+    if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+        return None
+    r, _ = whitened(factors.make(0, m, None), _values(0, pose), None)
+    return _robust_cost(r, _cauchy_k(m, config)), len(r)
+
+
+def _cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
+    return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
+
+
+def _robust_cost(residual: FloatArray, k: float) -> float:
+    """Cauchy's cost of a whitened residual, as if it were that of two-dimensional sightings."""
+    pairs = len(residual) / 2.0
+    return k**2 * math.log1p(float(residual @ residual) / pairs / k**2) * pairs
 
 
 def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ _STILL_RATE = 0.03  # rad/s on top of what the bias may be: a robot that turns f
 _STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
 _GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
 _APART_S = 2.0  # ... and another one after at least this long
+_ALARM = 16.0  # squared sigmas
 _REST_M, _REST_RAD = 1e-3, 1e-3  # of wheel motion a second: quantization is no motion
 
 
@@ -81,17 +82,19 @@ class Gyro:
             self._standing_s = 0.0
             if self._heard:
                 self.rejections["gyro.silence"] += 1
-            self.forget_fix()
             return None
         self._heard = True
         self.bias_variance += self._config.bias_walk**2 * dt
         self._watch_rest(raw / dt, dt, wheels)
         yaw = raw - self.bias * dt
-        self._turned += yaw
-        self._turned_s += dt
         drift = self.bias_variance * ((blind_s + dt) ** 2 - blind_s**2)
         noise = self._config.yaw_per_sqrt_s**2 * dt + self._config.scale_sigma**2 * abs(yaw)
         return Turn(yaw, noise + drift)
+
+    def turned(self, yaw: float, seconds: float) -> None:
+        """The robot went on by a step over which `measure` gave this turn [rad]."""
+        self._turned += yaw
+        self._turned_s += seconds
 
     def fix(self, yaw: float, variance: float) -> None:
         """Take in the yaw at the end of the last step, as sightings have told it; two of them teach the bias.
@@ -126,6 +129,9 @@ class Gyro:
             self._learn(rate, self._config.yaw_per_sqrt_s**2 / dt + _STILL_SIGMA**2)
 
     def _learn(self, bias: float, variance: float) -> None:
+        if (bias - self.bias) ** 2 > _ALARM * (self.bias_variance + variance):  # a wrong fix, or a bias that jumped:
+            self.bias_variance *= 2.0  # the next ones will tell
+            return
         gain = self.bias_variance / (self.bias_variance + variance)
         self.bias += gain * (bias - self.bias)
         self.bias_variance *= 1.0 - gain
