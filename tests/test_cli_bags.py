@@ -70,6 +70,17 @@ def test_many_bags_give_what_each_alone_gives(bags, tmp_path):
         assert (tmp_path / "many" / "two_bag" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
 
 
+def test_files_of_other_settings_do_not_count(bags, tmp_path):
+    noises = {0.05: [], 0.2: []}
+    for noise in (0.05, 0.2, 0.05, 0.05):
+        config = Config.model_validate({"landmarks": {"range_sigma_m": noise}})
+        (job,) = plan_bags([bags / "one" / "bag"], None, lambda bag, config=config: config, "").jobs
+        execute(job, tmp_path)
+        noises[noise].append((tmp_path / "bag" / "trajectory.tum").read_bytes())
+    assert noises[0.05][0] == noises[0.05][1] != noises[0.2][0]
+    assert len(attempts(tmp_path)) == 3
+
+
 def test_a_lost_robot_among_many_exits_with_3(bags, tmp_path):
     given = [bags / "one" / "bag", bags / "lost" / "bag"]
     run_before(given, tmp_path)

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict
 import fgloc
 from fgloc import se2
 from fgloc.ablation.failures import Scene, generators, spoil
-from fgloc.ablation.records import Cost, Record, Track, log_attempt, read_record, write_record
+from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path, read_record, write_record
 from fgloc.ablation.suite import Cell
 from fgloc.assembly import resolved
 from fgloc.config import Config
@@ -29,7 +29,7 @@ from fgloc.errors import FglocError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.frames import quaternion_yaw
-from fgloc.recording.outputs import sha256_of
+from fgloc.recording.outputs import sha256_of, write_text
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
@@ -124,11 +124,13 @@ def code_hash() -> str:
 
 
 def finished(job: Job, out: Path) -> Record | None:
-    """The record of a job that need not run; None if it has none, or if the files of its run are gone."""
+    """The record of a job that need not run; None if it has none, or if the files of its run are gone or another's."""
     record = read_record(out, job.key)
     if record is None or record.outcome != "done" or job.folder is None:
         return record
-    return record if (out / job.folder / "metrics.json").exists() else None
+    owner = owner_path(out, job.folder)
+    whole = (out / job.folder / "metrics.json").exists() and owner.exists() and owner.read_text("utf-8") == job.key
+    return record if whole else None
 
 
 def execute(job: Job, out: Path) -> str:
@@ -187,7 +189,10 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         )
     metrics = compute_metrics(result, config)
     if job.folder is not None:
+        owner = owner_path(out, job.folder)
+        owner.unlink(missing_ok=True)  # the files may be those of a run with other settings
         write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
+        write_text(owner, job.key)
     touched: dict[str, int] = {}
     for scene in scenes:
         for kind, n in scene.touched.items():

@@ -51,6 +51,11 @@ def record_path(out: Path, key: str) -> Path:
     return out / "jobs" / f"{key}.json"
 
 
+def owner_path(out: Path, folder: str) -> Path:
+    """Where the key of the job is that wrote the files of a folder last."""
+    return out / "jobs" / f"{folder}.owner"
+
+
 def read_record(out: Path, key: str) -> Record | None:
     """A job's record; None if it has none."""
     path = record_path(out, key)
