@@ -24,7 +24,7 @@ from robot_world import (
     room,
 )
 
-from datasets import turtlebot3
+from datasets import mrclam, pioneer, turtlebot3
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.assembly import given_pose
@@ -357,6 +357,23 @@ def test_fault_24_attendance_stays_bounded_and_keeps_count():
     assert heard.count == 250_001
     assert heard.longest_silence_s == pytest.approx(5.01)
     assert np.median(np.diff(heard.times)) / heard.every == pytest.approx(0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["first_run", "light_drop_run", "patches_run"])
+def test_the_sound_samples_are_not_accused(name):
+    folder = SAMPLES / name
+    result = run(folder / "bag", folder / "map.yaml", load_config(folder / "robot.yaml"), "online")
+    assert not [note for note in result.notes if _accuses(note)]
+
+
+@pytest.mark.slow
+def test_sound_real_robots_are_not_accused(tmp_path):
+    bags = [mrclam.convert(real_data("mrclam6"), 3, tmp_path / "mrclam")]
+    bags += [pioneer.convert(real_data("pioneer_aruco", f"{n}.bag"), tmp_path / n) for n in ("duarte", "pinto1")]
+    for bag in bags:
+        result = run(bag, find_beside(bag, "map.yaml"), load_config(find_beside(bag, "robot.yaml")), "online")
+        assert not [note for note in result.notes if _accuses(note)]
 
 
 def test_the_sound_turtlebot3_is_not_accused(tmp_path):

@@ -26,6 +26,7 @@ _MIN_SCALE = 0.03
 _MIN_TURN = 0.03  # rad
 _MIN_ARM_M = 0.05
 _SAME_SCALE = 0.02
+_BELIEVABLE = 1.5  # times how large faults may be: what is larger stands in for something that is not modeled
 _MODEL_S, _MODEL_SHARE, _MODEL_DEG, _MODEL_M = 0.003, 0.002, 0.2, 0.005  # what this model of a robot leaves out
 _GROSS_SHARE, _GROSS_KEPT = 0.5, 6
 _ALL_GROSS = 0.8  # without an explanation fewer may be the wheels' slipping
@@ -95,8 +96,9 @@ class Diagnosis:
         travelled = self._cutter.travelled
         window = self._cutter.move(step, None if wheels is None else wheels.motion)
         if window is not None:
-            self._gyro.compare(window)
-            self._judge(window, travelled, step.segment)
+            slipped = self._gyro.compare(window)
+            if not slipped:
+                self._judge(window, travelled, step.segment)
 
     def _judge(self, window: Window, travelled: FloatArray, segment: int) -> None:
         fit = fit_window(window, self._place, self._known)
@@ -136,7 +138,8 @@ class Diagnosis:
                 )
         faults = self._faults.constant()
         notes = [*self._clocks(faults, source), *self._first_pose()]
-        if self._known is not None and not self._config.landmarks.self_calibrating:
+        believable = bool((np.abs(faults.values) < _BELIEVABLE * PRIOR_SIGMAS).all())
+        if self._known is not None and believable and not self._config.landmarks.self_calibrating:
             notes += [*self._scales(faults), *self._mounting(faults)]
         return tuple(notes)
 

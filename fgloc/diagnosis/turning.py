@@ -16,6 +16,7 @@ _STARTS_S = np.arange(-1.0, 1.01, 0.1)
 _ITERATIONS = 5
 _KEPT_S = 16.0
 _NOISE_RAD = 0.003
+_SLIPPED_RAD = 0.015  # rms of the yaw that wheels and gyro differ by in a window, whatever their scales and clocks
 _OWN_DOF = 4.0
 
 
@@ -50,20 +51,20 @@ class GyroWitness:
             keep = next(i for i, t in enumerate(self._times) if t > at_s - _KEPT_S)
             del self._times[:keep], self._rates[:keep]
 
-    def compare(self, window: Window) -> None:
-        """Add what this window says."""
+    def compare(self, window: Window) -> bool:
+        """Add what this window says; whether the wheels slipped in it, as they and the gyro contradict each other."""
         times = np.array(self._times) - window.start_s
         if len(times) < 20 or np.diff(times).max() > 0.5:
-            return
+            return False
         rates = np.array(self._rates)
         angles = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(times))])
         yaw = np.concatenate([[0.0], np.cumsum(window.motions[:, 2])])
         inside = (window.times > times[0] + 1.0) & (window.times < times[-1] - 1.0)
         if inside.sum() < 20:
-            return
+            return False
         at, yaw = window.times[inside], yaw[inside]
         if float(np.std(np.diff(yaw) / np.diff(at))) < _MIN_TURNING:
-            return
+            return _misfit(at, yaw, times, angles, 0.0) > _SLIPPED_RAD
         late = min(_STARTS_S.tolist(), key=lambda start: _misfit(at, yaw, times, angles, start))
         scale, fitted = _line(at, yaw, times, angles, late)
         for _ in range(_ITERATIONS):
@@ -76,6 +77,7 @@ class GyroWitness:
         information, pull = eliminated(J.T @ J / noise, -(J.T @ r) / noise, 2)
         value = np.array([late, scale])
         self.pool.add(Evidence(window.start_s + float(at.mean()), information, pull + information @ value))
+        return math.sqrt(float(np.mean(r**2))) > _SLIPPED_RAD
 
 
 def _jacobian(
