@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,13 +13,23 @@ from motion_models import make_card, make_tensors
 from fgloc import se2
 from fgloc.config import MotionConfig, NoiseDensity
 from fgloc.errors import ModelError
-from fgloc.motion import DisplacementModel, LearnedMotion, MotionModel, VelocityModel, load_model, save_model
+from fgloc.motion import (
+    DisplacementModel,
+    LearnedMotion,
+    MotionModel,
+    NaiveModel,
+    VelocityModel,
+    load_model,
+    save_model,
+)
+from fgloc.motion.card import Kind
 from fgloc.motion.commands import CommandTrack
 from fgloc.motion.forms import noise_density
 from fgloc.types import CommandEvent, Step
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
+KINDS = get_args(Kind)
 
 
 def commands(rng: np.random.Generator, seconds: float = 6.0) -> tuple[CommandEvent, ...]:
@@ -43,10 +54,11 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_file_round_trip(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model = model_of(kind, rng, tmp_path)
-    assert isinstance(model, VelocityModel if kind == "velocity" else DisplacementModel)
+    classes = {"naive": NaiveModel, "velocity": VelocityModel, "displacement": DisplacementModel}
+    assert isinstance(model, classes[model.card.family])
     assert model.card == make_card(kind)
     assert model.joint is not None
     assert not list(tmp_path.glob("*.part"))
@@ -110,7 +122,7 @@ def test_velocity_without_network_is_a_first_order_lag(rng: np.random.Generator,
         assert prediction.motion[2] == pytest.approx(se2.wrap(0.88 * (t - 0.3 * (1 - np.exp(-t / 0.3)))), abs=0.004)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_steps_of_whole_sub_steps_compose_exactly(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path), commands(rng)
     start, velocity = T0 + 3 * SECOND, np.array([0.1, 0.2])
@@ -118,14 +130,14 @@ def test_steps_of_whole_sub_steps_compose_exactly(kind: str, rng: np.random.Gene
     half = model.predict(events, start, start + SECOND // 2, velocity)
     assert whole is not None
     assert half is not None
-    carried = half.velocity if kind == "velocity" else None
+    carried = half.velocity if model.card.family == "velocity" else None
     rest = model.predict(events, start + SECOND // 2, start + SECOND, carried)
     assert rest is not None
     np.testing.assert_allclose(se2.compose(half.motion, rest.motion), whole.motion, atol=1e-6)
     np.testing.assert_allclose(se2.compose_cov(half.cov, rest.motion, rest.cov), whole.cov, rtol=1e-4, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_covariance_is_composed_as_se2_does(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path), commands(rng)
     start, motion, cov, velocity = T0 + 3 * SECOND, np.zeros(3), np.zeros((3, 3)), np.array([0.1, 0.2])
@@ -159,7 +171,7 @@ def test_a_track_followed_step_by_step_equals_one_made_at_once(rng: np.random.Ge
     assert len(track._events) < 5000  # memory does not grow
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_any_cadence_gives_the_same_motion_and_covariance(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path), commands(rng)
     start = T0 + 3 * SECOND
@@ -211,6 +223,24 @@ def test_known_velocity_matters_at_first_and_fades(rng: np.random.Generator, tmp
     np.testing.assert_array_equal(a.motion, b.motion)
 
 
+def test_naive_model_does_what_it_is_told(rng: np.random.Generator, tmp_path: Path) -> None:
+    model = model_of("naive", rng, tmp_path)
+    events = tuple(CommandEvent(T0 + k * SECOND, 0, "c", 0.1 * k, 0.2 * k) for k in range(1, 4))
+    prediction = model.predict(events, T0 + 3 * SECOND // 2, T0 + 5 * SECOND // 2, None)
+    assert prediction is not None
+    halves = [se2.exp((0.05 * k, 0.0, 0.1 * k)) for k in (1, 2)]
+    np.testing.assert_allclose(prediction.motion, se2.compose(*halves), atol=1e-9)
+    np.testing.assert_allclose(prediction.velocity, [0.2, 0.4], atol=1e-9)
+
+
+def test_rate_model_without_a_network_keeps_its_velocity(rng: np.random.Generator, tmp_path: Path) -> None:
+    card = make_card("rate")
+    save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
+    prediction = load_model(tmp_path / "m.safetensors").predict(commands(rng), T0, T0 + SECOND, np.array([0.3, 0.4]))
+    assert prediction is not None
+    np.testing.assert_allclose(prediction.motion, se2.exp((0.3, 0.0, 0.4)), atol=1e-9)
+
+
 def test_noise_density_adds_up() -> None:
     noise = NoiseDensity(
         x_per_sqrt_m=1.0, y_per_sqrt_m=2.0, yaw_per_sqrt_m=3.0, xy_per_sqrt_rad=4.0, yaw_per_sqrt_rad=5.0,
@@ -232,7 +262,7 @@ def step(events: tuple[CommandEvent, ...], index: int, segment: int = 0, length:
     return Step(index, segment, start, start + length, commands=events)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path, history_s=0.1), commands(rng)
     source = LearnedMotion(model, MotionConfig())
@@ -254,7 +284,7 @@ def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Genera
     assert fresh is not None
     assert lone is not None
     np.testing.assert_array_equal(fresh.motion, lone.motion)
-    if kind == "velocity":
+    if model.card.family == "velocity":
         assert np.abs(fresh.motion - second.motion).max() > 1e-6
 
 
@@ -272,7 +302,7 @@ def test_source_says_why_it_is_silent(rng: np.random.Generator, tmp_path: Path) 
     assert not off.rejections
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("naive", "lag")])  # they have no network
 def test_fault_33_network_returns_nan(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     card = make_card(kind)
     tensors = make_tensors(card, rng)

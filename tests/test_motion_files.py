@@ -59,7 +59,7 @@ def test_fault_34_wrong_normalization(card: ModelCard, rng: np.random.Generator,
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "telepathy"}, r"kind.*'velocity' or 'displacement'.*'telepathy'"),
+        ({"kind": "telepathy"}, r"kind.*'naive'.* or 'gru'.*'telepathy'"),
         ({"version": 2}, r"2\), this program reads.* 1\)"),
         ({"format": "other"}, r"'other'.*'fgloc-motion'"),
         ({"inputs": ["commands", "lidar"]}, "lidar"),

@@ -7,7 +7,8 @@ import numpy as np
 from fgloc.motion.card import ModelCard, Split
 from fgloc.motion.load import Tensors
 from training.config import TrainConfig
-from training.models import DisplacementNet, MotionNet
+from training.models import DisplacementNet, MotionNet, VelocityNet
+from training.recurrent import Trunk
 
 _WARM_UP_S = 2.0  # a velocity model that is told no velocity starts from rest this long ago
 
@@ -19,6 +20,8 @@ def tensors_of(nets: list[MotionNet]) -> Tensors:
         for name, tensors in zip(("weight", "bias"), zip(*members, strict=True), strict=True):
             arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors]
             out[f"layer{i}.{name}"] = np.stack(arrays) if len(arrays) > 1 else arrays[0]
+    if isinstance(nets[0], DisplacementNet) and isinstance(nets[0].trunk, Trunk):
+        out |= {name: tensor.detach().numpy() for name, tensor in nets[0].trunk.weights().items()}
     return out
 
 
@@ -26,13 +29,14 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
     """The card of a network that is trained and not yet calibrated."""
     network = config.network
     displacement = isinstance(net, DisplacementNet)
+    velocity = isinstance(net, VelocityNet)
     return ModelCard.model_validate(
         dict(
             kind=network.kind,
             robot=config.robot,
-            inputs=network.inputs if displacement else ("commands", "velocity"),
+            inputs=network.inputs if displacement else ("commands", "velocity") if velocity else ("commands",),
             dt_s=network.dt_s,
-            hidden=network.hidden,
+            hidden=() if network.kind in ("naive", "lag", "arx") else network.hidden,
             members=network.members,
             hold_s=network.hold_s,
             history_s=max(network.edges_s[-1], net.kinematics.delay_s) if displacement else _WARM_UP_S,

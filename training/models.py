@@ -17,6 +17,9 @@ from fgloc.motion.signals import Signals
 from fgloc.types import FloatArray
 from training.config import NetworkConfig
 from training.data import Run
+from training.recurrent import Trunk
+
+_RATE_S = 0.2  # a robot's velocities change within about this time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,9 +67,14 @@ class DisplacementNet(nn.Module):
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
         self.register_buffer("scale", torch.tensor((actual - base).std(axis=0), dtype=torch.float32))
-        net = mlp([len(mean), *config.hidden, 3])
-        self.trunk, self.mean_head = net[:-1], net[-1]
-        self.variance_head = nn.Linear(config.hidden[-1], 3)
+        if config.kind == "gru":
+            self.trunk: Trunk | nn.Sequential = Trunk(len(config.edges_s) - 1, len(mean), config.hidden)
+            self.mean_head = mlp([self.trunk.width, 3])[-1]
+        else:
+            net = mlp([len(mean), *config.hidden, 3])
+            self.trunk, self.mean_head = net[:-1], net[-1]
+        width = self.mean_head.in_features
+        self.variance_head = nn.Linear(width, 3)
         with torch.no_grad():
             self.variance_head.weight.zero_()
             self.variance_head.bias.copy_(torch.log(torch.tensor([1e-2, 1e-2, 3e-2]) ** 2))
@@ -137,37 +145,61 @@ class DisplacementNet(nn.Module):
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weights and biases; the last layer has the mean's rows, then the variance's."""
-        linear = [m for m in self.trunk if isinstance(m, nn.Linear)]
+        trunk = self.trunk.layers if isinstance(self.trunk, Trunk) else self.trunk
+        linear = [m for m in trunk if isinstance(m, nn.Linear)]
         heads = (self.mean_head, self.variance_head)
         last = (torch.cat([h.weight for h in heads]), torch.cat([h.bias for h in heads]))
         return [*((m.weight, m.bias) for m in linear), last]
 
 
-class VelocityNet(nn.Module):
-    """[v, ω] a step later from (v, ω, u_v, u_ω, Δt): a lag plus Δt times a network. Source: paper eq. 6, 10."""
+class NaiveNet(nn.Module):
+    """v = u: nothing to learn."""
 
-    def __init__(self, config: NetworkConfig, kinematics: Kinematics, lag: Lag, runs: list[Run]) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
+        """Take the configuration."""
+        super().__init__()
+        self.config, self.kinematics, self.lag = config, Kinematics(), None
+        for name in ("mean", "std", "scale"):
+            self.register_buffer(name, torch.zeros(0))
+
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """None."""
+        return []
+
+
+class VelocityNet(nn.Module):
+    """[v, ω] a step later from (v, ω, u_v, u_ω, Δt): a lag plus Δt times a network. Source: paper eq. 6, 10.
+
+    Of a ``lag`` model there is no network, of an ``arx`` model it is one linear layer, and in the ``rate`` form no lag:
+    the network is the acceleration.
+    """
+
+    def __init__(self, config: NetworkConfig, kinematics: Kinematics, lag: Lag | None, runs: list[Run]) -> None:
         """Take the normalization from the training runs."""
         super().__init__()
         self.config, self.kinematics, self.lag = config, kinematics, lag
+        self._delay_s = kinematics.delay_s if lag is None else lag.delay_s
         told = np.concatenate([self._features(run) for run in runs])
         actual = np.concatenate([run.velocities[:, [0, 2]] for run in runs])
         dts = np.array([0.5, 1.0]) * config.dt_s  # the range that sub-steps will have
         mean = [*actual.mean(axis=0), *told.mean(axis=0), dts.mean()]
         std = [*actual.std(axis=0), *told.std(axis=0), dts.std()]
-        rate = np.maximum(actual.std(axis=0), 1e-3) / np.array(lag.lag_s)
+        rate = np.maximum(actual.std(axis=0), 1e-3) / (_RATE_S if lag is None else np.array(lag.lag_s))
+        if config.kind == "lag":
+            mean, std, rate = [], [], np.zeros(0)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(rate, dtype=torch.float32))
-        self.net = mlp([5, *config.hidden, 2])
+        hidden = () if config.kind == "arx" else config.hidden
+        self.net = None if config.kind == "lag" else mlp([5, *hidden, 2])
 
     def _features(self, run: Run) -> FloatArray:
         limits = np.append(run.times, len(run.poses) * run.dt_s)
-        return run.track.means(limits - self.lag.delay_s)
+        return run.track.means(limits - self._delay_s)
 
     def samples(self, runs: list[Run]) -> Samples:
         """Samples of runs, in order."""
-        aims = self.kinematics.model_copy(update={"delay_s": self.lag.delay_s})
+        aims = self.kinematics.model_copy(update={"delay_s": self._delay_s})
         return _samples(runs, [self._features(run) for run in runs], [_base(aims, run) for run in runs])
 
     def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
@@ -183,13 +215,15 @@ class VelocityNet(nn.Module):
             part.reshape(len(starts), steps // pair, pair, 2).mean(dim=2)
             for part in (samples.features[rows], samples.base[rows][..., [0, 2]])
         )
-        keep = torch.exp(-dt / torch.tensor(self.lag.lag_s))
+        keep = torch.ones(2) if self.lag is None else torch.exp(-dt / torch.tensor(self.lag.lag_s))
         state = samples.velocities[starts]
         dts = torch.full((len(starts), 1), dt)
         states = [state]
         for k in range(steps // pair):
             x = torch.cat([state, told[:, k], dts], dim=1)
-            state = aims[:, k] + keep * (state - aims[:, k]) + dt * self.scale * self.net((x - self.mean) / self.std)
+            state = aims[:, k] + keep * (state - aims[:, k])
+            if self.net is not None:
+                state = state + dt * self.scale * self.net((x - self.mean) / self.std)
             states.append(state)
         velocity = torch.stack(states, dim=1)
         between = 0.5 * (velocity[:, :-1] + velocity[:, 1:]).repeat_interleave(pair, dim=1) * samples.dt_s
@@ -197,10 +231,10 @@ class VelocityNet(nn.Module):
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weights and biases."""
-        return [(m.weight, m.bias) for m in self.net if isinstance(m, nn.Linear)]
+        return [] if self.net is None else [(m.weight, m.bias) for m in self.net if isinstance(m, nn.Linear)]
 
 
-MotionNet = DisplacementNet | VelocityNet
+MotionNet = DisplacementNet | VelocityNet | NaiveNet
 
 
 def integrate(twists: Tensor) -> Tensor:

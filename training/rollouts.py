@@ -79,7 +79,7 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
         signals = reader.read(heard, run.heard.gyro_bias(start_ns))
         if isinstance(signals, str):
             raise ModelError(f"{run.name}: the model reads {signals}, which was silent at {start_ns} ns")
-        carried = velocity if model.card.kind == "velocity" else None
+        carried = velocity if model.card.family == "velocity" else None
         prediction = model.predict(commands, start_ns, end_ns, carried, signals)
         if prediction is None:
             raise ModelError(f"{run.name}: the model's output at {start_ns} ns is not finite")

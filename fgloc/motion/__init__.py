@@ -6,7 +6,7 @@ from fgloc.motion.forms import MotionModel, MotionPrediction
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.load import load_model, save_model
 from fgloc.motion.source import LearnedMotion
-from fgloc.motion.velocity import VelocityModel
+from fgloc.motion.velocity import NaiveModel, VelocityModel
 
 __all__ = [
     "DisplacementModel",
@@ -15,6 +15,7 @@ __all__ = [
     "ModelCard",
     "MotionModel",
     "MotionPrediction",
+    "NaiveModel",
     "VelocityModel",
     "load_model",
     "save_model",

@@ -16,9 +16,25 @@ VERSION = 1
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix = tuple[Row, Row, Row]
 Input = Literal["commands", "velocity", "gyro", "effort", "wheels"]
+Kind = Literal["naive", "lag", "arx", "velocity", "rate", "displacement", "gru"]
+Family = Literal["naive", "velocity", "displacement"]
+FAMILIES: dict[Kind, Family] = {
+    "naive": "naive",
+    "lag": "velocity",
+    "arx": "velocity",
+    "velocity": "velocity",
+    "rate": "velocity",
+    "displacement": "displacement",
+    "gru": "displacement",
+}
 CHANNELS: dict[str, int] = {"gyro": 1, "effort": 2, "wheels": 2}  # of the measured inputs, in the network's order
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(lt=1)]
+
+
+def _needs(kind: Kind) -> str:
+    lag = "no lag" if kind in ("naive", "rate") else "a lag"
+    return f"{lag} and the noise densities of its error"
 
 
 def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
@@ -103,15 +119,17 @@ class Split(Section):
 class ModelCard(Section):
     """Everything but the weights.
 
-    A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later; a ``displacement`` model maps the mean
-    commands of the age bins ``edges_s`` and whatever else ``inputs`` names (means of measured signals over the sub-step
-    and over ages before it, the velocity's innovation) to a residual twist on the best known kinematics and three
-    log-variances.
+    ``naive``: the robot does as it is told. A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later: a
+    first-order lag plus Δt times a network. ``lag`` has no network, ``arx`` a linear one, ``rate`` no lag: its network
+    is the acceleration. A ``displacement`` model maps the mean commands of the age bins ``edges_s`` and whatever else
+    ``inputs`` names (means of measured signals over the sub-step and over ages before it, the velocity's innovation) to
+    a residual twist on the best known kinematics and three log-variances; ``gru`` reads the bins one after the other
+    with a recurrent cell of ``hidden[0]`` units, oldest first.
     """
 
     format: Literal["fgloc-motion"] = "fgloc-motion"
     version: Literal[1] = 1
-    kind: Literal["velocity", "displacement"]
+    kind: Kind
     robot: str
     inputs: tuple[Input, ...]
     dt_s: Positive = Field(description="longest sub-step: a step is cut into equal parts no longer than this")
@@ -120,7 +138,7 @@ class ModelCard(Section):
     hold_s: Positive = Field(description="a command is believed to hold for this long when the next one is missing")
     history_s: Positive = Field(description="seconds of commands before a step that the model wants")
     kinematics: Kinematics = Kinematics()
-    lag: Lag | None = Field(None, description="velocity: the known part of the response")
+    lag: Lag | None = Field(None, description="lag, arx, velocity: the known part of the response")
     edges_s: tuple[FiniteFloat, ...] = Field((), description="displacement: limits of the age bins, youngest first")
     joints: WheelJoints | None = Field(None, description="the wheels, for the inputs effort and wheels")
     signal_edges_s: tuple[FiniteFloat, ...] = Field(
@@ -132,7 +150,7 @@ class ModelCard(Section):
     input_mean: tuple[FiniteFloat, ...]
     input_std: tuple[Positive, ...]
     output_scale: tuple[Positive, ...]
-    noise: NoiseDensity | None = Field(None, description="velocity: densities of the error")
+    noise: NoiseDensity | None = Field(None, description="all but displacement and gru: densities of the error")
     variance_scale: tuple[Positive, Positive, Positive] = Field(
         (1.0, 1.0, 1.0), description="displacement: calibration of the predicted variance densities"
     )
@@ -144,10 +162,15 @@ class ModelCard(Section):
     made_by: str = Field("", description="command and configuration that made the file")
 
     @property
+    def family(self) -> Family:
+        """What the model is like from outside."""
+        return FAMILIES[self.kind]
+
+    @property
     def n_inputs(self) -> int:
-        """Width of the network's input that this card implies."""
-        if self.kind == "velocity":
-            return 5
+        """Width of the network's input that this card implies; 0 if there is no network."""
+        if self.family != "displacement":
+            return 0 if self.kind in ("naive", "lag") else 5
         measured = len(self.signal_edges_s) * sum(CHANNELS[name] for name in self.measured)
         return 2 * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
 
@@ -164,28 +187,34 @@ class ModelCard(Section):
     @property
     def n_outputs(self) -> int:
         """Width of the network's output."""
-        return 2 if self.kind == "velocity" else 6
+        if self.family != "displacement":
+            return 0 if self.kind in ("naive", "lag") else 2
+        return 6
 
     @model_validator(mode="after")
     def _fits_together(self) -> ModelCard:
-        needed = {"velocity": {"commands", "velocity"}, "displacement": {"commands"}}[self.kind]
+        needed = {"commands", "velocity"} if self.family == "velocity" else {"commands"}
         if missing := needed - set(self.inputs):
             raise ValueError(f"a {self.kind} model needs the inputs {sorted(needed)}, the card lacks {sorted(missing)}")
-        if self.kind == "displacement":
+        if (self.kind in ("naive", "lag", "arx")) == bool(self.hidden):
+            raise ValueError(
+                f"hidden is {self.hidden}; naive, lag and arx models have no hidden layer, others have one"
+            )
+        if self.family == "displacement":
             _increasing(self.edges_s)
             if self.signal_edges_s[:1] != (0.0,) or any(b <= a for a, b in pairwise(self.signal_edges_s)):
                 raise ValueError(f"signal_edges_s: expected ages that increase from 0, got {self.signal_edges_s}")
-        elif self.members > 1:
-            raise ValueError(f"a velocity model has one network, the card says {self.members}")
-        elif self.noise is None or self.lag is None:
-            raise ValueError("a velocity model needs a lag and the noise densities of its error; the card lacks one")
+        elif self.noise is None or (self.lag is None) != (self.kind in ("naive", "rate")):
+            raise ValueError(f"a {self.kind} model needs {_needs(self.kind)}; the card does not fit")
+        if self.members > 1 and self.kind != "displacement":
+            raise ValueError(f"a {self.kind} model has one network, the card says {self.members}")
         if self.joints is None and {"effort", "wheels"} & set(self.inputs):
             raise ValueError("the inputs effort and wheels need the card's joints; it names none")
         if self.reads_wheels and (self.joints is None or not self.joints.measured):
             raise ValueError("the input wheels needs left_radius, right_radius and track of the card's joints")
-        if self.kind == "velocity" and self.measured:
-            raise ValueError(f"a velocity model reads commands and velocity, not {', '.join(self.measured)}")
-        n_scales = {"velocity": 2, "displacement": 3}[self.kind]
+        if self.family != "displacement" and self.measured:
+            raise ValueError(f"a {self.kind} model reads commands and velocity, not {', '.join(self.measured)}")
+        n_scales = self.n_outputs if self.family != "displacement" else 3
         for name, values, wanted in (
             ("input_mean", self.input_mean, self.n_inputs),
             ("input_std", self.input_std, self.n_inputs),

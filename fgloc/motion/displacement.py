@@ -10,7 +10,7 @@ from fgloc.errors import ModelError
 from fgloc.motion.card import Kinematics, ModelCard
 from fgloc.motion.commands import CommandTrack
 from fgloc.motion.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
-from fgloc.motion.network import Float32Array, Network
+from fgloc.motion.network import Answering, Float32Array
 from fgloc.motion.signals import Signal, Signals
 from fgloc.types import CommandEvent, FloatArray
 
@@ -32,7 +32,7 @@ class DisplacementModel:
     Source: design.md §5.
     """
 
-    def __init__(self, card: ModelCard, network: Network) -> None:
+    def __init__(self, card: ModelCard, network: Answering) -> None:
         """Take a checked card and its network, which knows the card's scales of the outputs."""
         self.card = card
         self.joint = joint_of(card)

@@ -16,9 +16,11 @@ from fgloc.errors import CovarianceError, ModelError
 from fgloc.motion.card import FORMAT, VERSION, ModelCard
 from fgloc.motion.displacement import DisplacementModel
 from fgloc.motion.forms import MotionModel
-from fgloc.motion.network import Network
-from fgloc.motion.velocity import VelocityModel
+from fgloc.motion.network import Answering, Network
+from fgloc.motion.recurrent import Cell, RecurrentNetwork
+from fgloc.motion.velocity import NaiveModel, VelocityModel
 
+_CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _MAX_BYTES = 64 << 20
 _REMEDY = "export it again with python -m training.train"
 Tensors = dict[str, NDArray[np.float32]]
@@ -31,15 +33,18 @@ def load_model(path: Path) -> MotionModel:
         ModelError: the file is missing, is not safetensors (a pickle, say), is damaged, is of another kind or version,
             or its card, shapes or numbers do not fit; both sides are named.
     """
-    tensors, card = read_model(path)
-    layers = _layers(tensors, card, path)
-    scale = offset = None
-    if card.kind == "displacement":
-        scale = np.array([*card.output_scale, 1.0, 1.0, 1.0])
-        offset = np.array([0.0, 0.0, 0.0, *np.log(card.variance_scale)])
-    network = Network(layers, np.array(card.input_mean), np.array(card.input_std), scale, offset)
+    return model_of(*read_model(path), path)
+
+
+def model_of(tensors: Tensors, card: ModelCard, path: Path = Path("model")) -> MotionModel:
+    """The model of weights and card; errors as in `load_model`, which name ``path``."""
+    _check(tensors, card, path)
     try:
-        return VelocityModel(card, network) if card.kind == "velocity" else DisplacementModel(card, network)
+        if card.family == "naive":
+            return NaiveModel(card)
+        if card.family == "displacement":
+            return DisplacementModel(card, _network(tensors, card))
+        return VelocityModel(card, None if card.kind == "lag" else _network(tensors, card))
     except CovarianceError as error:
         raise ModelError(f"{path}: its joint calibration cannot be used: {error}; {_REMEDY}") from error
 
@@ -97,13 +102,44 @@ def _card(metadata: dict[str, str], path: Path) -> ModelCard:
         raise ModelError(f"{path}: its card does not fit: {lines}; {_REMEDY}") from error
 
 
-def _layers(tensors: Tensors, card: ModelCard, path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    widths = [card.n_inputs, *card.hidden, card.n_outputs]
+def _network(tensors: Tensors, card: ModelCard) -> Answering:
+    """The network with its normalization; the outputs of a displacement model come out scaled."""
+    layers = [(tensors[f"layer{i}.weight"], tensors[f"layer{i}.bias"]) for i in range(len(_widths(card)) - 1)]
+    mean, std = np.array(card.input_mean), np.array(card.input_std)
+    if card.family == "velocity":
+        return Network(layers, mean, std)
+    scale = np.array([*card.output_scale, 1.0, 1.0, 1.0])
+    offset = np.array([0.0, 0.0, 0.0, *np.log(card.variance_scale)])
+    if card.kind == "displacement":
+        return Network(layers, mean, std, scale, offset)
+    width = _widths(card)[0]
+    head = Network(layers, np.zeros(width), np.ones(width), scale, offset)
+    cell = Cell(*(tensors[f"gru.{name}"] for name in _CELL))
+    return RecurrentNetwork(cell, head, len(card.edges_s) - 1, mean, std)
+
+
+def _widths(card: ModelCard) -> list[int]:
+    """Of the layers, from input to output."""
+    if card.kind in ("naive", "lag"):
+        return []
+    if card.kind == "gru":
+        return [card.hidden[0] + card.n_inputs - 2 * (len(card.edges_s) - 1), *card.hidden[1:], card.n_outputs]
+    return [card.n_inputs, *card.hidden, card.n_outputs]
+
+
+def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
+    """Refuse weights that are not those of the card's network."""
     expected: dict[str, tuple[int, ...]] = {}
     stack = (card.members,) if card.members > 1 else ()
-    for i, (n_in, n_out) in enumerate(pairwise(widths)):
+    for i, (n_in, n_out) in enumerate(pairwise(_widths(card))):
         expected[f"layer{i}.weight"] = (*stack, n_out, n_in)
         expected[f"layer{i}.bias"] = (*stack, n_out)
+    if card.kind == "gru":
+        h = card.hidden[0]
+        expected |= {
+            f"gru.{name}": shape
+            for name, shape in zip(_CELL, ((3 * h, 2), (3 * h, h), (3 * h,), (3 * h,)), strict=True)
+        }
     if set(tensors) != set(expected):
         raise ModelError(f"{path}: holds the tensors {sorted(tensors)}, its card needs {sorted(expected)}; {_REMEDY}")
     for name, shape in expected.items():
@@ -117,4 +153,3 @@ def _layers(tensors: Tensors, card: ModelCard, path: Path) -> list[tuple[NDArray
             raise ModelError(f"{path}: {name} is {tensor.dtype}, expected float32; {_REMEDY}")
         if not np.isfinite(tensor).all():
             raise ModelError(f"{path}: {name} holds NaN or infinite weights, expected finite ones; {_REMEDY}")
-    return [(tensors[f"layer{i}.weight"], tensors[f"layer{i}.bias"]) for i in range(len(widths) - 1)]

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 Float32Array = NDArray[np.float32]
+
+
+class Answering(Protocol):
+    """Any network: inputs ``(rows, in)`` to outputs ``(rows, out)``, or ``(members, rows, out)`` of an ensemble."""
+
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """Perhaps not finite; the next call overwrites the result."""
+        ...
 
 
 class Network:

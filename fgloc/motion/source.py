@@ -43,7 +43,7 @@ class LearnedMotion:
     def reads_velocity(self) -> bool:
         """Whether a better velocity changes the prediction: a model of commands alone does not look at it."""
         card = self.model.card
-        return card.kind == "velocity" or "velocity" in card.inputs
+        return "velocity" in card.inputs
 
     def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step.
