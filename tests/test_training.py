@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,13 +15,14 @@ from synthetic_robot import SECOND, sensing, synthetic, write_bag
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
 from fgloc.motion import load_model, save_model
-from fgloc.motion.card import Input, Split
+from fgloc.motion.card import Input, Kind, Split
 from fgloc.motion.load import read_model
 from training import evaluate as evaluation
 from training import optimize
 from training import train as training
 from training.checkpoint import Checkpoint, Checkpoints
 from training.config import (
+    AdaptationConfig,
     CalibrationConfig,
     NetworkConfig,
     OptimizationConfig,
@@ -44,8 +46,11 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "displacement"])
-@pytest.mark.parametrize("inputs", [("commands",), ("commands", "velocity")])
+@pytest.mark.parametrize(
+    ("kind", "inputs"),
+    [(kind, ("commands",)) for kind in get_args(Kind) if kind != "naive"]
+    + [(kind, ("commands", "velocity")) for kind in ("displacement", "gru")],
+)
 def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[str, Run], tmp_path: Path) -> None:
     torch.manual_seed(1)
     network = NetworkConfig(kind=kind, hidden=(32, 32), inputs=inputs, dt_s=0.1)
@@ -62,7 +67,7 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
     rolled = net.roll(samples, starts, 10).detach().numpy()
     for k, poses in zip(starts.tolist(), rolled, strict=True):
         start = run.origin_ns + round(k * run.dt_s * SECOND)
-        velocity = run.velocities[k, [0, 2]] if kind == "velocity" else None
+        velocity = run.velocities[k, [0, 2]] if model.card.family == "velocity" else None
         for steps in (1, 5, 10):
             got = model.predict(run.commands, start, start + steps * SECOND // 10, velocity)
             assert got is not None
@@ -263,6 +268,35 @@ def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert {row["source"] for row in rows} == {"commands", "calibrated commands", "model", "all"}
     assert evaluation.main([str(tmp_path / "config.yaml"), str(tmp_path / "run2" / "bag")]) == 1
     assert "not a sound safetensors file" in capsys.readouterr().err
+
+
+def test_model_is_adapted_to_another_robot_from_a_minute(runs: dict[str, Run], tmp_path: Path) -> None:
+    base = tiny_config("displacement", list(runs))
+    short = base.optimization.model_copy(update=dict(iterations=100, variance_iterations=20))
+    split = Split(train=("run0", "run1"), validation=("run2",))
+    path = tmp_path / "model.safetensors"
+    config = base.model_copy(update=dict(optimization=short, leave_one_out=False, split=split))
+    training.train(config, split, runs, path, "a test")
+    tensors, card = read_model(path)
+    other = card.kinematics.model_copy(
+        update={"scale_v": 1.04 * card.kinematics.scale_v, "yaw_per_m": card.kinematics.yaw_per_m + 0.04}
+    )
+    wrong = tmp_path / "other.safetensors"
+    save_model(wrong, tensors, card.model_copy(update={"kinematics": other}))
+    split = Split(train=("run3",), validation=("run4",))
+    loose = AdaptationConfig(scale_sigma=0.1, yaw_per_m_sigma=0.1)
+    config = config.model_copy(update=dict(split=split, robot="the other", adaptation=loose))
+    found = training.adapt(wrong, config, runs, tmp_path / "adapted.safetensors", "a test")
+    assert found == load_model(tmp_path / "adapted.safetensors").card
+    assert (found.robot, found.split) == ("the other", split)
+    assert abs(found.kinematics.yaw_per_m - card.kinematics.yaw_per_m) < 0.02
+
+    def drift(path: Path) -> float:
+        return evaluation.evaluate([roll_model(load_model(path), runs["run4"], 0.2)], 10.0).drift_percent
+
+    assert drift(tmp_path / "adapted.safetensors") < 0.9 * drift(wrong)
+    with pytest.raises(ConfigError, match="give one, not leave_one_out"):
+        training.adapt(wrong, base, runs, tmp_path / "never.safetensors", "a test")
 
 
 def test_controls_name_what_was_never_told(runs: dict[str, Run], tmp_path: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from fgloc.config import Section
 from fgloc.errors import ConfigError
-from fgloc.motion.card import Input, Split
+from fgloc.motion.card import Input, Kind, Split
 
 
 class DataConfig(Section):
@@ -34,8 +33,10 @@ class DataConfig(Section):
 class NetworkConfig(Section):
     """Form and size of the model."""
 
-    kind: Literal["velocity", "displacement"] = "displacement"
-    hidden: tuple[int, ...] = (128, 128)
+    kind: Kind = "displacement"
+    hidden: tuple[int, ...] = Field(
+        (128, 128), description="gru: units of the cell, then of layers; naive, lag, arx: unused"
+    )
     members: int = Field(1, ge=1, le=64, description="displacement: networks trained from different seeds and averaged")
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
@@ -53,9 +54,9 @@ class NetworkConfig(Section):
 
     @model_validator(mode="after")
     def _may_be_an_ensemble(self) -> NetworkConfig:
-        if self.kind == "velocity" and self.members > 1:
+        if self.kind != "displacement" and self.members > 1:
             raise ValueError(
-                f"a velocity model has one network, got members: {self.members}; take a displacement model"
+                f"a {self.kind} model has one network, got members: {self.members}; take a displacement model"
             )
         return self
 
@@ -100,6 +101,26 @@ class CalibrationConfig(Section):
     window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
 
 
+class AdaptationConfig(Section):
+    """How far a model moves towards another robot of its kind."""
+
+    scale_sigma: float = Field(0.02, gt=0, description="how much the gains of robots of a kind differ, relatively")
+    yaw_per_m_sigma: float = Field(0.02, gt=0, description="how much their pull to one side differs [rad/m]")
+    window_s: float = Field(5.0, gt=0, description="windows whose errors are compared with what the model expects")
+
+    after_training_s: float | None = Field(
+        None,
+        gt=0,
+        description="also fit gains and pull to windows of this length of the training recordings once the network is "
+        "trained: for a truth that is right only in the long run, as a smoothed one is",
+    )
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Of the gain of v, the gain of ω and the pull."""
+        return self.scale_sigma, self.scale_sigma, self.yaw_per_m_sigma
+
+
 class SpeedLimits(Section):
     """What the robot may be told, so that training can say what the recordings left out."""
 
@@ -125,6 +146,7 @@ class TrainConfig(Section):
     network: NetworkConfig = NetworkConfig()
     optimization: OptimizationConfig = OptimizationConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
 
     @model_validator(mode="after")
     def _one_split(self) -> TrainConfig:

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from fgloc.errors import FglocError, RecordingError
+from fgloc.errors import ConfigError, FglocError, RecordingError
 from fgloc.motion.card import Kinematics, ModelCard, Split
-from fgloc.motion.load import Tensors, load_model, read_model, save_model
+from fgloc.motion.load import Tensors, load_model, model_of, read_model, save_model
 from fgloc.motion.signals import Signal
+from training.adapt import adapted
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from training.checkpoint import Checkpoints, Curve
 from training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
@@ -27,7 +28,7 @@ from training.controls import controls, draw_controls
 from training.data import Run, load_run
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
-from training.models import DisplacementNet, MotionNet, VelocityNet
+from training.models import DisplacementNet, MotionNet, NaiveNet, VelocityNet
 from training.optimize import train_mean, train_variance
 from training.plots import draw_losses
 from training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
@@ -51,16 +52,41 @@ def train(
     """
     validation = [runs[name] for name in split.validation]
     tensors, card, curves = train_uncalibrated(config, split, runs, path, made_by, checkpoints)
-    draw_losses(path.with_name(f"{path.stem}.losses.png"), curves)
+    if curves:
+        draw_losses(path.with_name(f"{path.stem}.losses.png"), curves)
     if not validation:
         return card
     held_out = held_out_rollouts(path, card, validation)
     if config.calibration.cross:
         held_out += cross_rollouts(config, split, runs, path, made_by, checkpoints)
     card = calibrate(card, held_out, config.calibration)
+    if (window_s := config.adaptation.after_training_s) is not None:
+        card = adapted(tensors, card, [runs[name] for name in split.train], config.adaptation, window_s)
     tested = [runs[name] for name in split.test] or validation
     save_model(path, tensors, card)
     card = card.model_copy(update={"figures": card_figures([roll_model(load_model(path), r, STEP_S) for r in tested])})
+    save_model(path, tensors, card)
+    return card
+
+
+def adapt(start: Path, config: TrainConfig, runs: dict[str, Run], path: Path, made_by: str) -> ModelCard:
+    """Write a model that was made of other robots, fitted to this one on the training recordings of the split.
+
+    Its covariance stays that of a robot not seen. Figures are of the split's test recordings, or else its validation's.
+
+    Raises:
+        ConfigError: there is no split.
+        RecordingError: the recordings are too short.
+    """
+    if config.split is None:
+        raise ConfigError("a model is adapted to the training recordings of a split; give one, not leave_one_out")
+    tensors, card = read_model(start)
+    card = adapted(tensors, card, [runs[name] for name in config.split.train], config.adaptation)
+    tested = config.split.test or config.split.validation
+    rollouts = [roll_model(model_of(tensors, card), runs[name], STEP_S) for name in tested]
+    update = {"robot": config.robot, "split": config.split, "made_by": made_by, "figures": card_figures(rollouts)}
+    card = card.model_copy(update=update)
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_model(path, tensors, card)
     return card
 
@@ -114,7 +140,9 @@ def train_member(
     kept = {stage: checkpoints.of(config, split, runs, member, stage) for stage in ("mean", "variance")}
     torch.manual_seed(optimization.seed)
     net = new_net(config.network, training)
-    curves = {"mean": train_mean(net, training, validation, optimization, kept["mean"])}
+    curves = {}
+    if not isinstance(net, NaiveNet) and any(True for _ in net.parameters()):
+        curves["mean"] = train_mean(net, training, validation, optimization, kept["mean"])
     if isinstance(net, DisplacementNet):
         curves["variance"] = train_variance(net, training, validation, optimization, kept["variance"])
     return net, curves
@@ -122,11 +150,14 @@ def train_member(
 
 def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
     """An untrained network on top of what is known of these recordings' robot."""
+    if config.kind == "naive":
+        return NaiveNet(config)
     kinematics = fit_kinematics(training)
-    if config.kind == "displacement":
+    if config.kind in ("displacement", "gru"):
         wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
         return DisplacementNet(config, kinematics, wheel_kinematics, training)
-    return VelocityNet(config, kinematics, fit_lag(training, kinematics), training)
+    lag = None if config.kind == "rate" else fit_lag(training, kinematics)
+    return VelocityNet(config, kinematics, lag, training)
 
 
 def _wheels_of(run: Run) -> Signal:
@@ -141,7 +172,7 @@ def _wheels_of(run: Run) -> Signal:
 def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: CalibrationConfig) -> ModelCard:
     """The card with covariances that hold on these rollouts, and their correlation with the wheels' stand-in."""
     rollouts, wheels = [learned for learned, _ in held_out], [kinematics for _, kinematics in held_out]
-    if card.kind == "velocity":
+    if card.family != "displacement":
         noise = fit_noise(rollouts, config)
         card = card.model_copy(update={"noise": noise})
         rollouts = [replace(r, covs=noise_covs(r, noise)) for r in rollouts]
@@ -201,6 +232,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("config", type=Path)
     parser.add_argument("--data", type=Path, default=Path(), help="folder that the recordings' paths are relative to")
     parser.add_argument("--out", type=Path, required=True, help="folder for the models")
+    parser.add_argument(
+        "--from",
+        dest="start",
+        type=Path,
+        metavar="MODEL",
+        help="adapt this model to the robot of the split's training recordings, a minute of which will do",
+    )
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
@@ -212,6 +250,10 @@ def main(arguments: list[str] | None = None) -> int:
             name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data, smoothed.get(name))
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
+        if options.start is not None:
+            path = options.out / "model.safetensors"
+            _report(path.stem, adapt(options.start, config, runs, path, f"{made_by}; from {options.start.name}"))
+            return 0
         trained = list(runs) if config.split is None else config.split.train
         _report_controls([runs[name] for name in trained], config, options.out)
         checkpoints = Checkpoints(options.out / ".checkpoints")
