@@ -37,6 +37,8 @@ def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tup
     """
     localizer, config = parts.localizer, parts.config
     solver = BatchSmoother(localizer.estimator.log, localizer.factors, config.batch, config.estimator.gate_probability)
+    if config.batch.robust == "gnc" and solver.outliers:
+        solver.replace_motions(_without(parts, solver))
     if parts.learned is not None and parts.learned.reads_velocity:
         for _ in range(config.batch.outer_iterations - 1):
             solver.replace_motions(_measure_again(parts, solver))
@@ -61,6 +63,17 @@ def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tup
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
     return estimates, landmarks, tuple(notes)
+
+
+def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:
+    """Motions of the keyframes with outliers, made as if these sources had been switched off online."""
+    changed = {}
+    for frame in solver.frames:
+        if frame.k in solver.outliers:
+            frame.off |= solver.outliers[frame.k]
+            if motions := parts.localizer.sources.combine(frame.readings, frame.off):
+                changed[frame.k] = tuple(motions)
+    return changed
 
 
 def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

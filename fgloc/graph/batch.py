@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import gtsam
@@ -16,6 +16,7 @@ from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
+from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
 from fgloc.graph.log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.weights import chi2_bound
 from fgloc.types import (
@@ -49,7 +50,13 @@ class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
     The first solution holds every sighting, also those the online gate refused, under its robust kernel; then those
-    that the smoothed trajectory finds less likely than ``1 - gate_probability`` are left out.
+    that the smoothed trajectory finds less likely than ``1 - gate_probability`` are left out. With ``config.robust``
+    graduated non-convexity decides instead, over sightings and motions at once.
+
+    Attributes:
+        frames: the keyframes.
+        believed: the sightings in the graph, by keyframe.
+        outliers: motion sources that are not believed, by keyframe; their factors say next to nothing.
     """
 
     def __init__(
@@ -65,23 +72,63 @@ class BatchSmoother:
             raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
         self._factors = factors
         self._config = config
-        self.believed = {
+        self.believed: dict[int, tuple[Sighting, ...]] = {}
+        self.outliers: dict[int, frozenset[str]] = {}
+        seen = {
             frame.k: tuple(s for s in (*frame.sightings, *frame.refused) if self._in_front(s, frame.belief.pose))
             for frame in self.frames
         }
-        self._values = _initial(self.frames, self.believed, factors)
         try:
-            self._graph = self._optimize()
+            self._begin(seen, gate_probability)
         except RuntimeError:  # a trial step took the camera past a marker that the online gate had refused, rightly
-            self.believed = {frame.k: frame.sightings for frame in self.frames}
-            self._values = _initial(self.frames, self.believed, factors)
-            self._graph = self._optimize()
-        bound = gate_probability
-        self.believed = {
-            k: tuple(s for s in sightings if _nis(s, self._values) <= chi2_bound(bound, _dof(s)))
-            for k, sightings in self.believed.items()
-        }
+            self._begin({frame.k: frame.sightings for frame in self.frames}, gate_probability)
+
+    def _begin(self, sightings: dict[int, tuple[Sighting, ...]], probability: float) -> None:
+        """Solve with all of these, decide which of them are believed, and solve again."""
+        self.believed = sightings
+        self._values = _initial(self.frames, self.believed, self._factors)
         self._graph = self._optimize()
+        if self._config.robust == "none":
+            self.believed = {
+                k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(probability, _dof(s)))
+                for k, held in self.believed.items()
+            }
+        else:
+            self._graduate(probability)
+        self._graph = self._optimize()
+
+    def _graduate(self, probability: float) -> None:
+        """Decide by graduated non-convexity which sightings and motions are believed.
+
+        The online estimator's own doubts stay: a source that it switched off is not in the log's motions.
+        """
+        sources = None if self._config.robust == "gnc_all" else {"wheels"}  # None: all
+        inliers = gtsam.NonlinearFactorGraph()
+        motions: list[tuple[int, str]] = []
+        sightings: list[tuple[int, Sighting]] = []
+        candidates: list[Candidate] = []
+        for frame in self.frames:
+            if frame.prior is not None:
+                inliers.add(prior_factor(frame.k, frame.prior.pose, frame.prior.cov))
+            for m in frame.motions:
+                if sources is not None and m.source not in sources:
+                    inliers.add(motion_factor(frame.k, m))
+                    continue
+                motions.append((frame.k, m.source))
+                candidates.append(Candidate((motion_factor(frame.k, m),), chi2_bound(probability, 3)))
+        for k, held in self.believed.items():
+            for sighting in held:
+                factors = tuple(self._factors.make(k, sighting.measurement, None))
+                sightings.append((k, sighting))
+                candidates.append(Candidate(factors, chi2_bound(probability, _dof(sighting))))
+        weights, self._values = graduate(inliers, candidates, self._values, self._solve)
+        trusted = (weights >= 0.5).tolist()
+        doubted = [key for key, good in zip(motions, trusted, strict=False) if not good]
+        self.outliers = {k: frozenset(s for key, s in doubted if key == k) for k, _ in doubted}
+        self.believed = {frame.k: () for frame in self.frames}
+        for (k, sighting), good in zip(sightings, trusted[len(motions) :], strict=True):
+            if good:
+                self.believed[k] = (*self.believed[k], sighting)
 
     def _in_front(self, sighting: Sighting, pose: FloatArray) -> bool:
         m = sighting.measurement
@@ -99,6 +146,7 @@ class BatchSmoother:
         """Take other motion measurements for these keyframes, and solve again from the last solution."""
         for frame in self.frames:
             frame.motions = motions.get(frame.k, frame.motions)
+        self.outliers = {k: held for k, held in self.outliers.items() if k not in motions}
         self._graph = self._optimize()
 
     def replace_sightings(self, change: Callable[[LandmarkMeasurement], LandmarkMeasurement]) -> None:
@@ -133,17 +181,19 @@ class BatchSmoother:
         )
 
     def _optimize(self) -> gtsam.NonlinearFactorGraph:
-        graph = _graph(self.frames, self.believed)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(self._config.max_iterations)
-        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
-        params.setRelativeErrorTol(1e-7)
-        values = _without_orphans(self._values, graph)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        graph = _graph(self.frames, self.believed, self.outliers)
+        values = self._solve(graph, _without_orphans(self._values, graph))
         if not np.isfinite(graph.error(values)):
             raise EstimatorError("the batch optimum is not finite; look at steps.csv for the sighting that broke it")
         self._values = values
         return graph
+
+    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(self._config.max_iterations)
+        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
+        params.setRelativeErrorTol(1e-7)
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
 def _with_deep_stack(work: Callable[[], _T]) -> _T:
@@ -170,12 +220,16 @@ def _dof(sighting: Sighting) -> int:
     return sum(factor.dim() for factor in sighting.factors)
 
 
-def _graph(frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]]) -> gtsam.NonlinearFactorGraph:
+def _graph(
+    frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]], outliers: Mapping[int, frozenset[str]]
+) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for frame in frames:
         if frame.prior is not None:
             graph.add(prior_factor(frame.k, frame.prior.pose, frame.prior.cov))
         for motion in frame.motions:
+            if motion.source in outliers.get(frame.k, ()):
+                motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
             graph.add(motion_factor(frame.k, motion))
         for sighting in believed[frame.k]:
             for factor in sighting.factors:
