@@ -21,7 +21,6 @@ from pydantic import TypeAdapter
 from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
 from benchmarks.adaptive_scores import Figures, lost, score
 from fgloc.ablation.failures import AnyFailure, Failure, Scene, generators, spoil
-from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
@@ -167,8 +166,7 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
         ),
         modes=tuple(e.mode for e in estimates),
     )
-    kidnapped = [failure.when.intervals[0][0] for failure in chain if isinstance(failure, Kidnap)]
-    return score(recorded, seed, config, online, result if batch else None, kidnapped[0] if kidnapped else None, given)
+    return score(recorded, seed, config, online, result if batch else None, chain, given)
 
 
 def changed(config: Config, changes: Changes) -> Config:

@@ -11,6 +11,9 @@ import numpy as np
 
 from benchmarks.adaptive_recordings import Recorded, slip_intervals
 from fgloc import se2
+from fgloc.ablation.failures import Failure
+from fgloc.ablation.failures.kidnap import Kidnap
+from fgloc.ablation.failures.sightings import MovedMarker
 from fgloc.config import Config
 from fgloc.evaluation.metrics import Metrics, compute_metrics
 from fgloc.types import CornersEvent, Decision, Event, FloatArray, Mode, RunResult
@@ -55,6 +58,7 @@ class Figures:
     batch_nees_over_3: float
     step_ms: FloatArray  # of the steps after the first pose
     named: frozenset[int]  # markers that the run says do not stand where the map has them
+    moved: frozenset[int]  # those that do not
     slips: Slips | None
     found_again_s: float | None  # of a kidnapped robot
     rejections: Mapping[str, int]
@@ -63,7 +67,7 @@ class Figures:
 def lost(seed: int) -> Figures:
     """Figures of a run that never found its first pose."""
     inf = float("inf")
-    return Figures(seed, inf, inf, inf, inf, inf, np.zeros(0), frozenset(), None, None, {})
+    return Figures(seed, inf, inf, inf, inf, inf, np.zeros(0), frozenset(), frozenset(), None, None, {})
 
 
 def score(
@@ -72,7 +76,7 @@ def score(
     config: Config,
     online: RunResult,
     batch: RunResult | None,
-    kidnapped_s: float | None,
+    chain: Sequence[Failure],
     events: Sequence[Event],
 ) -> Figures:
     """Figures of a run.
@@ -83,9 +87,10 @@ def score(
         config: of the run.
         online: the estimates as they were made, with all decisions.
         batch: the smoothed run, if there is one.
-        kidnapped_s: when the robot was carried away [s from the recording's first message]; None: never.
+        chain: the failures.
         events: that the localizer was given; only the sightings are looked at.
     """
+    kidnapped = [failure.when.intervals[0][0] for failure in chain if isinstance(failure, Kidnap)]
     metrics = compute_metrics(online, config)
     smoothed = compute_metrics(batch, config) if batch is not None else None
     return Figures(
@@ -97,8 +102,9 @@ def score(
         batch_nees_over_3=_batch(smoothed, "nees_over_3"),
         step_ms=online.step_ms[len(online.step_ms) - len(online.trajectory) + 1 :],
         named=frozenset(int(i) for note in online.notes for i in _NAMED.findall(note)),
+        moved=frozenset(i for failure in chain if isinstance(failure, MovedMarker) for i in failure.ids),
         slips=slips(recorded, online),
-        found_again_s=None if kidnapped_s is None else found_again(recorded, online, kidnapped_s, events),
+        found_again_s=found_again(recorded, online, kidnapped[0], events) if kidnapped else None,
         rejections=online.rejections,
     )
 
