@@ -201,6 +201,18 @@ def test_losses_are_least_at_the_truth() -> None:
     assert min(losses, key=losses.__getitem__) == 0.3
 
 
+@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
+def test_beta_lets_unsure_windows_pull_as_hard(beta: float) -> None:
+    eye = torch.eye(3).expand(2, 1, 3, 3)
+    log_density = (2 * torch.log(torch.tensor([0.01, 1.0]))).reshape(2, 1, 1).expand(2, 1, 3)
+    error = (2.0 * torch.tensor([[0.01], [1.0]]).expand(2, 3)).clone().requires_grad_(True)
+    composed_nll(error, eye, log_density, 1.0, beta).backward()
+    sure, unsure = error.grad[:, 0].tolist()
+    assert sure / unsure == pytest.approx(100.0 ** (1.0 - 2.0 * beta), rel=1e-3)
+    at_best = [float(composed_nll(error.detach(), eye, log_density + shift, 1.0, beta)) for shift in (1.0, 1.386, 1.8)]
+    assert np.argmin(at_best) == 1  # the scale that fits is the same for every beta
+
+
 # --- calibration ------------------------------------------------------------------------------------------------------
 
 

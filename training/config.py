@@ -82,6 +82,9 @@ class OptimizationConfig(Section):
         gt=0,
         description="the same rollouts in pieces of this length count as much: they show which steps are sure",
     )
+    nll_beta: float = Field(
+        0.0, ge=0, le=1, description="β of the β-NLL: 0 is the likelihood, 1 gives sure and unsure windows equal weight"
+    )
     variance_iterations: int = Field(500, ge=0)
 
 

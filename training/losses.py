@@ -29,7 +29,7 @@ def rollout_loss(predicted: Tensor, truth: Tensor, dt_s: float, config: Optimiza
     return (torch.sqrt(position + yaw + 1e-4) / torch.sqrt(times)).mean()
 
 
-def composed_nll(error: Tensor, adjoints: Tensor, log_density: Tensor, dt_s: float) -> Tensor:
+def composed_nll(error: Tensor, adjoints: Tensor, log_density: Tensor, dt_s: float, beta: float = 0.0) -> Tensor:
     """Negative log-likelihood of the errors at the ends of windows, their covariance composed from each step's.
 
     Args:
@@ -37,13 +37,22 @@ def composed_nll(error: Tensor, adjoints: Tensor, log_density: Tensor, dt_s: flo
         adjoints: ``(b, n, 3, 3)`` that carry each step's perturbation to the end.
         log_density: ``(b, n, 3)`` log-variances per second.
         dt_s: time step.
+        beta: each window weighs as its variance to this power: 0 is the likelihood, towards 1 windows that are known
+            well count no more than the others.
+
+    Source: Seitzer et al., "On the pitfalls of heteroscedastic uncertainty estimation with probabilistic neural
+    networks", ICLR 2022, eq. 5 (β-NLL).
     """
     variances = torch.exp(log_density) * dt_s
     cov = torch.einsum("bnij,bnj,bnkj->bik", adjoints, variances, adjoints)
     root = torch.linalg.cholesky(cov)
     white = torch.linalg.solve_triangular(root, error[..., None], upper=False)[..., 0]
     log_root = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(dim=-1)
-    return (0.5 * white.square().sum(dim=-1) + log_root).mean()
+    losses = 0.5 * white.square().sum(dim=-1) + log_root
+    if beta == 0.0:
+        return losses.mean()
+    weights = torch.softmax(beta * 2.0 / error.shape[-1] * log_root.detach(), dim=0)
+    return (weights * losses).sum()
 
 
 def end_errors(poses: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:

@@ -168,7 +168,7 @@ def train_variance(
             poses = torch.cat([torch.zeros(len(chosen), 1, 3), net.roll(on, chosen, steps)], dim=1)
             truth = on.poses[chosen[:, None] + torch.arange(steps + 1)]
         log_density = net.variance_head(hidden)
-        return sum(_nll_of_pieces(poses, truth, log_density, length, on.dt_s) for length in lengths)
+        return sum(_nll_of_pieces(poses, truth, log_density, length, on.dt_s, config.nll_beta) for length in lengths)
 
     def loss_of_batch(rng: torch.Generator) -> Tensor:
         return loss_of(samples, starts[torch.randint(len(starts), (config.batch,), generator=rng)])
@@ -182,14 +182,14 @@ def train_variance(
     return descend(plan, net.variance_head, loss_of_batch, judge, config.seed, checkpoint or Checkpoint())
 
 
-def _nll_of_pieces(poses: Tensor, truth: Tensor, log_density: Tensor, length: int, dt_s: float) -> Tensor:
+def _nll_of_pieces(poses: Tensor, truth: Tensor, log_density: Tensor, length: int, dt_s: float, beta: float) -> Tensor:
     """`composed_nll` of windows ``(b, n + 1, 3)`` cut into pieces of ``length`` steps."""
     firsts = torch.arange(0, log_density.shape[1], length)
     rows = firsts[:, None] + torch.arange(length + 1)
     told, actual = (whole[:, rows].flatten(0, 1) for whole in (poses, truth))
     with torch.no_grad():
         error, adjoints = end_errors(relative(told[:, :1], told[:, 1:]), actual)
-    return composed_nll(error, adjoints, log_density.reshape(-1, length, 3), dt_s)
+    return composed_nll(error, adjoints, log_density.reshape(-1, length, 3), dt_s, beta)
 
 
 def window_starts(runs: list[Run], steps: int, stride: int = 1) -> Tensor:
