@@ -4,18 +4,18 @@ Simulated recordings of the suite's scenarios (see `benchmarks.adaptive_recordin
 MRCLAM 6 with failures injected. Of one case are run, on the same events: ours; *fixed*, the same graph with constant
 covariances, tuned on training recordings (`benchmarks.adaptive_fixed`); *nominal*, the same with the covariances of
 ``robot.yaml``; the *oracle*, which is fixed but told when the wheels are wrong; and the peers: kernels on the wheels'
-factors and an extended Kalman filter online, GNC on every factor in batch. Values are ratios of means over the seeds, spreads
-the standard deviation of the ratios of single runs. ATE is the mean distance from the truth, online where not said
-otherwise. Settings are chosen on the training and validation splits; the rows are of the test split.
+factors and an extended Kalman filter online, GNC on every factor in batch. Values are ratios of means over the seeds,
+spreads the standard deviation of the ratios of single runs. ATE is the mean distance from the truth, online where not
+said otherwise. Settings are chosen on the training and validation splits; the rows are of the test split.
 
 The detector's delay is that of the slips it found; a slip is what the simulator says to slip for 0.1 s or more.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import product
@@ -23,13 +23,16 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
+from benchmarks import adaptive_mrclam
 from benchmarks.adaptive_fixed import constant
 from benchmarks.adaptive_recordings import SEEDS, Split, prepare
 from benchmarks.adaptive_runs import CASES, cell
-from benchmarks.adaptive_scores import Figures, Slips
+from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
 from datasets.sim.camera import RenderError
+from fgloc.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,39 +58,44 @@ VARIANTS: dict[str, Variant] = {
     "gnc": Variant(NOMINAL | {"batch": {"robust": "gnc_all"}}, batch=True),
 }
 PEERS = ("huber", "cauchy", "dcs", "ekf")
-Found = dict[tuple[str, str], list[Figures]]
+QUICK_CASES, QUICK_VARIANTS = ("slip", "dark30"), ("ours", "fixed", "oracle")
+_LEFT_OUT = "left out of a quick run"
+Key = tuple[str, str]
+Found = dict[Key, list[Figures]]
 """Figures of each seed, by case and variant."""
 
 
 def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
-    """All rows."""
+    """All rows; a quick run has one seed and two cases."""
+    cases, variants = (QUICK_CASES, QUICK_VARIANTS) if quick else (tuple(CASES), tuple(VARIANTS))
     seeds = SEEDS[split][:1] if quick else SEEDS[split]
     try:
-        prepare(sorted({case.floor for case in CASES.values()}), split, seeds)
+        prepare(sorted({CASES[name].floor for name in cases}), split, seeds)
+        found = run_all(cases, variants, seeds, split)
     except RenderError as error:
         yield from not_run([f"{name}.nees_over_3" for name in CASES], str(error))
-        return
-    found = run_all(CASES, VARIANTS, seeds, split)
-    yield from rows(found)
+    else:
+        yield from rows(found)
+    yield from adaptive_mrclam.measure(quick)
 
 
-def run_all(cases: Iterable[str], variants: Iterable[str], seeds: Sequence[int], split: Split) -> Found:
+def run_all(cases: Sequence[str], variants: Sequence[str], seeds: Sequence[int], split: Split) -> Found:
     """Every case with every variant, one process per core; a process keeps to one floor and seed at a time."""
-    floors = {CASES[name].floor for name in cases}
-    groups = [
-        (seed, [n for n in cases if CASES[n].floor == floor], list(variants), split)
-        for seed, floor in product(seeds, floors)
-    ]
-    workers = min(os.cpu_count() or 1, len(groups))
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    floors = sorted({CASES[name].floor for name in cases})
+    groups = list(product(seeds, floors))
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(groups)), get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(_run_group, seed, [n for n in cases if CASES[n].floor == floor], variants, split)
+            for seed, floor in groups
+        ]
         found: Found = {}
-        for part in pool.map(_run_group, *zip(*groups, strict=True)):
-            for key, figures in part.items():
+        for job in tqdm(jobs, unit="recording", disable=None):
+            for key, figures in job.result().items():
                 found.setdefault(key, []).append(figures)
     return found
 
 
-def _run_group(seed: int, cases: list[str], variants: list[str], split: Split) -> dict[tuple[str, str], Figures]:
+def _run_group(seed: int, cases: Sequence[str], variants: Sequence[str], split: Split) -> dict[Key, Figures]:
     out = {}
     for name, label in product(cases, variants):
         variant = VARIANTS[label]
@@ -98,43 +106,45 @@ def _run_group(seed: int, cases: list[str], variants: list[str], split: Split) -
 
 def rows(found: Found) -> Iterator[Row]:
     """The table."""
-    yield _ratio("none.over_fixed", found["none", "ours"], found["none", "fixed"])
+    yield _over(found, "none.over_fixed", "none", "fixed")
     for name in ("slip", "mu01"):
-        yield _ratio(f"{name}.over_oracle", found[name, "ours"], found[name, "oracle"])
-        yield _ratio(f"{name}.over_fixed", found[name, "ours"], found[name, "fixed"])
-        yield _ratio(f"{name}.over_nominal", found[name, "ours"], found[name, "nominal"])
-    for name in ("dark30", "dark60"):
-        yield _ratio(f"{name}.over_oracle", found[name, "ours"], found[name, "oracle"])
-        yield _ratio(f"{name}.over_fixed", found[name, "ours"], found[name, "fixed"])
+        for peer in ("oracle", "fixed", "nominal"):
+            yield _over(found, f"{name}.over_{peer}", name, peer)
+    for name, peer in product(("dark30", "dark60"), ("oracle", "fixed")):
+        yield _over(found, f"{name}.over_{peer}", name, peer)
     for name in ("ids10", "ids30", "ids50", "moved"):
-        yield _ratio(f"{name}.over_none", found[name, "ours"], found["none", "ours"])
-    named = [f.named == f.moved for f in found["moved", "ours"]]
-    yield Row("moved.named", float(np.mean(named)), n=len(named))
+        yield _ratio(f"{name}.over_none", found.get((name, "ours")), found.get(("none", "ours")))
+    yield _row("moved.named", found.get(("moved", "ours")), lambda f: float(f.named == f.moved))
     for name in ("frozen", "onewheel"):
-        yield _ratio(f"{name}.over_oracle", found[name, "ours"], found[name, "oracle"])
-    yield _row("kidnap.seconds", [f.found_again_s or 0.0 for f in found["kidnap", "ours"]], "s")
-    yield from _detector([f.slips for name in ("none", "slip", "mu01") for f in found[name, "ours"] if f.slips])
+        yield _over(found, f"{name}.over_oracle", name, "oracle")
+    yield _row("kidnap.seconds", found.get(("kidnap", "ours")), lambda f: f.found_again_s or 0.0, "s")
+    yield from _detector([f for name in ("none", "slip", "mu01") for f in found.get((name, "ours"), [])])
     for name in CASES:
-        yield _row(f"{name}.ate_m", [f.ate_m for f in found[name, "ours"]], "m")
-        yield _row(f"{name}.nees_over_3", [f.nees_over_3 for f in found[name, "ours"]])
-        yield _row(f"{name}.batch_nees_over_3", [f.batch_nees_over_3 for f in found[name, "ours"]])
-        yield _ratio(f"batch.{name}.over_online", found[name, "ours"], found[name, "ours"], _batch)
-        yield _ratio(f"batch.{name}.over_fixed", found[name, "ours"], found[name, "fixed"], _batch, _batch)
+        ours = found.get((name, "ours"))
+        yield _row(f"{name}.ate_m", ours, _online, "m")
+        yield _row(f"{name}.nees_over_3", ours, lambda f: f.nees_over_3)
+        yield _row(f"{name}.batch_nees_over_3", ours, lambda f: f.batch_nees_over_3)
+        yield _ratio(f"batch.{name}.over_online", ours, ours, _batch)
+        yield _ratio(f"batch.{name}.over_fixed", ours, found.get((name, "fixed")), _batch, _batch)
     yield _cost(found)
     yield from _peers(found)
 
 
-def _detector(slips: Sequence[Slips]) -> Iterator[Row]:
+def _detector(figures: Sequence[Figures]) -> Iterator[Row]:
+    slips = [f.slips for f in figures if f.slips is not None]
     delays = [d for s in slips for d in s.delays_s]
-    sizes = [m for s in slips for m in s.found_m]
+    found = [m for s in slips for m in s.found_m]
     missed = [m for s in slips for m in s.missed_m]
-    yield Row(
-        "detector.delay_s", float(np.median(delays)) if delays else None, None, len(delays), "s", "no slip was found"
-    )
+    n = len(found) + len(missed)
+    if not delays:
+        yield from not_run([f"detector.{name}" for name in ("delay_s", "found", "smallest_m")], "no slip was found")
+    else:
+        yield Row("detector.delay_s", float(np.median(delays)), float(np.std(delays)), len(delays), "s")
+        yield Row("detector.found", len(found) / n, None, n)
+        yield Row("detector.smallest_m", smallest_found(found, missed), None, n, "m", "most are missed at any size")
     km = sum(s.path_m for s in slips) / 1000.0
-    yield Row("detector.false_per_km", sum(s.false_alarms for s in slips) / km, None, len(slips), "1/km")
-    yield Row("detector.found", len(sizes) / max(len(sizes) + len(missed), 1), None, len(sizes) + len(missed))
-    yield Row("detector.smallest_m", smallest_found(sizes, missed), None, len(sizes) + len(missed), "m")
+    if km:
+        yield Row("detector.false_per_km", sum(s.false_alarms for s in slips) / km, None, len(slips), "1/km")
 
 
 def smallest_found(found: Sequence[float], missed: Sequence[float], share: float = 0.9) -> float | None:
@@ -149,27 +159,27 @@ def smallest_found(found: Sequence[float], missed: Sequence[float], share: float
 
 
 def _cost(found: Found) -> Row:
-    """99th percentiles of a step; both variants of a run come one after the other in one process."""
-    ratios = []
+    """Ratio of the 99th percentiles of a step; both runs of a recording come one after the other in one process."""
+    pairs = []
     for name in ("none", "slip", "mu01"):
-        for ours, fixed in zip(found[name, "ours"], found[name, "fixed"], strict=True):
-            ratios.append(float(np.percentile(ours.step_ms, 99) / np.percentile(fixed.step_ms, 99)))
-    return _row("cost.step_ratio", ratios)
+        pairs += list(zip(found.get((name, "ours"), []), found.get((name, "fixed"), []), strict=True))
+    ratios = [float(np.percentile(ours.step_ms, 99) / np.percentile(fixed.step_ms, 99)) for ours, fixed in pairs]
+    return Row("cost.step_ratio", float(np.median(ratios)), float(np.std(ratios)), len(ratios))
 
 
 def _peers(found: Found) -> Iterator[Row]:
     """Ours over each peer, and over the best of them in the case where that is worst for us."""
-    worst = 0.0
+    worst: list[float] = []
     for name in CASES:
-        ratios = {}
-        for peer in PEERS:
-            row = _ratio(f"peers.{name}.over_{peer}", found[name, "ours"], found[name, peer])
-            ratios[peer] = row.value or 0.0
-            yield row
-        row = _ratio(f"peers.{name}.batch_over_gnc", found[name, "ours"], found[name, "gnc"], _batch, _batch)
-        yield row
-        worst = max(worst, *ratios.values(), row.value or 0.0)
-    yield Row("peers.best_ratio", worst, None, len(CASES))
+        ours = found.get((name, "ours"))
+        compared = [_over(found, f"peers.{name}.over_{peer}", name, peer) for peer in PEERS]
+        compared.append(_ratio(f"peers.{name}.batch_over_gnc", ours, found.get((name, "gnc")), _batch, _batch))
+        yield from compared
+        worst += [row.value for row in compared if row.value is not None]
+    if worst:
+        yield Row("peers.best_ratio", max(worst), None, len(worst))
+    else:
+        yield from not_run(["peers.best_ratio"], _LEFT_OUT)
 
 
 def _batch(figures: Figures) -> float:
@@ -180,28 +190,43 @@ def _online(figures: Figures) -> float:
     return figures.ate_m
 
 
+def _over(found: Found, row_id: str, name: str, peer: str) -> Row:
+    """Ours over a peer in the same case, online."""
+    return _ratio(row_id, found.get((name, "ours")), found.get((name, peer)))
+
+
 def _ratio(
     row_id: str,
-    ours: Sequence[Figures],
-    theirs: Sequence[Figures],
+    ours: Sequence[Figures] | None,
+    theirs: Sequence[Figures] | None,
     our_figure: Callable[[Figures], float] = _online,
     their_figure: Callable[[Figures], float] = _online,
 ) -> Row:
     """Ratio of the means over the seeds; the spread is that of the single ratios."""
+    if ours is None or theirs is None:
+        return Row(row_id, None, n=0, reason=_LEFT_OUT)
     a, b = np.array([our_figure(f) for f in ours]), np.array([their_figure(f) for f in theirs])
-    lost = int(np.sum(~np.isfinite(a)))
-    if lost:
-        return Row(row_id, None, n=len(a), reason=f"in {lost} of {len(a)} runs no pose was ever found")
-    return Row(row_id, float(a.mean() / b.mean()), float(np.std(a / b)), len(a))
+    if not np.isfinite(a).all():
+        return Row(row_id, None, n=len(a), reason=_never_found(a))
+    with np.errstate(invalid="ignore"):
+        return Row(row_id, float(a.mean() / b.mean()), float(np.std(a / b)), len(a))
 
 
-def _row(row_id: str, values: Sequence[float], unit: str = "") -> Row:
-    lost = int(np.sum(~np.isfinite(values)))
-    if lost:
-        return Row(row_id, None, n=len(values), reason=f"in {lost} of {len(values)} runs no pose was ever found")
+def _row(row_id: str, figures: Sequence[Figures] | None, figure: Callable[[Figures], float], unit: str = "") -> Row:
+    if figures is None:
+        return Row(row_id, None, n=0, reason=_LEFT_OUT)
+    values = [figure(f) for f in figures]
+    if not np.isfinite(values).all():
+        return Row(row_id, None, n=len(values), reason=_never_found(values))
     return Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
 
 
+def _never_found(values: Sequence[float] | FloatArray) -> str:
+    return f"in {int(np.sum(~np.isfinite(values)))} of {len(values)} runs no pose was ever found"
+
+
 if __name__ == "__main__":
-    chosen: list[Split] = ["validation" if "validation" in sys.argv else "test"]
-    main(lambda quick: measure(quick, chosen[0]), __doc__ or "")
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--split", choices=("validation", "test"), default="test")
+    known, rest = parser.parse_known_args()
+    main(lambda quick: measure(quick, known.split), __doc__ or "", rest)

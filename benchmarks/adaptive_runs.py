@@ -25,7 +25,7 @@ from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import CornersEvent, Estimate, Event, Step, Trajectory
+from fgloc.types import CornersEvent, Estimate, Event, RangeBearingEvent, Step, Trajectory
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]
@@ -107,7 +107,7 @@ def cell(
     out = []
     for seed in seeds:
         recorded = load(case.floor, split, seed)
-        chain = [_FAILURE.validate_python(failure) for failure in case.chain(recorded)]
+        chain = [failure(described) for described in case.chain(recorded)]
         config = changed(recorded.config, changes or {})
         if oracle:
             config = changed(config, distrusting(case.wheels_wrong(recorded)))
@@ -138,8 +138,8 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
 
     with tempfile.TemporaryDirectory() as folder:
         map_path, landmarks = recorded.map_path, recorded.landmarks
-        for failure, scene in zip(chain, scenes, strict=True):
-            landmarks = failure.spoil_map(landmarks, scene)
+        for spoiler, scene in zip(chain, scenes, strict=True):
+            landmarks = spoiler.spoil_map(landmarks, scene)
         if landmarks is not recorded.landmarks:
             map_path = Path(folder) / "map.yaml"
             write_map(landmarks, map_path)
@@ -183,8 +183,15 @@ def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:
     return {"weights": {"distrust": [{"source": "wheels", "start_s": a, "end_s": b} for a, b in intervals]}}
 
 
+def failure(described: dict[str, Any]) -> Failure:
+    """A failure as a suite of ablations describes it."""
+    return _FAILURE.validate_python(described)
+
+
 def moved_id(recorded: Recorded) -> int:
-    """The marker that is seen most often: moving another might change nothing."""
+    """The landmark that is seen most often: moving another might change nothing."""
     seen = [s.marker_id for e in recorded.events if isinstance(e, CornersEvent) for s in e.sightings]
+    seen += [s.landmark_id for e in recorded.events if isinstance(e, RangeBearingEvent) for s in e.sightings]
+    seen = [i for i in seen if i in recorded.landmarks]
     ids, counts = np.unique(seen, return_counts=True)
     return int(ids[int(np.argmax(counts))])
