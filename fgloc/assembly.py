@@ -98,10 +98,10 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
     learned = joint = None
     if config.motion.use and config.motion.model is not None:
         model = load_model(config.motion.model)
-        learned = LearnedMotion(model, config.motion)
+        learned = LearnedMotion(model, config.motion, mounted_up(recording, config, first))
         joint = model.joint if config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
-    imu_up = _imu_up(recording, config, first) if "imu" in recording.roles and config.gyro.use else None
+    imu_up = mounted_up(recording, config, first) if "imu" in recording.roles and config.gyro.use else None
     gyro = None if imu_up is None else Gyro(config.gyro, imu_up)
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
     seen_by: Role = "sightings" if detector is None else "image"
@@ -179,7 +179,7 @@ def _camera(recording: Recording, config: Config, first: dict[type[Event], Event
     return rescaled(camera, *size)
 
 
-def _imu_up(recording: Recording, config: Config, first: dict[type[Event], Event]) -> FloatArray:
+def mounted_up(recording: Recording, config: Config, first: dict[type[Event], Event]) -> FloatArray:
     """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level."""
     base, event = _base_frame(recording, config, first), first.get(ImuEvent)
     if isinstance(event, ImuEvent) and event.frame_id in recording.frames and base in recording.frames:

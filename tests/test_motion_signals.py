@@ -187,3 +187,11 @@ def test_cards_say_what_a_model_reads() -> None:
             make_card("displacement", **changes)
     with pytest.raises(ValueError, match="not gyro"):
         make_card("velocity", inputs=("commands", "velocity", "gyro"))
+
+
+def test_an_imu_may_be_mounted_upside_down() -> None:
+    card = make_card("displacement", inputs=("commands", "gyro"))
+    signals = SignalReader(card, imu_up=(0.0, 0.0, -1.0)).read(drive(3.0, 3.2), gyro_bias=0.1)
+    assert isinstance(signals, Signals)
+    assert signals.gyro is not None
+    np.testing.assert_allclose(signals.gyro.means(np.array([0.0, 0.1])), [[-0.6]], atol=1e-9)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
+from fgloc.assembly import mounted_up
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.motion.commands import CommandTrack
@@ -80,7 +81,8 @@ def load_run(
     with open_recording(path, settings.recording) as recording:
         for event in recording.events():
             (truth if isinstance(event, TruthEvent) else sensed).append(event)
-    heard = Heard(sensed, settings)
+        up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
+    heard = Heard(sensed, settings, up)
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
     else:
