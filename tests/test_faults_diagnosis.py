@@ -31,6 +31,7 @@ from fgloc.assembly import given_pose
 from fgloc.attendance import Attendance
 from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis import Diagnosis
+from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import find_beside, run
@@ -374,6 +375,19 @@ def test_sound_real_robots_are_not_accused(tmp_path):
     for bag in bags:
         result = run(bag, find_beside(bag, "map.yaml"), load_config(find_beside(bag, "robot.yaml")), "online")
         assert not [note for note in result.notes if _accuses(note)]
+
+
+def test_fault_24_evidence_stays_bounded_and_counts_all_windows():
+    rng = np.random.default_rng(0)
+    pool = Pool(np.array([10.0, 10.0]))
+    for i in range(3000):
+        information = np.diag(rng.uniform(0.5, 2.0, 2))
+        value = np.array([1.0 + 1e-4 * i, -2.0]) + rng.normal(0.0, 1.0, 2) / np.sqrt(np.diag(information))
+        pool.add(Evidence(float(i), information, information @ value))
+    assert len(pool) <= 512
+    drifting = pool.drifting(0)
+    assert abs(drifting.values[-1] - 1e-4) < 4.0 * drifting.sigmas[-1] < 2e-4
+    assert abs(pool.constant().values[1] + 2.0) < 4.0 * pool.constant().sigmas[1] < 0.2
 
 
 def test_the_sound_turtlebot3_is_not_accused(tmp_path):
