@@ -8,7 +8,8 @@ truth slides sideways faster than 0.012 m/s, as no wheel does, Vicon jumped: suc
 ``*.uncut_...`` tests the same models with them. Coverage at one step is that of a step of 0.2 s. ``finetune`` adapts
 the models of ``loro`` to the first minute of the robot left out, and tests both on the rest. ``selftruth`` trains as
 ``loro`` does, once on Vicon's poses and once on what ``fgloc smooth`` makes of the same runs without a learned model;
-both are tested against Vicon. ``husky`` and ``sim``: see `benchmarks.identification_husky` and `_sim`.
+both are tested against Vicon. ``limits``, ``husky`` and ``sim``: see `benchmarks.identification_limits`, `_husky` and
+`_sim`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks import identification_husky, identification_sim
+from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
 from datasets import mrclam
 from fgloc.config import load_config
@@ -88,6 +89,7 @@ def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig, quick
     commands = [roll_kinematics(Kinematics(), r, STEP_S) for r in uncut.values()]
     for horizon in _HORIZONS_S:
         yield Row(f"commands.drift_{horizon:.0f}s", evaluate(commands, horizon).drift_percent, unit="%")
+    yield from identification_limits.measure(recorded)
     trainer = _Trainer(scratch, optimization)
     parts, split = _parts(runs)
     whole, _ = _parts(uncut)
@@ -106,6 +108,7 @@ def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig, quick
         yield from not_run(["selftruth.drift_ratio"], "left out of a quick run")
         return
     own = {name: _smoothed(source, k, runs[name], scratch) for k, name in enumerate(runs, 1)}
+    (scratch / "own").mkdir()
     trainer = _Trainer(scratch / "own", _SMOOTHED_SETTINGS, _SMOOTHED_ADAPTATION)
     ratios = []
     for seed, vicon in zip(seeds, loro, strict=True):
