@@ -164,7 +164,9 @@ def _follow(events: list[_E], new: Sequence[_E], oldest_ns: int) -> None:
 
 
 def _gyro(events: Sequence[ImuEvent], origin_ns: int, bias: ArrayLike, up: ArrayLike) -> Signal | None:
-    rates = np.array([e.angular_velocity for e in events]).reshape(-1, 3) @ np.asarray(up) - np.asarray(bias)
+    if not events:
+        return None
+    rates = np.concatenate([e.angular_velocity for e in events]).reshape(-1, 3) @ np.asarray(up) - np.asarray(bias)
     return _of_samples([e.stamp_ns for e in events], rates[None], origin_ns)
 
 
