@@ -44,8 +44,9 @@ class Tracks:
 
 def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
     """Small plots side by side, all with one meaning of color; bands are the intervals."""
-    figure, axes = _grid(len(plots), 2.4)
     names = list(dict.fromkeys(name for plot in plots for name in plot.curves))
+    columns = 1 if len(plots) == 1 else 2 if len(plots) == 2 else 4  # of the legend: what the plots' width has room for
+    figure, axes = _grid(len(plots), 2.4, below=0.2 * math.ceil(len(names) / columns))
     for ax, plot in zip(axes, plots, strict=True):
         for name, points in plot.curves.items():
             color = _COLORS[names.index(name) % len(_COLORS)]
@@ -60,7 +61,9 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
         ax.set_ylim(bottom=0.0)
     axes[0].set_ylabel(label, fontsize=8)
     handles = {name: h for ax in axes for h, name in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside lower center", ncols=columns, fontsize=8, frameon=False
+    )
     return figure
 
 
@@ -75,10 +78,10 @@ def plot_tracks(plots: Sequence[Tracks]) -> Figure:
     return figure
 
 
-def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
+def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[Axes]]:
     columns = min(_COLUMNS, count)
     rows = math.ceil(count / columns)
-    figure = Figure(figsize=(_WIDTH * columns / _COLUMNS, height * rows + 0.4), dpi=110, layout="constrained")
+    figure = Figure(figsize=(_WIDTH * columns / _COLUMNS, height * rows + 0.4 + below), dpi=110, layout="constrained")
     axes = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
     for ax in axes:
         ax.tick_params(labelsize=8)
