@@ -119,13 +119,14 @@ def _load(source: Path, robot: int, scratch: Path) -> Recorded:
 
 def _with_odometry(events: Iterable[Event]) -> Iterator[Event]:
     """The events, and after each command what a wheel odometry that obeys at once would say."""
-    pose, last_ns, twist = np.zeros(3), 0, (0.0, 0.0)
+    pose, twist = np.zeros(3), (0.0, 0.0)
+    last_ns: int | None = None
     unknown = np.zeros((6, 6))
     for event in events:
         yield event
         if not isinstance(event, CommandEvent):
             continue
-        if last_ns:
+        if last_ns is not None:
             seconds = (event.stamp_ns - last_ns) * 1e-9
             pose = se2.compose(pose, se2.exp((twist[0] * seconds, 0.0, twist[1] * seconds)))
         last_ns, twist = event.stamp_ns, (event.v, event.omega)
