@@ -37,7 +37,7 @@ from training.config import AdaptationConfig, DataConfig, NetworkConfig, Optimiz
 from training.data import Run, cut, make_run
 from training.evaluate import STEP_S, Figures, evaluate
 from training.rollouts import Rollout, roll_kinematics, roll_model
-from training.train import HISTORY_S, leave_one_out, train
+from training.train import leave_one_out, train
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
@@ -180,7 +180,7 @@ def _run(recorded: mrclam.Run, name: str, data: DataConfig) -> Run:
 
 
 def _sampled(name: str, commands: list[CommandEvent], stamps: FloatArray, poses: FloatArray, data: DataConfig) -> Run:
-    return make_run(name, commands, stamps, poses, NetworkConfig().dt_s, HISTORY_S, data)
+    return make_run(name, commands, stamps, poses, NetworkConfig().dt_s, data.history_s, data)
 
 
 def _smoothed(source: Path, robot: int, recorded: Run, scratch: Path) -> Run:

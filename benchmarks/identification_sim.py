@@ -23,7 +23,7 @@ from training.config import DataConfig, NetworkConfig, OptimizationConfig, Train
 from training.data import Run, load_run
 from training.evaluate import STEP_S, evaluate
 from training.rollouts import Rollout, roll_model, roll_wheels
-from training.train import HISTORY_S, train
+from training.train import train
 
 _SEEDS = {"train": (11, 12, 13, 14), "validation": (21, 22, 23), "test": (31, 32, 33, 34)}
 _WINDOW_S = 5.0
@@ -62,7 +62,9 @@ def measure(quick: bool, seeds: range, optimization: OptimizationConfig, scratch
     dt_s = NetworkConfig().dt_s
     for scenario in sorted(names):
         mine = [job for job in todo if job.scenario.name == scenario]
-        runs = {job.folder: load_run(scratch / job.folder / "bag", job.folder, dt_s, HISTORY_S, _DATA) for job in mine}
+        runs = {
+            job.folder: load_run(scratch / job.folder / "bag", job.folder, dt_s, _DATA.history_s, _DATA) for job in mine
+        }
         parts = {part: tuple(job.folder for job in mine if job.split == part) for part in _SEEDS}
         split = Split(train=parts["train"], validation=parts["validation"], test=parts["test"])
         wheels = _error([roll_wheels(runs[name], STEP_S) for name in split.test])

@@ -27,6 +27,8 @@ class DataConfig(Section):
         0.05, gt=0, description="a smoothed trajectory is believed as truth where its position is known this well"
     )
     margin_s: float = Field(0.5, ge=0, description="left out at both ends")
+    history_s: float = Field(3.0, ge=0, description="of commands before the first sample; the model wants less")
+    apart_s: float = Field(10.0, gt=0, description="a recording that falls silent for longer is several runs")
     shortest_s: float = Field(10.0, gt=0, description="a recording that is shorter is refused")
 
 

@@ -5,8 +5,11 @@ Source: paper eq. 1, 2.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +78,50 @@ def load_run(
         RecordingError: it cannot be read, or has no commands, no truth or too little of both.
         TrajectoryError: the trajectory cannot be read.
     """
+    whole = _read(path, config, truth_from)
+    return make_run(name, Heard(whole.sensed, whole.settings, whole.imu_up), *whole.truth, dt_s, history_s, config)
+
+
+def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from: Path | None = None) -> dict[str, Run]:
+    """Read a bag as one run or, where nothing at all was heard for longer than ``config.apart_s``, as several.
+
+    The name of one run is the recording's, of several ``name.0``, ``name.1`` and so on; stretches that are too short
+    are left out. Arguments else, and errors, as of `load_run`.
+    """
+    whole = _read(path, config, truth_from)
+    stamps, poses = whole.truth
+    heard_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
+    limits = [int(heard_ns[0]), *heard_ns[1:][np.diff(heard_ns) > config.apart_s * 1e9].tolist(), int(heard_ns[-1]) + 1]
+    if len(limits) == 2:
+        heard = Heard(whole.sensed, whole.settings, whole.imu_up)
+        return {name: make_run(name, heard, stamps, poses, dt_s, config.history_s, config)}
+    runs: dict[str, Run] = {}
+    sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
+    sensed_ns = [e.stamp_ns for e in sensed]
+    for k, (first, last) in enumerate(pairwise(limits)):
+        part = sensed[bisect_left(sensed_ns, first) : bisect_left(sensed_ns, last)]
+        inside = (stamps >= first) & (stamps < last)
+        if not inside.any() or not any(isinstance(event, CommandEvent) for event in part):
+            continue
+        heard, label = Heard(part, whole.settings, whole.imu_up), f"{name}.{k}"
+        with suppress(RecordingError):
+            runs[label] = make_run(label, heard, stamps[inside], poses[inside], dt_s, config.history_s, config)
+    if not runs:
+        raise RecordingError(f"{path}: {len(limits) - 1} stretches, each shorter than {config.shortest_s:g} s")
+    return runs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recorded:
+    """A recording before it is cut to samples."""
+
+    settings: Config
+    sensed: list[Event]
+    truth: tuple[NDArray[np.int64], FloatArray]  # stamps (m,) and poses (m, 3)
+    imu_up: FloatArray
+
+
+def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
     settings = _settings(path)
     truth: list[TruthEvent] = []
     sensed: list[Event] = []
@@ -82,15 +129,14 @@ def load_run(
         for event in recording.events():
             (truth if isinstance(event, TruthEvent) else sensed).append(event)
         up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
-    heard = Heard(sensed, settings, up)
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
     else:
         stamps, rows = smoothed_truth(truth_from, config)
-    for kind, count in (("commands", len(heard.commands)), ("truth", len(stamps))):
+    for kind, count in (("commands", sum(isinstance(e, CommandEvent) for e in sensed)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
-    return make_run(name, heard, stamps, rows, dt_s, history_s, config)
+    return _Recorded(settings, sensed, (stamps, rows), up)
 
 
 def make_run(

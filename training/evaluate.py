@@ -23,7 +23,7 @@ from fgloc.motion.load import load_model
 from fgloc.types import FloatArray
 from training.calibrate import nis
 from training.config import DataConfig
-from training.data import Run, load_run
+from training.data import Run, load_runs
 from training.evaluation_plots import draw_calibration, draw_growth, draw_tracks
 from training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_wheels
 
@@ -143,7 +143,8 @@ def _table(rows: list[tuple[str, Figures]]) -> str:
 
 
 def _runs(card: ModelCard, bags: list[Path]) -> list[Run]:
-    return [load_run(bag, bag.name, card.dt_s, card.history_s, DataConfig()) for bag in bags]
+    data = DataConfig(history_s=card.history_s)
+    return [run for bag in bags for run in load_runs(bag, bag.name, card.dt_s, data).values()]
 
 
 def main(arguments: list[str] | None = None) -> int:

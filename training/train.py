@@ -25,7 +25,7 @@ from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fi
 from training.checkpoint import Checkpoints, Curve
 from training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
 from training.controls import controls, draw_controls
-from training.data import Run, load_run
+from training.data import Run, load_runs
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
 from training.models import DisplacementNet, MotionNet, NaiveNet, VelocityNet
@@ -35,7 +35,6 @@ from training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
 
 _SEEDS_APART = 1_000  # between the members of an ensemble
 _NOTHING_KEPT = Checkpoints()
-HISTORY_S = 3.0  # of commands before the first sample of a run: enough for every model
 
 
 def train(
@@ -246,10 +245,13 @@ def main(arguments: list[str] | None = None) -> int:
         config = load_train_config(options.config)
         made_by = f"python -m training.train {options.config.as_posix()}; {config.model_dump_json()}"
         smoothed = {name: options.data / folder for name, folder in config.truth.items()}
-        runs = {
-            name: load_run(options.data / bag, name, config.network.dt_s, HISTORY_S, config.data, smoothed.get(name))
+        parts = {
+            name: load_runs(options.data / bag, name, config.network.dt_s, config.data, smoothed.get(name))
             for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
         }
+        runs = {name: run for part in parts.values() for name, run in part.items()}
+        if config.split is not None:
+            config = config.model_copy(update={"split": _in_parts(config.split, parts)})
         if options.start is not None:
             path = options.out / "model.safetensors"
             _report(path.stem, adapt(options.start, config, runs, path, f"{made_by}; from {options.start.name}"))
@@ -280,6 +282,15 @@ def _report_controls(training: list[Run], config: TrainConfig, out: Path) -> Non
     draw_controls(out / "controls.png", found)
     for missing in found.missing():
         print(f"warning: the recordings hold too little of {missing}", file=sys.stderr)
+
+
+def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
+    """The split of recordings as one of the runs that they are made of."""
+
+    def names(recordings: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(name for recording in recordings for name in parts[recording])
+
+    return Split(train=names(split.train), validation=names(split.validation), test=names(split.test))
 
 
 def _report(name: str, card: ModelCard) -> None:

@@ -1,0 +1,110 @@
+"""Recordings that fall silent are several runs; runs hear what the robot's own sensors say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensing
+
+from datasets.bag import BagWriter
+from fgloc.config import Config, WheelsConfig
+from fgloc.errors import RecordingError
+from fgloc.motion import load_model
+from fgloc.types import Event, ImuEvent, JointsEvent
+from training import train as training
+from training.config import DataConfig
+from training.data import load_runs
+from training.heard import Heard
+from training.rollouts import roll_wheels
+
+SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
+
+
+def write_windows(path: Path, seeds: list[int], seconds: float = 2.5, apart_s: float = 100.0) -> None:
+    """Short drives, each of another seed, far apart."""
+    with BagWriter(path) as bag:
+        for k, seed in enumerate(seeds):
+            later = round(k * apart_s * SECOND)
+            commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
+            for c in commands:
+                bag.command("/cmd_vel", c.stamp_ns + later, c.v, c.omega)
+            for stamp, (x, y, yaw) in zip(stamps[::5].tolist(), poses[::5], strict=True):
+                bag.truth("/truth", stamp + later, [x, y, 0.0], [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+
+
+def test_a_recording_that_falls_silent_is_several_runs(tmp_path: Path) -> None:
+    write_windows(tmp_path / "bag", [1, 2, 3])
+    runs = load_runs(tmp_path / "bag", "w", 0.1, SHORT)
+    assert list(runs) == ["w.0", "w.1", "w.2"]
+    for k, (name, run) in enumerate(runs.items()):
+        assert run.name == name
+        assert run.origin_ns == T0 + k * 100 * SECOND + 300_000_000
+        assert len(run.starts(15)) > 0
+        assert len(run.commands) == 125
+        _, stamps, poses = drive(np.random.default_rng(1 + k), 2.5)
+        at = run.times + 0.3
+        truth = [np.interp(at, (stamps - T0) * 1e-9, poses[:, i]) for i in (0, 1)]
+        np.testing.assert_allclose(run.poses[:, :2], np.transpose(truth), atol=0.004)  # at the ends as well
+    whole = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5, apart_s=1000.0)
+    assert list(load_runs(tmp_path / "bag", "w", 0.1, whole)) == ["w"]
+
+
+def test_stretches_that_are_too_short_are_left_out(tmp_path: Path) -> None:
+    write_windows(tmp_path / "some", [1, 2], seconds=2.5)
+    longer = SHORT.model_copy(update={"shortest_s": 3.0})
+    with pytest.raises(RecordingError, match="2 stretches, each shorter than 3 s"):
+        load_runs(tmp_path / "some", "w", 0.1, longer)
+
+
+def test_windows_of_two_seconds_train_a_model(tmp_path: Path) -> None:
+    for part, seeds in (("train", range(12)), ("validation", range(12, 16)), ("test", range(16, 20))):
+        write_windows(tmp_path / part / "bag", list(seeds))
+    parts = ("train", "validation", "test")
+    settings = dict(
+        robot="r",
+        recordings={part: f"{part}/bag" for part in parts},
+        split={part: [part] for part in parts},
+        data=SHORT.model_dump(),
+        network=dict(hidden=[16], edges_s=[0.0, 0.1, 0.2, 0.3]),
+        optimization=dict(
+            horizon_s=1.5, validation_s=[1.5], variance_horizon_s=1.5, batch=32, iterations=20, validate_every=10,
+            variance_iterations=10,
+        ),
+        calibration=dict(horizons_s=[1.5], short_s=[0.2], window_s=1.5),
+    )  # fmt: skip
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(settings))
+    arguments = [str(tmp_path / "c.yaml"), "--data", str(tmp_path), "--out", str(tmp_path / "models")]
+    assert training.main(arguments) == 0
+    card = load_model(tmp_path / "models" / "model.safetensors").card
+    assert card.split.test == ("test.0", "test.1", "test.2", "test.3")
+    assert len(card.split.train) == 12
+    assert card.figures["drift_percent_1s"] > 0.0
+
+
+def test_the_gyros_bias_is_known_after_a_rest() -> None:
+    bias, stamps = 0.02, [T0 + k * 10_000_000 for k in range(600)]
+    rates = [bias if k < 300 else bias + 0.5 for k in range(600)]
+    events: list[Event] = []
+    for k, (stamp, rate) in enumerate(zip(stamps, rates, strict=True)):
+        events.append(ImuEvent(stamp, stamp, "/imu", "imu", np.array([0.0, 0.0, rate]), np.zeros(3), np.zeros((3, 3))))
+        turned = max(0, k - 300) * 0.01 * 0.5 * TRACK / 2 / RADIUS
+        angles = np.array([-turned, turned])
+        events.append(JointsEvent(stamp, stamp, "/joints", JOINTS, angles, np.zeros(2), np.zeros(2)))
+    wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
+    heard = Heard(events, Config(wheels=wheels))
+    assert heard.gyro_bias(T0) == 0.0
+    assert heard.gyro_bias(T0 + 5 * SECOND) == pytest.approx(bias, abs=1e-3)
+    gyro = heard.signals(("gyro",), T0).gyro
+    assert gyro is not None
+    np.testing.assert_allclose(gyro.means(np.array([1.5, 2.5, 3.2, 5.5]))[[0, 2], 0], [0.0, 0.5], atol=1e-3)
+
+
+def test_wheel_odometry_is_rolled_out_as_the_localizer_measures_it() -> None:
+    run = sensing(3, 20.0)
+    assert run.heard.has_wheels
+    wheels = roll_wheels(run, 0.2)
+    assert 0.002 < np.hypot(*wheels.errors(5.0)[:, :2].T).mean() < 0.1  # a wheel 2 % larger than nominal
+    assert np.linalg.eigvalsh(wheels.covs).min() > 0.0
