@@ -20,7 +20,7 @@ from fgloc import se2
 from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import attempts, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
-from fgloc.ablation.sweep import sweep
+from fgloc.ablation.sweep import _client, sweep
 from fgloc.errors import ConfigError
 
 START_NS = 1_700_000_000_000_000_000
@@ -204,6 +204,14 @@ def test_job_that_kills_its_workers_is_quarantined_and_the_others_finish(folder,
     assert "its worker died 4 times" in records[poison].error
     assert all(r.outcome == "done" for key, r in records.items() if key != poison)
     assert sweep(jobs, out) == records  # left alone
+
+
+@pytest.mark.slow
+def test_workers_that_the_cluster_gave_up_are_replaced():
+    with _client(1, None) as client:
+        client.cluster.sync(client.cluster.workers[0].close)
+        client.cluster.workers.clear()  # as after a worker's death while it was starting
+        assert client.submit(abs, -1).result(timeout=120) == 1
 
 
 def test_half_written_record_does_not_count(folder, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from fgloc.errors import ConfigError
 Progress = Callable[[int, int], None]
 """Called with the number of jobs done and their total."""
 
+_WATCH_S = 5.0
 _DEATHS = 3  # of workers, while they ran one job, after which the job is quarantined
 
 
@@ -103,7 +105,11 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         import distributed
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error.name} is not installed, and sweeps run on it: pip install 'fgloc[sweep]'") from error
-    settings = {"distributed.scheduler.worker-saturation": 1.0, "distributed.scheduler.allowed-failures": _DEATHS}
+    settings = {
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.scheduler.allowed-failures": _DEATHS,
+        "distributed.deploy.lost-worker-timeout": "60s",  # a busy machine takes long to start a new process
+    }
     with dask.config.set(settings):
         if scheduler is not None:
             try:
@@ -125,5 +131,24 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
                 silence_logs="ERROR",
             ) as cluster,
             distributed.Client(cluster) as client,
+            _replacing(cluster, workers),
         ):
             yield client
+
+
+@contextmanager
+def _replacing(cluster: Any, workers: int) -> Iterator[None]:
+    """Replace workers that the cluster has given up, as it does with one that dies again while it starts."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_WATCH_S):
+            cluster.scale(workers)
+
+    thread = threading.Thread(target=watch, name="worker-watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
