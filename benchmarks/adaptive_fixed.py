@@ -28,7 +28,8 @@ def constant(way: float = WAY, turn: float = TURN) -> dict[str, Any]:
     """Configuration of a run without adaptation, its wheels' noise multiplied by these factors."""
     noise = robot_settings(Scenario(name="any"))["wheels"]["noise"]
     scaled = {name: value * (turn if name.startswith("yaw") else way) for name, value in noise.items()}
-    return {"weights": {"adaptive": False}, "wheels": {"noise": scaled}}
+    systematic = dict.fromkeys(("scale_sigma", "turn_scale_sigma", "yaw_per_m_sigma"), 0.0)  # these grow with the way
+    return {"weights": {"adaptive": False}, "wheels": {"noise": scaled, **systematic}}
 
 
 def tune(changes: dict[str, Any]) -> Iterator[tuple[float, float, list[float]]]:

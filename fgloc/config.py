@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from fgloc.errors import ConfigError
 
@@ -115,6 +115,9 @@ class WheelsConfig(Section):
     zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
     zero_yaw_rate: float = Field(0.0, ge=0, description="rad/s below which a reported rate is rest")
     noise: NoiseDensity = NoiseDensity()
+    scale_sigma: float = Field(0.0, ge=0, le=0.5, description="how far scale_v may be off, all the time alike")
+    turn_scale_sigma: float = Field(0.0, ge=0, le=0.5, description="how far scale_omega may be off, likewise")
+    yaw_per_m_sigma: float = Field(0.0, ge=0, le=1, description="rad/m: how far yaw_per_m may be off, likewise")
 
 
 class GyroConfig(Section):
@@ -179,10 +182,30 @@ class LandmarksConfig(Section):
         return self.range_scale_sigma > 0.0 or self.bearing_bias_sigma_rad > 0.0
 
 
+def model_path(given: Any) -> Any:
+    """The file of a motion model; ``shipped:NAME`` is one that comes with the package.
+
+    Raises:
+        ValueError: no model of this name is shipped; those that are get listed.
+    """
+    if not str(given).startswith(_SHIPPED):
+        return given
+    path = _MODELS / (str(given).removeprefix(_SHIPPED) + ".safetensors")
+    if path.is_file():
+        return path
+    names = ", ".join(
+        sorted(f"{_SHIPPED}{p.relative_to(_MODELS).with_suffix('')}" for p in _MODELS.rglob("*.safetensors"))
+    )
+    raise ValueError(f"{given} is not shipped; there are {names}")
+
+
 class MotionConfig(Section):
     """The learned motion model."""
 
-    model: Path | None = Field(None, description="a .safetensors file that python -m training.train wrote")
+    model: Annotated[Path | None, BeforeValidator(model_path)] = Field(
+        None,
+        description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
+    )
     use: bool = True
     correlation: Literal["joint", "independent"] = Field(
         "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
@@ -279,6 +302,8 @@ class Config(Section):
 
 
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
+_SHIPPED = "shipped:"
+_MODELS = Path(__file__).parent / "motion" / "models"
 
 
 def load_config(path: Path) -> Config:
@@ -299,7 +324,7 @@ def load_config(path: Path) -> Config:
         raise ConfigError(f"{path}: expected a mapping of sections, got {type(data).__name__}")
     for section, key in _PATH_KEYS:
         part = data.get(section)
-        if isinstance(part, dict) and isinstance(part.get(key), str):
+        if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(_SHIPPED):
             part[key] = path.parent / part[key]
     try:
         return Config.model_validate(data)

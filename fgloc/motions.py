@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container
 from dataclasses import replace
 
@@ -48,6 +49,7 @@ class MotionSources:
         self._joint = joint
         self.gyro = gyro
         self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
+        self._way_m = self._turn_rad = 0.0  # what the wheels have told since the last fix
 
     @property
     def gyro_is_read(self) -> bool:
@@ -64,7 +66,7 @@ class MotionSources:
         """
         if step.dt <= 0.0:
             return Readings()
-        wheels = self._wheels.measure(step)
+        wheels = self._with_systematic_error(self._wheels.measure(step))
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = None
         if self.gyro is not None:
@@ -76,6 +78,20 @@ class MotionSources:
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
+
+    def _with_systematic_error(self, m: MotionMeasurement | None) -> MotionMeasurement | None:
+        """Add what a wrong radius or track adds: the same error all along, so that its sigma grows with the way.
+
+        As with the bias of the gyro, a step gets the growth of the variance since the last fix.
+        """
+        if m is None:
+            return None
+        config = self._config.wheels
+        way, turn = math.hypot(m.motion[0], m.motion[1]), abs(float(m.motion[2]))
+        forth = (self._way_m + way) ** 2 - self._way_m**2
+        around = (self._turn_rad + turn) ** 2 - self._turn_rad**2
+        yaw = config.yaw_per_m_sigma**2 * forth + config.turn_scale_sigma**2 * around
+        return replace(m, cov=m.cov + np.diag([config.scale_sigma**2 * forth, 0.0, yaw]))
 
     def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -148,7 +164,10 @@ class MotionSources:
             fix: where sightings have it now; None if there were none.
         """
         if fix is not None:
-            self._silent_s = 0.0
+            self._silent_s = self._way_m = self._turn_rad = 0.0
+        elif readings.wheels is not None:
+            self._way_m += math.hypot(*readings.wheels.motion[:2])
+            self._turn_rad += abs(float(readings.wheels.motion[2]))
         if self.gyro is None:
             return
         if readings.gyro is None:
@@ -161,7 +180,7 @@ class MotionSources:
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
-        self._silent_s = 0.0
+        self._silent_s = self._way_m = self._turn_rad = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
 

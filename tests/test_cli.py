@@ -117,7 +117,9 @@ def test_without_truth_the_run_is_still_done(tmp_path):
 
 
 def test_lost_robot_exits_with_3_after_writing(tmp_path):
-    code, _, stderr = fgloc("online", write_circle(tmp_path, seconds=15.0, kidnapped_at=5.0), "--out", tmp_path / "out")
+    bag = write_circle(tmp_path, seconds=15.0, kidnapped_at=5.0)
+    (tmp_path / "fixed.yaml").write_text("weights: {adaptive: false}\n")  # else it is found again at once
+    code, _, stderr = fgloc("online", bag, "--config", tmp_path / "fixed.yaml", "--out", tmp_path / "out")
     assert code == 3
     assert "LOST for" in stderr
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
-from fgloc.config import Config, load_config
+from fgloc.config import Config, MotionConfig, load_config
+from fgloc.errors import ConfigError
 
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
@@ -19,7 +21,9 @@ MapOption = Annotated[
 ]
 ModelOption = Annotated[
     Path | None,
-    typer.Option("--model", metavar="M", help="learned motion (.safetensors); default: the configuration's"),
+    typer.Option(
+        "--model", metavar="M", help="learned motion: a .safetensors, or shipped:NAME; default: the configuration's"
+    ),
 ]
 ConfigOption = Annotated[
     Path | None,
@@ -43,4 +47,8 @@ def configured(bag: Path, config_file: Path | None, model: Path | None) -> Confi
     config = Config() if file is None else load_config(file)
     if model is None:
         return config
-    return config.model_copy(update={"motion": config.motion.model_copy(update={"model": model, "use": True})})
+    try:
+        motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
+    except ValidationError as error:
+        raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    return config.model_copy(update={"motion": motion})
