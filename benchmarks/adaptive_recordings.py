@@ -43,7 +43,6 @@ SEEDS: dict[Split, tuple[int, ...]] = {
 }
 DURATION_S = 80.0
 _ROOT = Path(__file__).resolve().parent.parent
-MODEL = _ROOT / "fgloc" / "motion" / "models" / "sim" / "diff_drive.safetensors"
 _CAMERA_HZ = 5.0
 _DETECTOR = [f"fgloc/sensors/{name}.py" for name in ("dictionaries", "edges", "images", "markers")]
 
@@ -55,7 +54,7 @@ class Recorded:
     name: str
     bag: Path
     map_path: Path
-    config: Config  # what robot.yaml says, with the simulated robot's motion model
+    config: Config  # what robot.yaml says
     landmarks: LandmarkMap
     events: tuple[Event, ...]
     start_ns: int  # receive time of the first message
@@ -110,7 +109,7 @@ def load(floor: Floor, split: Split, seed: int) -> Recorded:
     prepare([floor], split, [seed])
     made = scenario(floor, split)
     folder = cache_folder() / _name(floor, split, seed)
-    config = Config.model_validate({**robot_settings(made), "motion": {"model": MODEL}})
+    config = Config.model_validate(robot_settings(made))
     landmarks = load_map(folder / "map.yaml")
     with open_recording(folder / "bag", config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
