@@ -229,7 +229,7 @@ class EstimatorConfig(Section):
     )
     dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
-        "none", description="robust kernel on the wheels' factors of a graph, for comparison: it cannot locate a slip"
+        "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
     )
 
 
