@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensing
+from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
 from datasets.bag import BagWriter
 from fgloc.config import Config, WheelsConfig
@@ -108,3 +108,15 @@ def test_wheel_odometry_is_rolled_out_as_the_localizer_measures_it() -> None:
     wheels = roll_wheels(run, 0.2)
     assert 0.002 < np.hypot(*wheels.errors(5.0)[:, :2].T).mean() < 0.1  # a wheel 2 % larger than nominal
     assert np.linalg.eigvalsh(wheels.covs).min() > 0.0
+
+
+def test_the_truth_teaches_the_gyros_bias_until_ten_seconds_before() -> None:
+    commands, stamps, poses = drive(np.random.default_rng(3), 40.0)
+    wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
+    bias = 0.02
+    heard = Heard([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps, poses))
+    assert heard.gyro_bias(T0 + 5 * SECOND) == 0.0  # this robot sets out at once
+    assert heard.gyro_bias(T0 + 35 * SECOND) == pytest.approx(bias, abs=2e-3)
+    silent = (stamps > T0 + 1 * SECOND) & (stamps < T0 + 39 * SECOND)
+    mute = Heard([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps[~silent], poses[~silent]))
+    assert mute.gyro_bias(T0 + 35 * SECOND) == 0.0

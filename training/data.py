@@ -79,7 +79,9 @@ def load_run(
         TrajectoryError: the trajectory cannot be read.
     """
     whole = _read(path, config, truth_from)
-    return make_run(name, Heard(whole.sensed, whole.settings, whole.imu_up), *whole.truth, dt_s, history_s, config)
+    return make_run(
+        name, Heard(whole.sensed, whole.settings, whole.imu_up, whole.truth), *whole.truth, dt_s, history_s, config
+    )
 
 
 def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from: Path | None = None) -> dict[str, Run]:
@@ -93,7 +95,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
     heard_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
     limits = [int(heard_ns[0]), *heard_ns[1:][np.diff(heard_ns) > config.apart_s * 1e9].tolist(), int(heard_ns[-1]) + 1]
     if len(limits) == 2:
-        heard = Heard(whole.sensed, whole.settings, whole.imu_up)
+        heard = Heard(whole.sensed, whole.settings, whole.imu_up, whole.truth)
         return {name: make_run(name, heard, stamps, poses, dt_s, config.history_s, config)}
     runs: dict[str, Run] = {}
     sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
@@ -103,7 +105,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
         inside = (stamps >= first) & (stamps < last)
         if not inside.any() or not any(isinstance(event, CommandEvent) for event in part):
             continue
-        heard, label = Heard(part, whole.settings, whole.imu_up), f"{name}.{k}"
+        heard, label = Heard(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
             runs[label] = make_run(label, heard, stamps[inside], poses[inside], dt_s, config.history_s, config)
     if not runs:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fgloc.buffers import EventBuffer
 from fgloc.config import Config, GyroConfig, WheelsConfig
@@ -16,6 +17,10 @@ from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent, Step
 
 _STEP_NS = 200_000_000  # of the gyro's filter
+_BLIND_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
+_FIRST_NS = 2_000_000_000
+_FIX_SIGMA = 0.002  # rad
+_MAX_TRUTH_GAP_NS = 200_000_000
 
 
 class Heard:
@@ -28,7 +33,11 @@ class Heard:
     """
 
     def __init__(
-        self, events: Iterable[Event], config: Config | None = None, imu_up: ArrayLike = (0.0, 0.0, 1.0)
+        self,
+        events: Iterable[Event],
+        config: Config | None = None,
+        imu_up: ArrayLike = (0.0, 0.0, 1.0),
+        truth: tuple[NDArray[np.int64], FloatArray] | None = None,
     ) -> None:
         """Keep what a motion model may read.
 
@@ -36,6 +45,8 @@ class Heard:
             events: of any kind, in any order.
             config: the robot's.
             imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+            truth: stamps ``(n,)`` and poses ``(n, 3)``: the fixes from which the gyro's bias is learned, as the
+                localizer learns it from sightings. None: from rests alone.
         """
         config = Config() if config is None else config
         self.wheels: WheelsConfig = config.wheels
@@ -54,7 +65,7 @@ class Heard:
             elif isinstance(event, OdometryEvent):
                 self._odometry.insert(event)
         self.commands = _all(self._commands)
-        self._biases = self._gyro_biases(config.gyro)
+        self._biases = self._gyro_biases(config.gyro, truth)
 
     @property
     def has_wheels(self) -> bool:
@@ -91,7 +102,7 @@ class Heard:
         )
 
     def gyro_bias(self, stamp_ns: int) -> float:
-        """What was known of the gyro's bias [rad/s] at a time."""
+        """What was known of the gyro's bias [rad/s] 10 s before a time, as after 10 s of dead reckoning."""
         if not len(self._biases):
             return 0.0
         return float(self._biases[max(0, int(np.searchsorted(self._imu.stamps, stamp_ns, "right")) - 1)])
@@ -102,8 +113,8 @@ class Heard:
             wanted, _all(self._imu), _all(self._joints), self.joints, origin_ns, self._biases, self.imu_up
         )
 
-    def _gyro_biases(self, config: GyroConfig) -> FloatArray:
-        """Bias at each IMU message, by the filter that the localizer uses; nothing but rests teaches it here."""
+    def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
+        """What the localizer's own filter knew of the bias some time before each IMU message."""
         stamps = self._imu.stamps
         if not stamps:
             return np.zeros(0)
@@ -112,10 +123,27 @@ class Heard:
         for start in range(stamps[0], stamps[-1], _STEP_NS):
             step = self.step(start, start + _STEP_NS)
             measured = None if wheels is None else wheels.measure(step)
-            gyro.measure(step, None if measured is None else measured.motion)
+            turn = gyro.measure(step, None if measured is None else measured.motion)
+            if turn is None:
+                gyro.forget_fix()
+            else:
+                gyro.turned(turn.yaw, step.dt)
             at.append(step.stamp_ns)
+            if truth is not None and (yaw := _yaw_at(*truth, step.stamp_ns)) is not None:
+                gyro.fix(yaw, _FIX_SIGMA**2)
             biases.append(gyro.bias)
-        return np.array(biases)[np.searchsorted(at, stamps, "right") - 1]
+        known = np.searchsorted(at, np.array(stamps) - _BLIND_NS, "right") - 1
+        first = np.searchsorted(at, stamps[0] + _FIRST_NS)  # a robot rests before it sets out
+        return np.array(biases)[np.maximum(known, np.minimum(np.searchsorted(at, stamps, "right") - 1, first))]
+
+
+def _yaw_at(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: int) -> float | None:
+    """Yaw [rad] between the poses around a time; None if the truth is silent there."""
+    k = int(np.searchsorted(stamps_ns, at_ns, "right")) - 1
+    if k < 0 or k + 1 >= len(stamps_ns) or stamps_ns[k + 1] - stamps_ns[k] > _MAX_TRUTH_GAP_NS:
+        return None
+    share = (at_ns - stamps_ns[k]) / (stamps_ns[k + 1] - stamps_ns[k])
+    return float(poses[k, 2] + share * math.remainder(poses[k + 1, 2] - poses[k, 2], math.tau))
 
 
 def _all(buffer: EventBuffer[Event]) -> tuple[Event, ...]:  # type: ignore[type-var]
