@@ -102,12 +102,15 @@ def test_torch_and_numpy_agree_on_measured_signals(
 
 
 def test_wheels_with_unequal_radii_are_learned_and_slip_free_odometry_beaten(tmp_path: Path) -> None:
-    runs = {f"run{seed}": sensing(seed) for seed in range(3)}
+    runs = {f"run{seed}": sensing(seed, 30.0) for seed in range(3)}
     split = Split(train=("run0",), validation=("run1",), test=("run2",))
     base = tiny_config("displacement", list(runs))
     network = base.network.model_copy(update=dict(inputs=("commands", "wheels")))
-    optimization = base.optimization.model_copy(update=dict(iterations=50))
-    config = base.model_copy(update=dict(leave_one_out=False, split=split, network=network, optimization=optimization))
+    optimization = base.optimization.model_copy(update=dict(iterations=20, variance_iterations=10))
+    quick = base.calibration.model_copy(update=dict(memory_s=(0.5,), horizons_s=(2.0,)))
+    config = base.model_copy(
+        update=dict(leave_one_out=False, split=split, network=network, optimization=optimization, calibration=quick)
+    )
     card = training.train(config, split, runs, tmp_path / "m.safetensors", "a test")
     assert card.reads_wheels
     assert card.wheel_kinematics.yaw_per_m == pytest.approx(-0.01 / 0.26 * 2, rel=0.1)
