@@ -195,6 +195,8 @@ class _Replay:
         sources += [parts.localizer.rejections, parts.localizer.weights.rejections]
         if parts.learned is not None:
             sources.append(parts.learned.rejections)
+        if parts.localizer.sources.gyro is not None:
+            sources.append(parts.localizer.sources.gyro.rejections)
         for source in sources:
             total.update(source)
         return total

@@ -133,8 +133,10 @@ class Gyro:
             self.bias_variance *= 2.0  # the next ones will tell
             return
         gain = self.bias_variance / (self.bias_variance + variance)
-        self.bias += gain * (bias - self.bias)
+        change = gain * (bias - self.bias)
+        self.bias += change
         self.bias_variance *= 1.0 - gain
+        self._turned -= change * self._turned_s  # what was turned since the last fix, with the bias of now
 
     def _integral(self, events: tuple[ImuEvent, ...], start_ns: int, end_ns: int) -> float | None:
         """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""

@@ -1,0 +1,190 @@
+"""The gyro: exact turns, a bias that is learned, a variance that grows with the time without a fix."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fgloc.config import GyroConfig
+from fgloc.sensors.gyro import Gyro
+from fgloc.types import ImuEvent, Step
+
+START = 10**18
+STILL, DRIVING = np.zeros(3), np.array([0.04, 0.0, 0.02])
+
+
+def imu(t: float, rate: float, axis=(0.0, 0.0, 1.0)) -> ImuEvent:
+    stamp = START + round(t * 1e9)
+    return ImuEvent(stamp, stamp, "/imu", "imu", rate * np.asarray(axis), np.zeros(3), np.zeros((3, 3)))
+
+
+def step(start: float, end: float, rate, hz: float = 100.0, axis=(0.0, 0.0, 1.0), phase: float = 0.0) -> Step:
+    """A step with the messages inside and one on either side; ``rate`` is a function of time [s]."""
+    n = round((end - start) * hz)
+    times = start + phase / hz + np.arange(-1, n + 2) / hz
+    messages = tuple(imu(t, rate(t), axis) for t in times)
+    return Step(0, 0, START + round(start * 1e9), START + round(end * 1e9), imu=messages)
+
+
+def known(gyro: Gyro, bias: float = 0.0, sigma: float = 1e-6) -> Gyro:
+    gyro.bias, gyro.bias_variance = bias, sigma**2
+    return gyro
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.37, 0.9])
+def test_a_varying_rate_is_integrated_to_the_ends_of_the_step(phase):
+    """Linear rates exactly, wherever the messages lie against the step."""
+    turn = known(Gyro(GyroConfig())).measure(step(2.0, 2.13, lambda t: 0.3 - 0.7 * t, phase=phase), DRIVING)
+    assert turn.yaw == pytest.approx(0.3 * 0.13 - 0.35 * (2.13**2 - 2.0**2), abs=1e-9)
+
+
+def test_rates_are_held_at_the_ends_that_no_message_covers():
+    messages = (imu(0.02, 1.0), imu(0.06, 2.0))
+    turn = known(Gyro(GyroConfig())).measure(Step(0, 0, START, START + 10**8, imu=messages), DRIVING)
+    assert turn.yaw == pytest.approx(0.02 * 1.0 + 0.04 * 1.5 + 0.04 * 2.0, abs=1e-9)
+
+
+def test_steps_add_up_to_the_whole_turn():
+    def rate(t):
+        return 0.4 * math.sin(3.0 * t)
+
+    gyro = known(Gyro(GyroConfig()))
+    cuts = [0.0, 0.05, 0.25, 0.31, 0.8, 1.0]
+    parts = [gyro.measure(step(a, b, rate), DRIVING).yaw for a, b in zip(cuts, cuts[1:], strict=False)]
+    assert sum(parts) == pytest.approx(0.4 / 3.0 * (1.0 - math.cos(3.0)), abs=1e-4)
+
+
+def test_only_the_rate_about_the_bases_vertical_counts():
+    """An IMU that hangs upside down, and one that leans by 30 degrees."""
+    leaning = np.array([0.0, -math.sin(math.pi / 6), math.cos(math.pi / 6)])
+    for up in (np.array([0.0, 0.0, -1.0]), leaning):
+        gyro = known(Gyro(GyroConfig(), up))
+        turn = gyro.measure(step(0.0, 0.2, lambda t: 0.5, axis=up + 3.0 * np.cross(up, (1.0, 0.0, 0.0))), DRIVING)
+        assert turn.yaw == pytest.approx(0.1, abs=1e-9)
+
+
+def test_silence_is_no_turn_and_is_counted_once_the_gyro_has_spoken():
+    gyro = Gyro(GyroConfig())
+    nothing = Step(0, 0, START, START + 10**8)
+    assert gyro.measure(nothing, DRIVING) is None
+    assert not gyro.rejections
+    assert gyro.measure(step(0.0, 0.1, lambda t: 0.1), DRIVING) is not None
+    assert gyro.measure(nothing, DRIVING) is None
+    gap = Step(0, 0, START, START + 4 * 10**8, imu=(imu(0.0, 0.1), imu(0.1, 0.1), imu(0.3, 0.1), imu(0.4, 0.1)))
+    assert gyro.measure(gap, DRIVING) is None
+    assert gyro.rejections == {"gyro.silence": 2}
+
+
+# --- bias -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_bias_is_learned_while_the_wheels_stand():
+    rng, config = np.random.default_rng(1), GyroConfig()
+    gyro, bias = Gyro(config), 0.012
+    noise = config.yaw_per_sqrt_s * math.sqrt(100.0)
+    for i in range(40):
+        gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: bias + rng.normal(0.0, noise)), STILL)
+    assert abs(gyro.bias - bias) < 4.0 * math.sqrt(gyro.bias_variance)
+    assert math.sqrt(gyro.bias_variance) < 0.0015
+
+
+def test_the_bias_is_not_learned_while_the_robot_is_turned_on_the_spot_or_drives():
+    turned, driving = Gyro(GyroConfig()), Gyro(GyroConfig())
+    for i in range(40):
+        turned.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.4), STILL)  # by hand: the wheels stand
+        driving.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.02), DRIVING)
+    assert turned.bias == 0.0
+    assert driving.bias == 0.0
+
+
+def drive(gyro: Gyro, bias: float, seconds: float, fix_every_s: float, seed: int = 0, wrong_at: float = -1.0) -> float:
+    """Turn at 0.3 rad/s with fixes of the yaw now and then; the true yaw at the end."""
+    rng, yaw, sigma = np.random.default_rng(seed), 0.0, 0.005
+    for i in range(round(10 * seconds)):
+        turn = gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.3 + bias), np.array([0.04, 0.0, 0.03]))
+        yaw += 0.03
+        gyro.turned(turn.yaw, 0.1)
+        t = 0.1 * (i + 1)
+        if round(t / 0.1) % round(fix_every_s / 0.1) == 0:
+            wrong = 0.8 if abs(t - wrong_at) < 0.01 else 0.0
+            gyro.fix(math.remainder(yaw + wrong + rng.normal(0.0, sigma), math.tau), sigma**2)
+    return yaw
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bias_is_learned_between_fixes_and_as_well_as_it_says(seed):
+    gyro = Gyro(GyroConfig())
+    drive(gyro, -0.015, 60.0, 0.5, seed)
+    assert abs(gyro.bias + 0.015) < 4.0 * math.sqrt(gyro.bias_variance)
+    assert math.sqrt(gyro.bias_variance) < 0.0015
+
+
+def test_a_bias_learned_at_rest_does_not_spoil_the_turn_since_the_last_fix():
+    """The turn was measured with the bias of then: what has been learned since must not be counted twice."""
+    gyro, bias = Gyro(GyroConfig()), 0.02
+    gyro.fix(0.0, 1e-6)
+    for i in range(100):
+        wheels = DRIVING if i < 50 else STILL
+        gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: bias), wheels).yaw, 0.1)
+    assert abs(gyro.bias - bias) < 2e-4
+    before = gyro.bias_variance
+    gyro.fix(0.0, 1e-6)
+    assert abs(gyro.bias - bias) < 2e-4
+    assert gyro.bias_variance < before  # the fix confirms it
+
+
+def test_a_wrong_fix_does_not_move_the_bias():
+    right, wrong = Gyro(GyroConfig()), Gyro(GyroConfig())
+    drive(right, 0.01, 40.0, 2.0)
+    drive(wrong, 0.01, 40.0, 2.0, wrong_at=30.0)
+    assert abs(wrong.bias - 0.01) < 4.0 * math.sqrt(wrong.bias_variance) + 1e-3
+    assert wrong.bias_variance > 1.5 * right.bias_variance  # it may have been the bias that jumped
+
+
+def test_an_uncertain_fix_teaches_nothing():
+    gyro = Gyro(GyroConfig())
+    for i in range(100):
+        gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.01), DRIVING).yaw, 0.1)
+        gyro.fix(0.0, 0.1**2)
+    assert gyro.bias == 0.0
+
+
+def test_a_silence_between_two_fixes_teaches_nothing():
+    gyro = known(Gyro(GyroConfig()), sigma=0.02)
+    gyro.fix(0.0, 1e-6)
+    for i in range(30):
+        gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.0), DRIVING).yaw, 0.1)
+    gyro.forget_fix()  # turned unheard by 0.5 rad
+    gyro.fix(0.5, 1e-6)
+    assert gyro.bias == 0.0
+
+
+# --- variance ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [GyroConfig(bias_walk=0.0, scale_sigma=0.01), GyroConfig(bias_walk=0.0)])
+def test_the_variance_over_a_blind_time_does_not_depend_on_how_it_is_cut(config):
+    sums = []
+    for dt in (0.05, 0.2, 1.0):
+        gyro, variance = known(Gyro(config), 0.001, 0.003), 0.0
+        for i in range(round(10.0 / dt)):
+            variance += gyro.measure(step(i * dt, (i + 1) * dt, lambda t: 0.2), DRIVING, blind_s=i * dt).variance
+        sums.append(variance)
+    white, bias = config.yaw_per_sqrt_s**2 * 10.0, (0.003 * 10.0) ** 2
+    expected = white + bias + config.scale_sigma**2 * (0.2 - 0.001) * 10.0
+    assert sums == pytest.approx([expected] * 3, rel=1e-6)
+
+
+def test_the_variance_covers_what_a_wrong_bias_does():
+    """Over runs whose bias is drawn as the gyro believes it to be."""
+    rng, sigma, values = np.random.default_rng(4), 0.004, []
+    for _ in range(60):
+        bias = rng.normal(0.0, sigma)
+        gyro, yaw, variance = known(Gyro(GyroConfig(bias_walk=0.0)), 0.0, sigma), 0.0, 0.0
+        for i in range(20):
+            turn = gyro.measure(step(0.5 * i, 0.5 * i + 0.5, lambda t, b=bias: b, hz=20.0), DRIVING, blind_s=0.5 * i)
+            yaw, variance = yaw + turn.yaw, variance + turn.variance
+        values.append(yaw**2 / variance)
+    assert 0.6 < np.mean(values) < 1.5
