@@ -42,7 +42,9 @@ class Case:
 
     floor: Floor
     chain: Callable[[Recorded], list[dict[str, Any]]] = lambda recorded: []
-    wheels_wrong: Callable[[Recorded], list[Interval]] = lambda recorded: []  # what the oracle is told [s]
+    wheels_wrong: Callable[[Recorded], list[Interval]] | None = (
+        None  # what an oracle is told [s]; None: nothing to tell
+    )
 
 
 def _dark(length_s: float) -> Case:
@@ -109,7 +111,7 @@ def cell(
         recorded = load(case.floor, split, seed)
         chain = [failure(described) for described in case.chain(recorded)]
         config = changed(recorded.config, changes or {})
-        if oracle:
+        if oracle and case.wheels_wrong is not None:
             config = changed(config, distrusting(case.wheels_wrong(recorded)))
         out.append(replay(recorded, config, chain, seed, batch))
     return out

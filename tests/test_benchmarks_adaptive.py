@@ -113,8 +113,10 @@ def test_every_case_describes_failures_and_intervals():
     assert moved_id(made) == 2
     for case in CASES.values():
         chain = [failure(described) for described in case.chain(made)]
-        told = changed(Config(), distrusting(case.wheels_wrong(made))).weights.distrust
-        assert all(d.end_s > d.start_s for d in told)
+        if case.wheels_wrong is not None:
+            told = changed(Config(), distrusting(case.wheels_wrong(made))).weights.distrust
+            assert told
+            assert all(d.end_s > d.start_s for d in told)
         assert len(chain) <= 1
     assert {case.floor for case in CASES.values()} == {"unequal_radii", "patches", "slippery"}
 
