@@ -80,6 +80,8 @@ class SourceTrust:
         reason = self._failure(verdict.since)
         if verdict.since or reason != self._reason:
             self.flags[f"wheels.{reason}"] += 1
+            if not verdict.since:  # the same failure, seen better now
+                self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
         return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -52,7 +53,7 @@ def test_steps_add_up_to_the_whole_turn():
 
     gyro = known(Gyro(GyroConfig()))
     cuts = [0.0, 0.05, 0.25, 0.31, 0.8, 1.0]
-    parts = [gyro.measure(step(a, b, rate), DRIVING).yaw for a, b in zip(cuts, cuts[1:], strict=False)]
+    parts = [gyro.measure(step(a, b, rate), DRIVING).yaw for a, b in itertools.pairwise(cuts)]
     assert sum(parts) == pytest.approx(0.4 / 3.0 * (1.0 - math.cos(3.0)), abs=1e-4)
 
 

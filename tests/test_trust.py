@@ -1,0 +1,202 @@
+"""Motion sources compared: no false alarms, quick detection, where it began, when it ends, what failed."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from fgloc.config import Config, WeightsConfig
+from fgloc.disagreement import Disagreement
+from fgloc.motions import MotionSources
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.trust import SourceTrust
+from fgloc.types import MotionMeasurement, Readings, Step
+
+DT = 0.1
+COV = np.diag([0.004, 0.001, 0.008]) ** 2  # of the difference over a step
+TRACK = 0.3
+SPEED, TURN = 0.4, 0.5
+
+
+def judged(test: Disagreement, differences):
+    return [test.judge(DT, d, COV) for d in differences]
+
+
+def white(rng: np.random.Generator, n: int) -> np.ndarray:
+    return rng.multivariate_normal(np.zeros(3), COV, n)
+
+
+def test_sources_that_agree_as_they_say_are_not_flagged():
+    """Half an hour; the statistic is the largest of some twenty windows with three degrees of freedom."""
+    rng = np.random.default_rng(0)
+    verdicts = judged(Disagreement(WeightsConfig()), white(rng, 18_000))
+    alarms = sum(v.since > 0 for v in verdicts)
+    assert alarms <= 1
+    assert 12.0 < np.quantile([v.nis for v in verdicts], 0.999) < 30.0  # it does look at all windows
+
+
+@pytest.mark.parametrize("slip", [(0.008, 0.0, 0.0), (0.0, 0.0, 0.016), (-0.006, 0.0, 0.012)])
+def test_a_small_constant_slip_is_found_within_a_window_and_its_beginning_told(slip):
+    """Of two sigmas a step in all: no single step shows it."""
+    delays, misses = [], []
+    for seed in range(20):
+        differences = white(np.random.default_rng(seed), 60)
+        differences[30:] += slip
+        verdicts = judged(Disagreement(WeightsConfig()), differences)
+        first = next(i for i, v in enumerate(verdicts) if v.flagged)
+        assert first >= 30
+        delays.append(first - 29)
+        misses.append(verdicts[first].since - delays[-1])
+    assert np.median(delays) * DT <= 1.0
+    assert max(delays) * DT <= WeightsConfig().window_s
+    assert abs(np.median(misses)) <= 1.0  # steps
+    assert np.quantile(np.abs(misses), 0.9) <= 5.0
+
+
+def test_the_onset_does_not_depend_on_the_length_of_the_steps():
+    spans = []
+    for dt in (0.05, 0.2):
+        test, n = Disagreement(WeightsConfig()), round(0.6 / dt)
+        for _ in range(30):
+            test.judge(dt, np.zeros(3), COV * dt / DT)
+        for _ in range(n):
+            verdict = test.judge(dt, np.array([0.01, 0.0, 0.02]) * dt / DT, COV * dt / DT)
+            if verdict.since:
+                spans.append(verdict.since * dt)
+                break
+    assert spans[0] == pytest.approx(spans[1], abs=0.21)
+
+
+def test_a_flag_is_raised_once_held_and_released_after_agreement():
+    config = WeightsConfig()
+    test = Disagreement(config)
+    slip, none = np.array([0.03, 0.0, 0.05]), np.zeros(3)
+    during = judged(test, [slip] * 30)
+    raised = [v.since for v in during if v.since]
+    assert len(raised) == 1
+    assert all(v.flagged for v in during[2:])
+    # one step of agreement does not end it, nor does a pause shorter than the release
+    assert all(v.flagged for v in judged(test, [none, slip, none, none, slip]))
+    after = [v.flagged for v in judged(test, [none] * 30)]
+    held_s = after.index(False) * DT
+    assert config.release_s <= held_s <= 2.0 * config.release_s + DT
+    assert not any(after[after.index(False) :])
+    again = judged(test, [none] * 3 + [slip] * 10)  # what came before the release is forgotten
+    (since,) = [v.since for v in again if v.since]
+    assert since <= 10
+
+
+# --- which source, and why --------------------------------------------------------------------------------------------
+
+
+class Witness:
+    """A learned model as far as trust is concerned: of commands alone."""
+
+    class model:  # noqa: N801
+        class card:  # noqa: N801
+            reads_wheels = False
+            inputs = ("commands",)
+
+
+def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> SourceTrust:
+    config = Config.model_validate({"weights": {"distrust": distrust, **weights}})
+    sources = MotionSources(config, WheelMotion(config.wheels), Witness() if learned else None)
+    return SourceTrust(config.weights, sources, track)
+
+
+def reading(source: str, i: int, v: float, omega: float, cov=COV / 2) -> MotionMeasurement:
+    start = 10**18 + round(i * DT * 1e9)
+    return MotionMeasurement(source, start, start + 10**8, np.array([v * DT, 0.0, omega * DT]), cov)
+
+
+def run(trust: SourceTrust, n: int, told, did=(SPEED, TURN), first: int = 0, witness: str = "learned"):
+    found = []
+    for i in range(first, first + n):
+        wheels, other = reading("wheels", i, *told), reading(witness, i, *did)
+        step = Step(i, 0, wheels.start_ns, wheels.stamp_ns)
+        found.append(trust.judge(step, Readings(wheels, **{witness: other})))
+    return found
+
+
+def sides(left: float, right: float) -> tuple[float, float]:
+    """Speed and yaw rate of wheels that say these speeds."""
+    return 0.5 * (left + right), (right - left) / TRACK
+
+
+LEFT, RIGHT = SPEED - 0.5 * TRACK * TURN, SPEED + 0.5 * TRACK * TURN
+
+
+@pytest.mark.parametrize(
+    ("told", "reason"),
+    [
+        (sides(0.0, 0.0), "frozen"),
+        (sides(0.0, RIGHT), "left_wheel_dead"),
+        (sides(LEFT, 0.0), "right_wheel_dead"),
+        (sides(1.4 * LEFT, 1.5 * RIGHT), "slip"),
+    ],
+)
+def test_fault_31_a_stuck_or_slipping_wheel_is_told_apart(told, reason):
+    trust = trust_in()
+    assert not any(t.off for t in run(trust, 20, sides(LEFT, RIGHT)))
+    found = run(trust, 20, told, first=20)
+    assert found[-1].off == {"wheels": reason}
+    raised = [i for i, t in enumerate(found) if t.off]
+    assert raised[0] * DT < 0.5
+    assert found[raised[0]].span <= raised[0] + 1 + 3
+    assert sum(trust.flags.values()) == 1
+    assert trust.flags[f"wheels.{reason}"] == 1
+
+
+def test_a_failure_whose_kind_shows_later_is_one_failure():
+    """First both wheels slip, then one stands still: told as what it turned out to be."""
+    trust = trust_in()
+    run(trust, 20, sides(LEFT, RIGHT))
+    run(trust, 8, sides(1.5 * LEFT, 1.5 * RIGHT), first=20)
+    found = run(trust, 30, sides(0.0, RIGHT), first=28)
+    assert found[-1].off == {"wheels": "left_wheel_dead"}
+    assert trust.flags == Counter({"wheels.left_wheel_dead": 1})
+
+
+def test_without_the_track_no_wheel_is_accused():
+    found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
+    assert found[-1].off == {"wheels": "slip"}
+
+
+def test_the_gyro_alone_witnesses_a_wrong_turn():
+    trust = trust_in(learned=False)
+    assert not any(t.off for t in run(trust, 20, (SPEED, TURN), witness="gyro"))
+    found = run(trust, 20, (SPEED, TURN + 0.4), first=20, witness="gyro")
+    assert found[-1].off == {"wheels": "slip"}
+    forward = run(trust_in(learned=False), 40, (2.0 * SPEED, TURN), witness="gyro")
+    assert not any(t.off for t in forward)  # of the way it knows nothing
+
+
+def test_without_a_witness_or_without_adaptation_nothing_is_flagged():
+    wild = sides(0.0, 3.0 * RIGHT)
+    assert not any(t.off for t in run(trust_in(adaptive=False), 20, wild))
+    alone = trust_in()
+    for i in range(20):
+        wheels = reading("wheels", i, *wild)
+        assert not alone.judge(Step(i, 0, wheels.start_ns, wheels.stamp_ns), Readings(wheels)).off
+
+
+def test_known_failures_are_believed_in_their_intervals_alone():
+    trust = trust_in(
+        [{"source": "learned", "start_s": 0.5, "end_s": 1.0}, {"source": "wheels", "start_s": 0.75, "end_s": 0.76}]
+    )
+    found = run(trust, 20, (SPEED, TURN))
+    off = {
+        source: [i for i, t in enumerate(found) if t.off.get(source) == "distrusted"]
+        for source in ("learned", "wheels")
+    }
+    assert off == {"learned": [5, 6, 7, 8, 9], "wheels": [7]}
+    assert all(t.span == 1 for t in found)
+
+
+def test_a_new_segment_begins_without_a_flag():
+    trust = trust_in()
+    assert run(trust, 20, sides(0.0, RIGHT))[-1].off
+    trust.reset()
+    assert not any(t.off for t in run(trust, 20, (SPEED, TURN), first=20))
