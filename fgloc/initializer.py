@@ -43,6 +43,7 @@ _WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to 
 _PARTIAL_COST_PER_DOF = 1.5
 _PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
+_REDUNDANT = 7  # residuals more than a pose has coordinates
 _TRIMS = 3
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
@@ -136,7 +137,7 @@ class Initializer:
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkMeasurement],
         readings: Readings | None = None,
-        landmarks: int = 1,
+        known: bool = False,
     ) -> Start | None:
         """Add a step; return the start once one place explains what was seen and no other does.
 
@@ -145,13 +146,14 @@ class Initializer:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            landmarks: how many different ones a place has to explain.
+            known: the robot is believed to be elsewhere. Then it takes two landmarks, and more sightings than a pose
+                needs: a wrong id or two agree with some place always.
         """
         self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
         while self._steps[0].step.stamp_ns < horizon:
             self._steps.popleft()
-        newest = self._solve(landmarks) if sightings else None
+        newest = self._solve(known) if sightings else None
         if newest is None:
             return None
         self.waiting = False
@@ -160,7 +162,7 @@ class Initializer:
         self._steps.clear()
         return Start(steps, Belief(se2.compose(newest.pose, back), _WEAK_PRIOR.copy()), newest)
 
-    def _solve(self, landmarks: int) -> Belief | None:
+    def _solve(self, known: bool) -> Belief | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
         few = _spread(here, _MAX_ROUGH)
         rough = [fit for c in self._candidates(here) if (fit := self._fit(c, few, _ROUGH_ITERATIONS)) is not None]
@@ -174,7 +176,7 @@ class Initializer:
             return None
         best = found[0]
         rivals = [other for other in found[1:] if _apart(best.fit.pose, other.fit.pose)]
-        if best.landmarks < landmarks or not best.certain:
+        if not best.certain or (known and (best.landmarks < 2 or best.fit.redundancy < _REDUNDANT)):
             return None
         if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None

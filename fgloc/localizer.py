@@ -226,7 +226,7 @@ class Localizer:
         self.sources.went(readings, belief if believed else None)
         self._watch_for_loss(believed)
         frame = self.estimator.log.keyframes[k]
-        frame.readings, frame.off = readings, frozenset(trust.off)
+        frame.readings, frame.off = readings, trust.off
         decisions += motion_decisions(k, motions, readings, trust, "overruled by sightings" if fit is not None else "")
         return self._estimate(step, belief, [*decisions, *weighed])
 
@@ -238,7 +238,7 @@ class Localizer:
         frames = [log[i] for i in range(k - trust.span + 1, k) if i in log and log[i].prior is None]
         changed, decisions = {}, []
         for frame in frames:
-            frame.off |= frozenset(trust.off)
+            frame.off = {**frame.off, **trust.off}
             changed[frame.k] = motions = self.sources.combine(frame.readings, frame.off)
             if motions:
                 decisions += motion_decisions(frame.k, motions, frame.readings, trust, "")
@@ -289,7 +289,7 @@ class Localizer:
             or not (self.config.weights.adaptive and self.factors.known)
         ):
             return None
-        started = self._initializer.collect(step, self.sources.combine(readings), contrary, readings, landmarks=2)
+        started = self._initializer.collect(step, self.sources.combine(readings), contrary, readings, known=True)
         if started is None or self.estimator.belief is None:
             return None
         x, y, yaw = se2.between(self.estimator.belief.pose, started.newest.pose)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +48,8 @@ class MotionSources:
         self._learned = learned
         self._joint = joint
         self.gyro = gyro
+        way = math.sqrt(config.weights.slip_scale)
+        self._slip_scale = np.outer((way, way, 1.0), (way, way, 1.0))
         self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
         self._way_m = self._turn_rad = 0.0  # what the wheels have told since the last fix
 
@@ -102,19 +104,23 @@ class MotionSources:
             return None
         return self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
 
-    def combine(self, readings: Readings, off: Container[str] = ()) -> list[MotionMeasurement]:
+    def combine(self, readings: Readings, off: Mapping[str, str] | None = None) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other.
 
         Args:
             readings: what the sources say.
-            off: sources that are not to be trusted. The wheels' factor is then left out or, if nothing else knows the
-                distance, kept with room for a slip. The other sources enter as they are.
+            off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
+                knows the distance, kept with room for a slip. The other sources enter as they are, but for the way
+                that the learned motion tells while the wheels slip, which it knows less well.
         """
+        off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
         if learned is None or "learned" in off:
             learned = None
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
+        if learned is not None and off.get("wheels") == "slip":
+            learned = replace(learned, cov=learned.cov * self._slip_scale)
         if wheels is not None and "wheels" in off:
             wheels = None if learned is not None else slipping(wheels)
         elif wheels is not None and learned is not None:

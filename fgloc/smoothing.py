@@ -70,7 +70,7 @@ def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMe
     changed = {}
     for frame in solver.frames:
         if frame.k in solver.outliers:
-            frame.off |= solver.outliers[frame.k]
+            frame.off = {**dict.fromkeys(solver.outliers[frame.k], "outlier"), **frame.off}
             if motions := parts.localizer.sources.combine(frame.readings, frame.off):
                 changed[frame.k] = tuple(motions)
     return changed

@@ -11,7 +11,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import chi2_bound, joint_fit
+from fgloc.graph.weights import REDUNDANT, chi2_bound, joint_fit
 from fgloc.types import LandmarkMeasurement
 
 _LIKELY = 0.9  # a NIS that is exceeded less often than the rest of this scales the interval
@@ -36,7 +36,7 @@ def interval_scale(
     Source: design.md §6.4.
     """
     fit = joint_fit(predicted.pose, sightings, factors, config)
-    if fit is None or fit.cost > chi2_bound(config.estimator.gate_probability, fit.dof):
+    if fit is None or fit.cost > fit.bound(config.estimator.gate_probability):
         return 1.0, float("nan")
     miss = se2.log(se2.between(predicted.pose, fit.pose))
 
@@ -44,7 +44,8 @@ def interval_scale(
         return float(miss @ np.linalg.solve(scale * predicted.cov + fit.cov, miss))
 
     found = nis(1.0)
-    most = _MOST if len({m.landmark_id for m in sightings}) > 1 else _MOST_BY_ONE
+    several = len({m.landmark_id for m in sightings}) > 1 and fit.redundancy >= REDUNDANT
+    most = _MOST if several else _MOST_BY_ONE
     if found <= chi2_bound(_LIKELY, 3) or nis(most) > 3.0:
         return 1.0, found
     return float(brentq(lambda scale: nis(scale) - 3.0, 1.0, most, rtol=1e-3)), found

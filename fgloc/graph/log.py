@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
@@ -46,7 +46,7 @@ class Keyframe:
     step: Step | None = None  # what was heard, to be measured again
     mode: Mode = Mode.OK
     readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
-    off: frozenset[str] = frozenset()  # ... and which of them were not believed
+    off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
 
 
 @dataclass(slots=True)

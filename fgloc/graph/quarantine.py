@@ -15,7 +15,7 @@ from fgloc.graph.log import Sighting
 from fgloc.types import CornerMeasurement, FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark
-_AGREE_M, _AGREE_SHARE = 0.15, 0.3  # how far they may lie from their median: at least, and of the displacement
+_AGREE_M, _AGREE_SHARE = 0.15, 0.5  # how far they may lie from their median: at least, and of the displacement
 _LEAST_M, _LEAST_SHARE = 0.05, 0.05  # nearer to its place, plus this share of the distance: ill seen, not moved
 _BELIEVED_COUNTS = 2.0  # a sighting that fits weighs as much as this many that do not
 _ITERATIONS = 4

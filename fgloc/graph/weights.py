@@ -29,7 +29,9 @@ from fgloc.types import (
 
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _GAUSS_NEWTON_STEPS = 4
+_STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
+REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
@@ -55,6 +57,7 @@ class Weights:
         self.rejections: Counter[str] = Counter()
         self.refused_in_a_row = 0
         self._refused_ids: set[int] = set()
+        self._believed_ns = 0  # the newest keyframe at which something was believed
         self.quarantine = Quarantine(config.weights.quarantine_after)
 
     def weigh(
@@ -102,15 +105,17 @@ class Weights:
             )
         if believed:
             self.forget_refusals()
+            self._believed_ns = stamp_ns
+        if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
             self._accuse(k, refused, decisions, predicted)
-        else:
+        if not believed:
             contrary = [d.landmark_id for d in decisions if d.reason != "quarantined"]
             self.refused_in_a_row += len(contrary)
             self._refused_ids.update(contrary)
         return believed, refused, decisions
 
     def _accuse(self, k: int, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> None:
-        """Others were believed: what was refused beside them may have been moved."""
+        """Others were believed, now or just before: what is refused beside them may have been moved."""
         reasons = iter([d.reason for d in decisions if d.reason])
         gated = [s for s, reason in zip(refused, reasons, strict=True) if reason in ("gate", "quarantined")]
         if self._config.weights.adaptive and self._factors.known and gated:
@@ -126,7 +131,7 @@ class Weights:
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
         fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
-        if fit is None or fit.cost > chi2_bound(self._config.estimator.gate_probability, fit.dof):
+        if fit is None or fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability):
             return None
         x, y, yaw = se2.between(predicted.pose, fit.pose)
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
@@ -212,12 +217,21 @@ def joint_nis(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A pose that sightings alone give: covariance of the right perturbation, robust cost, degrees of freedom."""
+    """A pose that sightings alone give: covariance of the right perturbation, robust cost, number of residuals."""
 
     pose: FloatArray
     cov: FloatArray
     cost: float
     dof: int
+
+    @property
+    def redundancy(self) -> int:
+        """How many residuals there are more than are needed for a pose."""
+        return self.dof - 3
+
+    def bound(self, probability: float) -> float:
+        """What the cost exceeds as seldom as one minus this."""
+        return chi2_bound(probability, max(self.redundancy, 1))
 
 
 def joint_fit(
