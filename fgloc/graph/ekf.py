@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -52,5 +54,7 @@ class ExtendedKalmanFilter(Estimator):
         left = np.eye(3) - K @ H
         frame.belief = Belief(pose, left @ P @ left.T + K @ K.T)
 
-    def _build_again(self) -> None:
-        """The beliefs in the log are all there is."""
+    def _build_again(self, changed: Sequence[int]) -> None:
+        """Filter anew; the oldest belief in the log, which nothing leads to any more, stands as it was changed."""
+        if changed:
+            self._solve_again(changed)

@@ -107,16 +107,16 @@ class Estimator(ABC):
             since_s: of the estimator's own time.
             scale: on the covariances.
         """
-        for frame in self.log.since(since_s):
-            if frame.elapsed_s > since_s and frame.prior is None:
-                frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
-                frame.belief = Belief(frame.belief.pose, frame.belief.cov * scale)
-        self._build_again()
+        inside = [f for f in self.log.since(since_s) if f.elapsed_s > since_s and f.prior is None]
+        for frame in inside:
+            frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
+            frame.belief = Belief(frame.belief.pose, frame.belief.cov * scale)
+        self._build_again([frame.k for frame in inside])
         self.belief = self.log.keyframes[self._k].belief
 
     @abstractmethod
-    def _build_again(self) -> None:
-        """The log has changed: take it up, and give the newest keyframe its belief."""
+    def _build_again(self, changed: Sequence[int]) -> None:
+        """Motions and beliefs of these keyframes (in order) have changed: take the log up as it is now."""
 
     def _take(self, frame: Keyframe) -> Belief:
         self._solve(frame)

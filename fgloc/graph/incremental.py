@@ -122,15 +122,20 @@ class IncrementalEstimator(Estimator):
             newest.belief = Belief(backend.pose(newest.k), backend.covariance(newest.k))
         except _GTSAM_ERRORS:
             self.rebuilt += 1
-            self._build_again()
+            self._build_again(changed)
             return
         for frame in frames:
             held, new = new[: len(frame.motions)], new[len(frame.motions) :]
             self._slots[frame.k] = frame.elapsed_s, held
 
-    def _build_again(self) -> None:
+    def _build_again(self, changed: Sequence[int]) -> None:
         newest = self.log.keyframes[self._k]
-        newest.belief = self._replayed(self._window(newest) or [newest], newest.belief.pose)
+        initial = newest.belief.pose
+        try:
+            newest.belief = self._replayed(self._window(newest) or [newest], initial)
+        except _GTSAM_ERRORS:  # what the window knew is in the belief
+            self.rebuilt += 1
+            newest.belief = self._replayed([newest], initial)
 
     def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: Belief | None = None) -> None:
         """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""
