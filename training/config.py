@@ -111,7 +111,7 @@ class AdaptationConfig(Section):
 
     scale_sigma: float = Field(0.02, gt=0, description="how much the gains of robots of a kind differ, relatively")
     yaw_per_m_sigma: float = Field(0.02, gt=0, description="how much their pull to one side differs [rad/m]")
-    window_s: float = Field(5.0, gt=0, description="windows whose errors are compared with what the model expects")
+    window_s: float = Field(10.0, gt=0, description="windows whose errors are compared with what the model expects")
 
     after_training_s: float | None = Field(
         None,
