@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from fgloc import se2
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
     LandmarkMeasurement,
     MarkerPoseMeasurement,
+    Step,
 )
 
 
@@ -66,3 +70,17 @@ def _corner_variance(m: CornerMeasurement, cov: FloatArray, size_m: float) -> fl
     longest_px = math.sqrt(float((sides**2).sum(axis=1).max()))  # the least foreshortened: focal * size / depth
     by_translation = 0.0 if size_m <= 0.0 else (longest_px / size_m) ** 2 * max(cov[0, 0], cov[1, 1])
     return float(focal**2 * cov[2, 2] + by_translation)
+
+
+def measure_carried(
+    step: Step, landmarks: LandmarkSensor, wheels: WheelMotion, sizes_m: Mapping[int, float]
+) -> list[LandmarkMeasurement]:
+    """All sightings of a step, as if made at its end: the wheels carry those that were made before it."""
+    measured: list[LandmarkMeasurement] = []
+    for event in step.sightings:
+        found = landmarks.measure(event)
+        if found and event.stamp_ns != step.stamp_ns:
+            motion, cov = wheels.carry(step, step.stamp_ns, event.stamp_ns)
+            found = tuple(carry(m, motion, cov, sizes_m.get(m.landmark_id, 0.0), len(found)) for m in found)
+        measured.extend(found)
+    return measured

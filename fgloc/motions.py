@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.log import Belief
+from fgloc.graph.log import Belief, Keyframe
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro
@@ -133,6 +133,11 @@ class MotionSources:
             known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
         return known
 
+    def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
+        """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
+        made = self.combine(readings or frame.readings, frame.off)
+        return [worsened(m, frame.scale, frame.doubt) for m in made]
+
     def disagreement(self, readings: Readings) -> tuple[FloatArray, FloatArray] | None:
         """How far the wheels and the sources that witness their slip are apart over the step.
 
@@ -189,6 +194,11 @@ class MotionSources:
         self._silent_s = self._way_m = self._turn_rad = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
+
+
+def worsened(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None = None) -> MotionMeasurement:
+    """The motion with its covariance scaled, and with room ``(3, 3)`` for what sightings say against it."""
+    return replace(m, cov=m.cov * scale + (0.0 if doubt is None else doubt))
 
 
 def slipping(m: MotionMeasurement) -> MotionMeasurement:

@@ -71,7 +71,7 @@ def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMe
     for frame in solver.frames:
         if frame.k in solver.outliers:
             frame.off = {**dict.fromkeys(solver.outliers[frame.k], "outlier"), **frame.off}
-            if motions := parts.localizer.sources.combine(frame.readings, frame.off):
+            if motions := parts.localizer.sources.combine_again(frame):
                 changed[frame.k] = tuple(motions)
     return changed
 
@@ -87,7 +87,7 @@ def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[Mo
             if frame.step is None:
                 continue
             readings = sources.read_again(frame.readings, frame.step, velocity)
-            if motions := sources.combine(readings, frame.off):
+            if motions := sources.combine_again(frame, readings):
                 again[frame.k] = tuple(motions)
     return again
 

@@ -110,6 +110,8 @@ class Estimator(ABC):
         inside = [f for f in self.log.since(since_s) if f.elapsed_s > since_s and f.prior is None]
         for frame in inside:
             frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
+            frame.scale *= scale
+            frame.doubt = None if frame.doubt is None else frame.doubt * scale
             frame.belief = Belief(frame.belief.pose, frame.belief.cov * scale)
         self._build_again([frame.k for frame in inside])
         self.belief = self.log.keyframes[self._k].belief

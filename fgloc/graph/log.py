@@ -47,6 +47,8 @@ class Keyframe:
     mode: Mode = Mode.OK
     readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
     off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
+    scale: float = 1.0  # on the covariances of the motions that these make ...
+    doubt: FloatArray | None = None  # ... and what was added to them
 
 
 @dataclass(slots=True)

@@ -1,0 +1,187 @@
+"""Whether the robot is where it is believed to be: its first pose, fixes, contradictions, and the search for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.log import Belief
+from fgloc.graph.weights import NEAR_M, NEAR_RAD
+from fgloc.initializer import Initializer, Start
+from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
+
+_NAMED = 3  # jumps
+_ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
+_NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
+_ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
+
+
+class Whereabouts:
+    """Looks for the robot while its place is unknown or contradicted, and keeps the time since the last fix.
+
+    A first pose that was given, and that sightings contradict from the start, holds against them: whether it or the map
+    is wrong, only the user can tell. They are refused and reported.
+
+    Attributes:
+        lost: nothing explains where the robot is.
+        fix_elapsed_s: the estimator's own time at the last fix.
+        defied: how far ``(3,)`` from the given first pose, in its frame, sightings put the robot; None: they did not.
+    """
+
+    def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
+        self._config = config.estimator
+        self._adaptive = config.weights.adaptive and factors.known
+        self._known = factors.known
+        self._initializer = Initializer(config, landmark_map, factors)
+        self.lost = False
+        self.fix_elapsed_s = 0.0
+        self.defied: FloatArray | None = None
+        self._clock_s = self._fix_s = 0.0
+        self._given = self._contradicted = False
+        self._jumps: list[FloatArray] = []
+
+    def begin_segment(self, last: Belief | None) -> Belief | None:
+        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
+        self.lost = self._given = self._contradicted = False
+        self._initializer.reset()
+        given = self._config.initial_pose
+        if given is not None and last is None:
+            self._given = True
+            return Belief(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
+        if self._known:
+            return None
+        return Belief(np.zeros(3), _ORIGIN) if last is None else Belief(last.pose, _ANYWHERE.copy())
+
+    def elapse(self, seconds: float) -> None:
+        """Time goes on."""
+        self._clock_s += seconds
+
+    @property
+    def blind_s(self) -> float:
+        """Time since the last fix [s]."""
+        return self._clock_s - self._fix_s
+
+    @property
+    def dark(self) -> bool:
+        """Whether the last fix is so long ago that the robot is dead reckoning."""
+        return self.blind_s > self._config.dead_reckoning_after_s
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the pose is looked for on the whole map."""
+        return self._initializer.waiting
+
+    @property
+    def mode(self) -> Mode:
+        """Of the newest estimate."""
+        if self.lost:
+            return Mode.LOST
+        return Mode.DEAD_RECKONING if self.dark else Mode.OK
+
+    @property
+    def holds_given(self) -> bool:
+        """Whether a given first pose was contradicted from the start, and by nothing confirmed yet."""
+        return self._given and self._contradicted
+
+    def fixed(self, elapsed_s: float, believed: bool = True) -> None:
+        """The robot is where it is believed to be, at this time of the estimator's.
+
+        Args:
+            elapsed_s: of the estimator's own time.
+            believed: whether sightings said so.
+        """
+        self._fix_s, self.fix_elapsed_s = self._clock_s, elapsed_s
+        if believed:
+            self.lost = self._given = False
+            self._initializer.forget()
+
+    def contradict(self) -> None:
+        """Sightings were refused, and none believed."""
+        if self._given and not self._contradicted:
+            self._contradicted = not self.dark  # later it is the motion that may be wrong
+            self._given = self._contradicted
+
+    def defy(self, believed: Belief, place: Belief) -> None:
+        """Sightings agree on another place than the given one."""
+        self.defied = se2.between(believed.pose, place.pose)
+
+    def get_lost(self) -> None:
+        """Look for the robot anywhere on the map."""
+        self.lost = True
+        self._initializer.waiting = True
+
+    def nowhere(self, belief: Belief | None) -> bool:
+        """Whether the pose is so little known that only a search of the map can find it again."""
+        if belief is None or not self._known:
+            return False
+        x, y, yaw = np.sqrt(np.diag(belief.cov))
+        return bool(max(x, y) > _NOWHERE_M or yaw > _NOWHERE_RAD)
+
+    def start_known(self) -> None:
+        """The pose is known; stop looking for it."""
+        self._initializer.waiting = False
+
+    def collect(
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[LandmarkMeasurement],
+        readings: Readings,
+    ) -> Start | None:
+        """While waiting: add a step; the start once it is clear."""
+        return self._initializer.collect(step, motions, sightings, readings)
+
+    def search(
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        contrary: Sequence[LandmarkMeasurement],
+        readings: Readings,
+        predicted: Belief,
+    ) -> Belief | None:
+        """While nothing is believed, look for another place that explains what is refused: the robot may be there.
+
+        Returns:
+            A place told by two landmarks or more, and far from the predicted one: nearer ones are the business of
+            `Weights.overruled`, unless the first pose was given.
+        """
+        if contrary:
+            self.contradict()
+        searching = bool(contrary) or self._initializer.searching
+        told = self.holds_given and self.defied is not None
+        if not searching or told or self.waiting or not self._adaptive:
+            return None
+        started = self._initializer.collect(step, motions, contrary, readings, known=True)
+        if started is None or self.holds_given:
+            return None if started is None else started.newest
+        x, y, yaw = se2.between(predicted.pose, started.newest.pose)
+        return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
+
+    def found(self, believed: Belief, place: Belief) -> None:
+        """The robot was found at another place than it was believed to be at."""
+        self._jumps.append(se2.between(believed.pose, place.pose))
+        self.lost = self._given = False
+        self._initializer.forget()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps[:_NAMED]]
+        if len(self._jumps) > _NAMED:
+            said.append(f"... and {len(self._jumps) - _NAMED} times more")
+        if self.defied is not None:
+            said.append(
+                f"sightings contradict the given first pose: they put the robot {_far(self.defied)} off and were "
+                "refused; correct estimator.initial_pose or the map, or leave the first pose to the sightings"
+            )
+        return tuple(said)
+
+
+def _far(miss: FloatArray) -> str:
+    x, y, yaw = miss
+    return f"{np.hypot(x, y):.2f} m and {abs(np.degrees(yaw)):.0f} degrees (forward {x:+.2f}, left {y:+.2f})"
