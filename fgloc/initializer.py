@@ -43,7 +43,8 @@ _WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to 
 _PARTIAL_COST_PER_DOF = 1.5
 _PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
-_REDUNDANT = 7  # residuals more than a pose has coordinates
+_RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
+_REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 _TRIMS = 3
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
@@ -87,6 +88,7 @@ class _Agreed:
     fit: Fit
     share: float
     landmarks: int
+    redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
 
     @property
     def certain(self) -> bool:
@@ -94,8 +96,15 @@ class _Agreed:
         if self.share < _LEAST_SHARE.get(self.landmarks, _LEAST_SHARE_OF_MANY) or self.fit.dof < 4:
             return False
         whole = self.share >= _WHOLE_SHARE
+        if not whole and self.redundancy < _REDUNDANT:
+            return False
         cost, sigma = (_MAX_COST_PER_DOF, _MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
         return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
+
+    @property
+    def compelling(self) -> bool:
+        """Whether it says that the robot is not where it was believed to be."""
+        return self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * _REDUNDANT
 
     def beats(self, other: _Agreed) -> bool:
         """Whether a place that explains about as much is so much worse that it is none."""
@@ -146,8 +155,8 @@ class Initializer:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            known: the robot is believed to be elsewhere. Then it takes two landmarks, and more sightings than a pose
-                needs: a wrong id or two agree with some place always.
+            known: the robot is believed to be elsewhere. Then it takes two landmarks, and that nearly everything agrees:
+                some wrong ids agree with some place always.
         """
         self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
@@ -176,7 +185,7 @@ class Initializer:
             return None
         best = found[0]
         rivals = [other for other in found[1:] if _apart(best.fit.pose, other.fit.pose)]
-        if not best.certain or (known and (best.landmarks < 2 or best.fit.redundancy < _REDUNDANT)):
+        if not best.certain or (known and not best.compelling):
             return None
         if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None
@@ -198,8 +207,10 @@ class Initializer:
                 return None
             fit = trimmed
         share = sum(map(_information, agreeing)) / sum(map(_information, sightings))
-        landmarks = len({m.landmark_id for m in agreeing})
-        return _Agreed(fit, share if landmarks > 1 else len(agreeing) / len(sightings), landmarks)
+        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing}
+        if len(residuals) < 2:
+            share = len(agreeing) / len(sightings)
+        return _Agreed(fit, share, len(residuals), sum(residuals.values()) - 3)
 
     def _explains(self, pose: FloatArray, m: LandmarkMeasurement) -> bool:
         cost = sighting_cost(pose, m, self._factors, self._config)

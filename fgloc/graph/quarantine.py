@@ -15,7 +15,7 @@ from fgloc.graph.log import Sighting
 from fgloc.types import CornerMeasurement, FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark
-_AGREE_M, _AGREE_SHARE = 0.15, 0.5  # how far they may lie from their median: at least, and of the displacement
+_AGREE_M, _AGREE_SHARE = 0.25, 0.15  # how far they may lie from their median: at least, and of the displacement
 _LEAST_M, _LEAST_SHARE = 0.05, 0.05  # nearer to its place, plus this share of the distance: ill seen, not moved
 _BELIEVED_COUNTS = 2.0  # a sighting that fits weighs as much as this many that do not
 _ITERATIONS = 4
@@ -50,6 +50,14 @@ class Quarantine:
     def displacements(self) -> dict[int, FloatArray]:
         """Landmarks in quarantine and how far ``(2,)`` [m], in the map, they seem to stand from their place."""
         return {i: np.median(case.places, axis=0) for i, case in sorted(self._cases.items()) if case.held}
+
+    def __len__(self) -> int:
+        """How many landmarks are in quarantine."""
+        return sum(case.held for case in self._cases.values())
+
+    def forget(self) -> None:
+        """What was held against landmarks was held against them from a wrong place."""
+        self._cases.clear()
 
     def holds(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""

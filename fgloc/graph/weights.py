@@ -30,6 +30,7 @@ from fgloc.types import (
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _GAUSS_NEWTON_STEPS = 4
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
+_LATELY_NS = 20_000_000_000
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
@@ -188,9 +189,17 @@ class Weights:
     def contradicted(self) -> bool:
         """Whether so much was refused, and so little believed, that the robot must be elsewhere.
 
-        One landmark alone does not say so, however often it is seen: it may have been moved.
+        One landmark alone does not say so, however often it is seen: it may have been moved. Nor do two or more in
+        quarantine, unless fewer than they agree: then it is not they that are in the wrong place.
         """
-        return self.refused_in_a_row >= self._config.estimator.lost_after and len(self._refused_ids) > 1
+        if self.refused_in_a_row >= self._config.estimator.lost_after and len(self._refused_ids) > 1:
+            return True
+        held = len(self.quarantine)
+        return held > 1 and held >= len(self._agreeing(_LATELY_NS))
+
+    def _agreeing(self, lately_ns: int) -> set[int]:
+        """Landmarks believed in this last time."""
+        return {i for i, stamp_ns in self._last_used_ns.items() if stamp_ns > self._believed_ns - lately_ns}
 
     def forget_refusals(self) -> None:
         """Count refusals anew."""
