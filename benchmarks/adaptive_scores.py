@@ -21,7 +21,7 @@ from fgloc.types import CornersEvent, Decision, Event, FloatArray, Mode, RunResu
 _NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
 _NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")
 _LINGER_S = 0.5  # a slip that is flagged so long after its end was still found
-_WINDOW_S = 1.0  # a flag may speak of a slip that ended so long before it
+_WINDOW_S = 2.0  # a flag may speak of a slip, however short, so long before it: the detector's window
 _STEP_S = 0.45  # flagged steps closer than this are of one flag
 _OFF_M, _OFF_RAD = 0.3, 0.2  # nearer to the truth than this, a kidnapped robot is found again ...
 _STAYS_S = 1.0  # ... if it stays so for this long
@@ -35,7 +35,7 @@ class Slips:
         delays_s: from the true onset to the flag, of each slip that was found.
         found_m: distance that the wheels slipped, of each slip that was found.
         missed_m: likewise, of each that was not.
-        false_alarms: flags without a slip.
+        false_alarms: flags without any slip in the detector's window.
         path_m: distance travelled.
     """
 
@@ -123,7 +123,8 @@ def slips(recorded: Recorded, online: RunResult) -> Slips:
             found.append(way)
         else:
             missed.append(way)
-    false = sum(all(end < rise - _WINDOW_S or start > fall for start, end in true) for rise, fall in rises)
+    slipping = recorded.slip_s[recorded.slipping]
+    false = sum(not ((slipping > rise - _WINDOW_S) & (slipping <= fall)).any() for rise, fall in rises)
     return Slips(tuple(delays), tuple(found), tuple(missed), false, recorded.path_m)
 
 

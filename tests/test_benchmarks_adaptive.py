@@ -104,6 +104,11 @@ def test_a_pose_that_is_right_but_lost_is_not_found():
 def test_kidnap_lasts_until_the_robot_is_away():
     start, end = moved_interval(recorded(), 5.0, 3.0)
     assert (start, end) == pytest.approx((5.0, 11.0), abs=0.03)
+    swinging = recorded()
+    swinging.truth[:, 1] = 2.0 * np.sin(2.0 * np.pi * swinging.truth[:, 0] / 20.0)  # 2 m to either side
+    start, end = moved_interval(swinging, 0.0, 3.0)
+    assert start == pytest.approx(2.0, abs=0.05)  # the first whole second from which 3 m lie ahead: x is 1.18
+    assert 10.0 < end < 15.0
     with pytest.raises(ValueError, match="never 30"):
         moved_interval(recorded(), 5.0, 30.0)
 
