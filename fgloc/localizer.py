@@ -38,7 +38,7 @@ from fgloc.types import (
     Readings,
     Step,
 )
-from fgloc.whereabouts import Whereabouts
+from fgloc.whereabouts import CONTRADICTS, Whereabouts
 
 
 class Localizer:
@@ -142,15 +142,14 @@ class Localizer:
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
-        believed, refused, decisions = self.weights.weigh(k, step.stamp_ns, sightings, prior, self._calibration())
+        weighed = self.weights.weigh(k, step.stamp_ns, sightings, prior, self._calibration())
+        believed, _, decisions = self._whereabouts.hold(*weighed)
         if self.calibrator is not None:
             self.calibrator.start(prior.pose, prior.cov)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
         self._whereabouts.fixed(self.estimator.elapsed_s, bool(believed))
-        if refused and not believed:
-            self._whereabouts.contradict()
         return self._estimate(step, belief, decisions)
 
     def _advance(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
@@ -167,7 +166,9 @@ class Localizer:
             motions, scale, returned = self._return(k, step, motions, sightings)
             decisions += returned
             predicted = self.estimator.predict(motions)
-            believed, refused, weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+            believed, refused, weighed = self._whereabouts.hold(
+                *self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+            )
             place = None
             if not believed:
                 contrary = [s.raw for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)]
@@ -176,7 +177,7 @@ class Localizer:
                 if not self._whereabouts.holds_given:
                     return self._found(step, place, [*decisions, *weighed])
                 self._whereabouts.defy(predicted, place)
-                decisions.append(place_decision(k, step.stamp_ns, predicted, place, "contradicts initial_pose"))
+                decisions.append(place_decision(k, step.stamp_ns, predicted, place, CONTRADICTS))
             fit, doubt = None, None
             if not believed and not self._whereabouts.holds_given:
                 fit = self.weights.overruled(refused, weighed, predicted)
@@ -204,7 +205,7 @@ class Localizer:
         if believed:
             self._whereabouts.fixed(self.estimator.elapsed_s)
         self.sources.went(readings, belief if believed else None)
-        if not believed and self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
+        if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
             self._get_lost()
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, scale, doubt
@@ -264,6 +265,7 @@ class Localizer:
 
     def _get_lost(self) -> None:
         self.weights.forget_refusals()
+        self.weights.quarantine.forget()
         self._whereabouts.get_lost()
 
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief
+from fgloc.graph.log import Belief, Sighting
 from fgloc.graph.weights import NEAR_M, NEAR_RAD
 from fgloc.initializer import Initializer, Start
-from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
+from fgloc.types import Decision, FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 _NAMED = 3  # jumps
+_CONFIRMED = 2  # sightings in excess of those that speak against it: more confirm a given pose
+CONTRADICTS = "contradicts initial_pose"
 _ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
@@ -42,16 +45,17 @@ class Whereabouts:
         self.fix_elapsed_s = 0.0
         self.defied: FloatArray | None = None
         self._clock_s = self._fix_s = 0.0
-        self._given = self._contradicted = False
+        self._given = False  # whether the first pose was given, and nothing is known yet of its worth
+        self._speaking_for = self._speaking_against = 0  # sightings
         self._jumps: list[FloatArray] = []
 
     def begin_segment(self, last: Belief | None) -> Belief | None:
         """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
-        self.lost = self._given = self._contradicted = False
+        self.lost = self._given = False
         self._initializer.reset()
         given = self._config.initial_pose
         if given is not None and last is None:
-            self._given = True
+            self._given, self._speaking_for, self._speaking_against = True, 0, 0
             return Belief(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
         if self._known:
             return None
@@ -85,8 +89,26 @@ class Whereabouts:
 
     @property
     def holds_given(self) -> bool:
-        """Whether a given first pose was contradicted from the start, and by nothing confirmed yet."""
-        return self._given and self._contradicted
+        """Whether sightings speak against a given first pose, and no more of them for it."""
+        return self._given and self._speaking_against >= max(self._speaking_for, 1)
+
+    def hold(
+        self, believed: list[Sighting], refused: list[Sighting], decisions: list[Decision]
+    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
+        """Judge a given first pose by what `Weights.weigh` makes of sightings; while it holds, believe none of them.
+
+        One that agrees with a contradicted pose does so by accident, and would drag it along.
+        """
+        if self.dark and not self._speaking_against:  # it is the motion that may be wrong by now
+            self._given = False
+        self._speaking_for += len(believed)
+        self._speaking_against += len(refused)
+        if self._speaking_for > self._speaking_against + _CONFIRMED:
+            self._given = False
+        if not self.holds_given:
+            return believed, refused, decisions
+        told = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
+        return [], [*refused, *believed], told
 
     def fixed(self, elapsed_s: float, believed: bool = True) -> None:
         """The robot is where it is believed to be, at this time of the estimator's.
@@ -97,14 +119,8 @@ class Whereabouts:
         """
         self._fix_s, self.fix_elapsed_s = self._clock_s, elapsed_s
         if believed:
-            self.lost = self._given = False
+            self.lost = False
             self._initializer.forget()
-
-    def contradict(self) -> None:
-        """Sightings were refused, and none believed."""
-        if self._given and not self._contradicted:
-            self._contradicted = not self.dark  # later it is the motion that may be wrong
-            self._given = self._contradicted
 
     def defy(self, believed: Belief, place: Belief) -> None:
         """Sightings agree on another place than the given one."""
@@ -150,8 +166,6 @@ class Whereabouts:
             A place told by two landmarks or more, and far from the predicted one: nearer ones are the business of
             `Weights.overruled`, unless the first pose was given.
         """
-        if contrary:
-            self.contradict()
         searching = bool(contrary) or self._initializer.searching
         told = self.holds_given and self.defied is not None
         if not searching or told or self.waiting or not self._adaptive:

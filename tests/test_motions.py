@@ -1,0 +1,232 @@
+"""What of the motion sources enters the graph: all they say together, no more, however time is cut."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion_models import make_card, make_tensors
+from robot_world import SPEED, START_NS, TURN, Chain, World, beacons, config
+from scipy.stats import chi2
+
+from fgloc import se2
+from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.graph.estimator import fuse
+from fgloc.graph.log import Belief, Keyframe
+from fgloc.localizer import Localizer
+from fgloc.motion import load_model, save_model
+from fgloc.motion.joint import JointCalibration
+from fgloc.motion.source import LearnedMotion
+from fgloc.motions import MotionSources, worsened
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.types import CommandEvent, ImuEvent, MotionMeasurement, Readings, Step
+
+W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2
+L_W, L_N = np.linalg.cholesky(W), np.linalg.cholesky(N)
+C = L_N @ np.diag([0.44, 0.3, 0.6]) @ L_W.T  # E[e_n e_w']
+
+
+def says(source: str, motion, cov) -> MotionMeasurement:
+    return MotionMeasurement(source, 0, 10**8, np.asarray(motion, dtype=float), np.asarray(cov))
+
+
+WHEELS = says("wheels", [0.050, 0.001, 0.020], W)
+LEARNED = says("learned", [0.058, 0.000, 0.012], N)
+GYRO = says("gyro", [0.050, 0.001, 0.016], np.diag([100.0, 100.0, 1e-5]))
+
+
+def learned_motion(tmp_path, kind="displacement", **card) -> LearnedMotion:
+    made = make_card(kind, **card)
+    save_model(tmp_path / "m.safetensors", make_tensors(made, np.random.default_rng(0)), made)
+    return LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
+
+
+def sources(learned=None, joint=None, gyro=None, **sections) -> MotionSources:
+    settings = Config.model_validate(sections)
+    return MotionSources(settings, WheelMotion(settings.wheels), learned, joint, gyro)
+
+
+def names(motions) -> list[str]:
+    return [m.source for m in motions]
+
+
+def test_the_pair_says_what_the_joint_gaussian_says(tmp_path):
+    """Of all unbiased combinations of two measurements with correlated errors the best one, to the last digit."""
+    both = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
+    motion, cov = fuse(both.combine(Readings(WHEELS, LEARNED)))
+    # the conditional of the joint, written out: x from [z_w; z_n] = [I; I] x + [e_w; e_n]
+    P = np.linalg.inv(np.block([[W, C.T], [C, N]]))
+    H = np.vstack([np.eye(3), np.eye(3)])
+    expected_cov = np.linalg.inv(H.T @ P @ H)
+    d = se2.log(se2.between(WHEELS.motion, LEARNED.motion))
+    expected = se2.compose(WHEELS.motion, se2.exp(expected_cov @ H.T @ P @ np.concatenate([np.zeros(3), d])))
+    assert motion == pytest.approx(expected, abs=1e-12)
+    assert cov == pytest.approx(expected_cov, rel=1e-9)
+    independent, too_small = fuse(sources(learned_motion(tmp_path)).combine(Readings(WHEELS, LEARNED)))
+    assert np.linalg.det(too_small) < 0.7 * np.linalg.det(expected_cov)
+    assert np.abs(independent - expected).max() > 1e-4
+
+
+def test_the_pair_is_honest_over_samples(tmp_path):
+    rng, values = np.random.default_rng(2), {"joint": [], "independent": []}
+    truth = np.array([0.05, 0.0, 0.015])
+    model = learned_motion(tmp_path)
+    made = {"joint": sources(model, JointCalibration(W, N, C)), "independent": sources(model)}
+    for e in rng.multivariate_normal(np.zeros(6), np.block([[W, C.T], [C, N]]), 400):
+        readings = Readings(
+            replace(WHEELS, motion=se2.compose(truth, se2.exp(e[:3]))),
+            replace(LEARNED, motion=se2.compose(truth, se2.exp(e[3:]))),
+        )
+        for name, which in made.items():
+            motion, cov = fuse(which.combine(readings))
+            error = se2.log(se2.between(motion, truth))
+            values[name].append(error @ np.linalg.solve(cov, error))
+    low, high = chi2.ppf([0.001, 0.999], 3 * 400)
+    assert low < sum(values["joint"]) < high
+    assert sum(values["independent"]) > high
+
+
+def test_what_enters_when_a_source_is_not_believed(tmp_path):
+    all_say = Readings(WHEELS, LEARNED, GYRO)
+    some = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
+    assert names(some.combine(all_say)) == ["wheels", "learned", "gyro"]
+    dead = some.combine(all_say, {"wheels": "frozen"})
+    assert names(dead) == ["learned", "gyro"]
+    assert dead[0] is LEARNED  # plain: there is nothing left that it is correlated with
+    slipping = some.combine(all_say, {"wheels": "slip"})
+    assert slipping[0].cov[2, 2] == LEARNED.cov[2, 2]
+    assert slipping[0].cov[0, 0] > LEARNED.cov[0, 0]  # the way is known less well in a slip
+    without = some.combine(all_say, {"learned": "distrusted"})
+    assert names(without) == ["wheels", "gyro"]
+    assert without[0] is WHEELS
+    assert names(some.combine(all_say, {"gyro": "distrusted"})) == ["wheels", "learned"]
+
+
+def test_wheels_that_alone_know_the_way_are_kept_with_room_for_a_slip():
+    kept = sources().combine(Readings(WHEELS, None, GYRO), {"wheels": "slip"})
+    assert names(kept) == ["wheels", "gyro"]
+    assert (np.diag(kept[0].cov) > 10.0 * np.diag(W)).all()
+    assert kept[1].motion == pytest.approx([*WHEELS.motion[:2], GYRO.motion[2]])
+    _, cov = fuse(kept)
+    assert cov[2, 2] < 1.1e-5  # the gyro knows the turn still
+    assert sources().combine(Readings(None, None, GYRO)) == []  # and no more than that
+
+
+def test_a_gyro_that_the_model_reads_does_not_enter_again(tmp_path):
+    reading = sources(learned_motion(tmp_path, inputs=("commands", "gyro")))
+    assert names(reading.combine(Readings(WHEELS, LEARNED, GYRO))) == ["wheels", "learned"]
+    assert names(reading.combine(Readings(WHEELS, None, GYRO))) == ["wheels", "gyro"]
+    assert names(reading.combine(Readings(WHEELS, LEARNED, GYRO), {"learned": "distrusted"})) == ["wheels", "gyro"]
+
+
+def step(i: int, dt: float, omega=0.0) -> Step:
+    start, end = START_NS + round(i * dt * 1e9), START_NS + round((i + 1) * dt * 1e9)
+    n = round(dt / 0.05)
+    stamps = [START_NS + round((i * dt + 0.05 * j) * 1e9) for j in range(-1, n + 2)]
+    commands = tuple(CommandEvent(t, t, "/cmd_vel", SPEED, TURN) for t in stamps[:-1])
+    rates = np.array([0.0, 0.0, TURN + omega])
+    imu = tuple(ImuEvent(t, t, "/imu", "imu", rates, np.zeros(3), np.zeros((3, 3))) for t in stamps)
+    return Step(i, 0, start, end, commands=commands, imu=imu)
+
+
+def test_commands_that_stand_in_for_wheels_are_left_out_beside_a_model_that_reads_them(tmp_path):
+    learned = learned_motion(tmp_path)
+    alone, beside = sources(wheels={"source": "command"}), sources(learned, wheels={"source": "command"})
+    for which in (alone, beside):
+        which.read(step(0, 0.1))
+    assert names(alone.combine(alone.read(step(1, 0.1)))) == ["wheels"]
+    readings = beside.read(step(1, 0.1))
+    assert readings.wheels is not None
+    assert names(beside.combine(readings)) == ["learned"]
+    assert beside.disagreement(readings) is None  # they are no witness of each other
+
+
+def test_systematic_errors_of_the_wheels_grow_with_the_way_however_it_is_cut():
+    scales = {"scale_sigma": 0.02, "turn_scale_sigma": 0.05, "yaw_per_m_sigma": 0.01}
+    totals = []
+    for dt in (0.05, 0.2):
+        some = sources(wheels={"source": "command", "noise": {}, **scales})
+        plain = sources(wheels={"source": "command", "noise": {}})
+        total = np.zeros((3, 3))
+        for i in range(round(10.0 / dt)):
+            a, b = some.read(step(i, dt)), plain.read(step(i, dt))
+            total += a.wheels.cov - b.wheels.cov
+            some.went(a, None)
+        totals.append(total)
+    way, turn = SPEED * 10.0, TURN * 10.0
+    expected = [(0.02 * way) ** 2, 0.0, (0.05 * turn) ** 2 + (0.01 * way) ** 2]
+    assert np.diag(totals[0]) == pytest.approx(expected, rel=0.01)
+    assert np.diag(totals[1]) == pytest.approx(np.diag(totals[0]), rel=0.01)
+    some.went(a, Belief(np.zeros(3), np.eye(3)))  # a fix: the way begins anew
+    after = some.read(step(200, 0.2)).wheels.cov - plain.read(step(200, 0.2)).wheels.cov
+    assert after[0, 0] == pytest.approx((0.02 * SPEED * 0.2) ** 2, rel=0.02)
+
+
+def test_factors_made_again_keep_what_sightings_said_against_them():
+    doubt = np.diag([0.01, 0.0, 0.04])
+    frame = Keyframe(1, 0, 0.1, Belief(np.zeros(3), np.eye(3)), readings=Readings(WHEELS), scale=4.0, doubt=doubt)
+    (made,) = sources().combine_again(frame)
+    assert made.cov == pytest.approx(4.0 * W + doubt)
+    assert worsened(WHEELS).cov == pytest.approx(W)
+
+
+# --- the same covariance at 20 Hz and at 5 Hz -------------------------------------------------------------------------
+
+
+class WithGyro(World):
+    """The world with an IMU."""
+
+    def events(self):
+        made = super().events()
+        for tick in range(round(self.seconds * 50)):
+            stamp = self.start_ns + tick * 20_000_000
+            rate = np.array([0.0, 0.0, TURN + self._rng.normal(0.0, 0.002 * math.sqrt(50.0))])
+            made.append(ImuEvent(stamp, stamp, "/imu", "imu", rate, np.zeros(3), np.zeros((3, 3))))
+        return sorted(made, key=lambda e: e.received_ns)
+
+
+def blind_covs(tmp_path, max_interval_s: float, kind: str | None, gyro: bool, **wheels):
+    """Covariance in the map frame every 2 s of 8 s without sightings."""
+    settings = config(keyframes={"max_interval_s": max_interval_s})
+    settings = settings.model_copy(update={"wheels": settings.wheels.model_copy(update=wheels)})
+    world_map = beacons()
+    chain = Chain(settings, world_map)
+    learned = None if kind is None else learned_motion(tmp_path, kind)
+    joint = None if learned is None else JointCalibration(np.eye(3), np.eye(3), np.diag([0.4, 0.5, 0.7]))
+    sensor = LandmarkSensor(settings, world_map, None, None)
+    chain.localizer = Localizer(
+        settings, world_map, chain.wheels, sensor, learned, joint, gyro=Gyro(GyroConfig()) if gyro else None
+    )
+    world = WithGyro(world_map, seconds=12.01, blind=((4.01, 13.0),))
+    estimates = chain.run(world.events())
+    for source, used in (("learned", learned is not None), ("gyro", gyro)):
+        assert (chain.localizer.counts[source] > 40) == used
+    at = [START_NS + round((8.0 + 2.0 * i) * 1e9) for i in range(6)]
+    covs = {e.stamp_ns: e.cov for e in estimates}
+    return np.array([covs[stamp] for stamp in at]), len(estimates)
+
+
+@pytest.mark.parametrize(
+    ("kind", "gyro", "wheels"),
+    [
+        (None, False, {}),
+        (None, False, {"scale_sigma": 0.03, "turn_scale_sigma": 0.05}),
+        (None, True, {}),
+        ("naive", False, {}),
+        ("velocity", True, {}),
+        ("displacement", True, {}),
+    ],
+    ids=["wheels", "wheels, systematic", "gyro", "naive", "velocity", "displacement"],
+)
+def test_the_covariance_of_a_blind_stretch_does_not_depend_on_the_cadence(tmp_path, kind, gyro, wheels):
+    fast, many = blind_covs(tmp_path, 0.05, kind, gyro, **wheels)
+    slow, few = blind_covs(tmp_path, 0.2, kind, gyro, **wheels)
+    assert many > few + 100
+    grown = [np.array([c - covs[0] for c in covs[1:]]) for covs in (fast, slow)]
+    for a, b in zip(*grown, strict=True):
+        assert np.diag(a)[2] == pytest.approx(np.diag(b)[2], rel=0.05)
+        assert np.trace(a[:2, :2]) == pytest.approx(np.trace(b[:2, :2]), rel=0.05)
