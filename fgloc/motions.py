@@ -20,6 +20,7 @@ from fgloc.types import FloatArray, MotionMeasurement, Readings, Step
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
+_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLIP_LASTS_S = 1.0  # ... for this long in one direction
 
 
@@ -72,7 +73,7 @@ class MotionSources:
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = None
         if self.gyro is not None:
-            turn = self.gyro.measure(step, None if wheels is None else motion, blind_s)
+            turn = self.gyro.measure(step, None if wheels is None or _told_to_move(step) else motion, blind_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
@@ -212,3 +213,9 @@ def slipping(m: MotionMeasurement) -> MotionMeasurement:
 
 def _turned(motion: FloatArray, yaw: float) -> FloatArray:
     return np.array([motion[0], motion[1], yaw])
+
+
+def _told_to_move(step: Step) -> bool:
+    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
+    since = step.start_ns - _COMMANDED_NS
+    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)

@@ -16,7 +16,10 @@ from fgloc.types import Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
 
 
 class EncoderFrozen(Failure):
-    """Odometry and joints go on with new stamps but repeat what they said last; then they jump to the present."""
+    """Odometry and wheel angles go on with new stamps but repeat what they said last; then they jump to the present.
+
+    Joint efforts, which motor drivers measure, go on as they are.
+    """
 
     kind: Literal["encoder_frozen"] = "encoder_frozen"
 
@@ -29,7 +32,10 @@ class EncoderFrozen(Failure):
                 yield event
             elif schedule.hits(event) and event.topic in last:
                 self.touch(scene)
-                yield replace(last[event.topic], stamp_ns=event.stamp_ns, received_ns=event.received_ns)
+                frozen = replace(last[event.topic], stamp_ns=event.stamp_ns, received_ns=event.received_ns)
+                if isinstance(frozen, JointsEvent) and isinstance(event, JointsEvent):
+                    frozen = replace(frozen, names=event.names, effort=event.effort)
+                yield frozen
             else:
                 last[event.topic] = event
                 yield event
