@@ -75,6 +75,7 @@ class Weights:
         prediction and sighting together (Gauss–Newton), because after dead reckoning the linear one is far too large.
         """
         believed, refused, decisions = [], [], []
+        fitting, gated = [], []
         values = _values(k, predicted.pose)
         for given in measurements:
             raw, weight = self._share_information(self._with_map_error(given, predicted))
@@ -82,7 +83,9 @@ class Weights:
             sighting = self._factors.sighting(k, m, _cauchy_k(m, self._config), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
             if not reason:
-                self.quarantine.fits(m.landmark_id)
+                fitting.append(m.landmark_id)
+            elif reason == "gate":
+                gated.append(sighting)
             if self.quarantine.holds(m.landmark_id):
                 reason = "quarantined"
             if reason:
@@ -108,19 +111,23 @@ class Weights:
             self.forget_refusals()
             self._believed_ns = stamp_ns
         if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
-            self._accuse(k, refused, decisions, predicted)
+            self._compare(k, fitting, gated, predicted)
         if not believed:
             contrary = [d.landmark_id for d in decisions if d.reason != "quarantined"]
             self.refused_in_a_row += len(contrary)
             self._refused_ids.update(contrary)
         return believed, refused, decisions
 
-    def _accuse(self, k: int, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> None:
-        """Others were believed, now or just before: what is refused beside them may have been moved."""
-        reasons = iter([d.reason for d in decisions if d.reason])
-        gated = [s for s, reason in zip(refused, reasons, strict=True) if reason in ("gate", "quarantined")]
-        if self._config.weights.adaptive and self._factors.known and gated:
-            self.quarantine.disagree(gated, k, predicted.pose, self._factors)
+    def _compare(self, k: int, fitting: Sequence[int], gated: Sequence[Sighting], predicted: Belief) -> None:
+        """Others were believed, now or just before: what disagrees beside them may have been moved.
+
+        Without them, in the dark say, the prediction is too little known to say that a landmark is back in its place.
+        """
+        if not self._config.weights.adaptive or not self._factors.known:
+            return
+        for landmark_id in fitting:
+            self.quarantine.fits(landmark_id)
+        self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
         """The place nearby that refused sightings agree on, if they are of two landmarks or more and leave no doubt.

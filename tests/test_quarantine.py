@@ -1,0 +1,237 @@
+"""Landmarks that were moved are named; the interval after dead reckoning says how wrong it was."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robot_world import CAMERA, SIGMA_PX, Chain, World, beacons, config, polar, position_error, project, room, truth_at
+
+from fgloc import se2
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.interval import interval_scale
+from fgloc.graph.log import Belief
+from fgloc.graph.quarantine import Quarantine, displacement
+from fgloc.graph.weights import Weights, chi2_bound
+from fgloc.types import CornerMeasurement, LandmarkMap, RangeBearingMeasurement
+
+R = np.diag([0.015, 0.06]) ** 2
+SURE = np.diag([0.01, 0.01, 0.005]) ** 2
+AFTER = 6
+
+
+def moved(landmark, dx: float, dy: float):
+    return replace(landmark, position=landmark.position + np.array([dx, dy, 0.0]))
+
+
+def corners(pose, landmark, rng, as_id=None):
+    seen = project(pose, landmark) + rng.normal(0.0, SIGMA_PX, (4, 2))
+    return CornerMeasurement(0, landmark.landmark_id if as_id is None else as_id, seen, SIGMA_PX, CAMERA)
+
+
+def beacon(pose, landmark, rng, scale: float = 1.0):
+    bearing, distance = rng.multivariate_normal(polar(pose, landmark)[::-1], R)
+    return RangeBearingMeasurement(0, landmark.landmark_id, scale * distance, bearing, R)
+
+
+def poses(seed: int, n: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [se2.compose(truth_at(0.4 * i), rng.normal(0.0, 0.005, 3)) for i in range(n)]
+
+
+@pytest.mark.parametrize("by", [(0.3, -0.4), (0.0, 0.25), (-1.5, 0.2)])
+def test_the_displacement_of_a_moved_landmark_is_what_it_was_moved_by(by):
+    rng, landmark = np.random.default_rng(0), beacons().landmarks[2]
+    factors = LandmarkFactors(beacons())
+    found = []
+    for pose in poses(0, 12):
+        sighting = factors.sighting(0, beacon(pose, moved(landmark, *by), rng), None)
+        found.append(displacement(sighting, 0, pose, factors))
+    assert np.median(found, axis=0) == pytest.approx(by, abs=0.08)
+
+
+def accused(sightings, factors, after: int = AFTER) -> Quarantine:
+    quarantine = Quarantine(after)
+    for pose, m in sightings:
+        quarantine.disagree([factors.sighting(0, m, 3.0)], 0, pose, factors)
+    return quarantine
+
+
+def test_fault_51_a_moved_marker_is_named_with_its_displacement():
+    rng, world = np.random.default_rng(1), room()
+    factors = LandmarkFactors(world)
+    stands = moved(world.landmarks[7], 0.4, 0.3)
+    seen = [(pose, corners(pose, stands, rng)) for pose in poses(1, 60) if project(pose, stands) is not None]
+    assert len(seen) > AFTER
+    before = accused(seen[: AFTER - 1], factors)
+    assert not before.holds(7)
+    quarantine = accused(seen, factors)
+    assert quarantine.holds(7)
+    assert list(quarantine.displacements) == [7]
+    assert quarantine.displacements[7] == pytest.approx((0.4, 0.3), abs=0.05)
+
+
+def test_fault_49_wrong_ids_scatter_and_name_nobody():
+    """Whatever the camera sees is now and then taken for marker 7."""
+    rng, world = np.random.default_rng(2), room()
+    factors = LandmarkFactors(world)
+    wrong = []
+    for pose in poses(2, 40):
+        others = [lm for lm in world.landmarks.values() if lm.landmark_id != 7 and project(pose, lm) is not None]
+        other = others[rng.integers(len(others))]
+        if factors.depth(m := corners(pose, other, rng, as_id=7), pose) > 0.5:
+            wrong.append((pose, m))
+    assert len(wrong) > 2 * AFTER
+    assert not accused(wrong, factors).holds(7)
+
+
+def test_a_landmark_that_is_only_ill_seen_is_not_named():
+    """A range 4 % too long is no displacement worth a name; 15 % would be."""
+    rng, world = np.random.default_rng(3), beacons()
+    factors, here = LandmarkFactors(world), np.array([0.0, -1.0, 0.4])
+    ill = [(here, beacon(here, world.landmarks[3], rng, 1.04)) for _ in range(30)]
+    assert not accused(ill, factors).holds(3)
+    far = [(here, beacon(here, world.landmarks[3], rng, 1.15)) for _ in range(30)]
+    assert accused(far, factors).holds(3)
+
+
+def weighed(weights: Weights, k: int, pose, sightings):
+    found = weights.weigh(k, k * 10**8, sightings, Belief(pose, SURE))
+    return [d.reason for d in found[2]]
+
+
+def test_a_returned_marker_is_believed_again_after_a_while():
+    rng, world = np.random.default_rng(4), beacons()
+    weights, landmark = Weights(config(), LandmarkFactors(world)), world.landmarks[2]
+    others = [world.landmarks[0], world.landmarks[4]]
+    stands, reasons = moved(landmark, 0.6, 0.4), []
+    for k in range(60):
+        if k == 20:
+            stands = landmark  # somebody puts it back
+        pose = poses(4, 60)[k]
+        seen = [beacon(pose, lm, rng) for lm in (*others, stands)]
+        reasons.append(weighed(weights, k, pose, seen)[2])
+    after = weights._config.weights.quarantine_after
+    assert set(reasons[:after]) == {"gate"}
+    assert reasons[after:20].count("quarantined") >= 10
+    assert set(reasons[20 : 20 + after]) == {"quarantined"}  # a few fits are no proof
+    assert set(reasons[45:]) == {""}
+    assert not weights.quarantine.displacements
+
+
+def test_a_marker_in_quarantine_is_not_released_in_the_dark():
+    """A prediction that is hardly known fits anything."""
+    rng, world = np.random.default_rng(4), beacons()
+    weights, stands = Weights(config(), LandmarkFactors(world)), moved(world.landmarks[2], 0.6, 0.4)
+    others = [world.landmarks[0], world.landmarks[4]]
+    for k, pose in enumerate(poses(4, 60)):
+        if k < 20:
+            weighed(weights, k, pose, [beacon(pose, lm, rng) for lm in (*others, stands)])
+            continue
+        unsure = Belief(pose, np.diag([1.0, 1.0, 0.3]) ** 2)
+        stamp = (k + 100) * 10**8  # ten seconds later
+        (decision,) = weights.weigh(k, stamp, [beacon(pose, stands, rng)], unsure)[2]
+        assert decision.reason == "quarantined"
+
+
+def test_a_sighting_that_fits_now_and_then_clears_a_landmark():
+    rng, world = np.random.default_rng(5), beacons()
+    factors, quarantine = LandmarkFactors(world), Quarantine(AFTER)
+    stands = moved(world.landmarks[2], 0.6, 0.4)
+    for i, pose in enumerate(poses(5, 60)):
+        quarantine.disagree([factors.sighting(0, beacon(pose, stands, rng), None)], 0, pose, factors)
+        if i % 2:
+            quarantine.fits(2)
+    assert not quarantine.holds(2)
+
+
+def test_fault_51_a_moved_marker_that_is_put_back_does_no_harm_in_a_run():
+    true_map = room()
+    away = dict(true_map.landmarks)
+    away[7] = moved(away[7], 0.5, -0.2)
+    early, late = World(true_map, seconds=22.0, shown=LandmarkMap(away)), World(true_map, seconds=42.0, seed=1)
+    at = early.start_ns + 22 * 10**9
+    events = [e for e in early.events() if e.stamp_ns < at] + [e for e in late.events() if e.stamp_ns >= at]
+    chain = Chain(config(), true_map)
+    estimates = chain.run(events)
+    reasons = [(e.stamp_ns, d.reason) for e in estimates for d in e.decisions if d.landmark_id == 7]
+    assert sum(reason == "quarantined" for stamp, reason in reasons if stamp < at) > 3
+    assert not chain.localizer.weights.quarantine.displacements  # it was seen to be back
+    assert [reason for _, reason in reasons[-10:]] == [""] * 10
+    assert np.mean([position_error(e, late.truth(e.stamp_ns)) for e in estimates]) < 0.006
+
+
+# --- interval ---------------------------------------------------------------------------------------------------------
+
+
+def returning(miss, sigma: float, ids, seed: int = 0, world=None, wrong: int | None = None):
+    """Scale and NIS of an interval whose dead-reckoned pose is off by ``miss``."""
+    rng, world, truth = np.random.default_rng(seed), world or room(), truth_at(3.0)
+    shown = {i: moved(world.landmarks[i], 0.4, 0.4) if i == wrong else world.landmarks[i] for i in ids}
+    make = corners if world.landmarks[ids[0]].size_m else beacon
+    seen = [make(truth, lm, rng) for lm in shown.values()]
+    predicted = Belief(se2.compose(truth, se2.exp(np.asarray(miss))), np.diag([sigma, sigma, 0.5 * sigma]) ** 2)
+    return interval_scale(predicted, seen, LandmarkFactors(world), config())
+
+
+def in_view(world=None) -> list[int]:
+    return [i for i, lm in (world or room()).landmarks.items() if project(truth_at(3.0), lm) is not None]
+
+
+def test_an_interval_that_was_worse_than_it_said_is_scaled_to_what_is_expected():
+    """Its NIS with the scaled covariance is three, the number of coordinates."""
+    miss = np.array([0.3, -0.2, 0.1])
+    scale, nis = returning(miss, 0.05, in_view())
+    assert nis == pytest.approx((0.3 / 0.05) ** 2 + (0.2 / 0.05) ** 2 + (0.1 / 0.025) ** 2, rel=0.4)
+    assert scale > nis / 3.0  # what the sightings leave open does not scale
+    scaled = 0.05 * math.sqrt(scale)
+    again, expected = returning(miss, scaled, in_view())
+    assert again == 1.0
+    assert expected == pytest.approx(3.0, rel=0.01)
+
+
+def test_an_honest_interval_is_left_alone():
+    rng = np.random.default_rng(6)
+    scales = []
+    for seed in range(60):
+        miss = rng.normal(0.0, [0.05, 0.05, 0.025])
+        scale, nis = returning(miss, 0.05, in_view(), seed)
+        scales.append(scale)
+        assert scale == 1.0 or nis > chi2_bound(0.9, 3)
+    assert np.mean(np.array(scales) > 1.0) < 0.2
+    assert max(scales) < 6.0
+
+
+def test_one_landmark_may_say_less_than_several_that_agree():
+    miss = np.array([0.5, -0.3, 0.15])
+    several, _ = returning(miss, 0.03, in_view()[:3])
+    assert 16.0 < several < 400.0
+    alone, nis = returning(miss, 0.03, in_view()[:1])
+    assert alone == 1.0
+    assert nis > 48.0
+    nearer, _ = returning(0.3 * miss, 0.03, in_view()[:1])
+    assert 1.0 < nearer <= 16.0
+
+
+def test_a_place_out_of_all_proportion_scales_nothing():
+    scale, nis = returning((2.0, 1.0, 0.8), 0.01, in_view())
+    assert scale == 1.0
+    assert nis > 1200.0
+
+
+def test_sightings_that_do_not_agree_scale_nothing():
+    miss = np.array([0.3, -0.2, 0.1])
+    ids = in_view()[:2]
+    assert returning(miss, 0.05, ids)[0] > 5.0
+    scale, nis = returning(miss, 0.05, ids, wrong=ids[0])
+    assert scale == 1.0
+    assert math.isnan(nis)
+
+
+def test_sightings_that_leave_the_place_open_scale_nothing():
+    world = beacons()
+    scale, nis = returning((0.3, -0.2, 0.1), 0.05, [1], world=world)
+    assert scale == 1.0
+    assert math.isnan(nis)
