@@ -21,7 +21,7 @@ _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
-_SLIP_LASTS_S = 1.0  # ... for this long in one direction
+_WRONG_LASTS_S = 1.0  # ... for this long in one direction
 
 
 class MotionSources:
@@ -123,7 +123,7 @@ class MotionSources:
         if learned is not None and off.get("wheels") == "slip":
             learned = replace(learned, cov=learned.cov * self._slip_scale)
         if wheels is not None and "wheels" in off:
-            wheels = None if learned is not None else slipping(wheels)
+            wheels = None if learned is not None else self._doubtful(wheels, off["wheels"])
         elif wheels is not None and learned is not None:
             if self._wheels.stands_in:  # made of the very commands that the model reads
                 wheels = None
@@ -133,6 +133,12 @@ class MotionSources:
         if gyro is not None and known:
             known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
         return known
+
+    def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
+        """Wheels that are not believed, where nothing else knows the way."""
+        if why == "slip":
+            return with_room(wheels, _SLIP_SPEED, _SLIP_TURN)
+        return with_room(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
 
     def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
@@ -202,13 +208,18 @@ def worsened(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None 
     return replace(m, cov=m.cov * scale + (0.0 if doubt is None else doubt))
 
 
-def slipping(m: MotionMeasurement) -> MotionMeasurement:
-    """The wheels' motion with room for a slip: the robot may do anything between what they say and nothing."""
+def with_room(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:
+    """The wheels' motion with room: the robot may do anything between what they say and nothing, or these speeds.
+
+    Args:
+        m: what the wheels say.
+        speed: that they may be wrong by, even when they hardly turn [m/s].
+        turn: likewise [rad/s].
+    """
     seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-    speed = np.hypot(*m.motion[:2]) / seconds
-    turn = abs(float(m.motion[2])) / seconds
-    density = np.square([max(speed, _SLIP_SPEED), max(0.3 * speed, 0.3 * _SLIP_SPEED), max(turn, _SLIP_TURN)])
-    return replace(m, cov=m.cov + np.diag(density * _SLIP_LASTS_S * seconds))
+    told, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
+    density = np.square([max(told, speed), 0.3 * max(told, speed), max(turned, turn)])
+    return replace(m, cov=m.cov + np.diag(density * _WRONG_LASTS_S * seconds))
 
 
 def _turned(motion: FloatArray, yaw: float) -> FloatArray:

@@ -200,3 +200,19 @@ def test_a_new_segment_begins_without_a_flag():
     assert run(trust, 20, sides(0.0, RIGHT))[-1].off
     trust.reset()
     assert not any(t.off for t in run(trust, 20, (SPEED, TURN), first=20))
+
+
+def test_a_witness_known_to_be_wrong_accuses_nobody():
+    trust = trust_in([{"source": "learned", "start_s": 0.0, "end_s": 2.0}])
+    assert {tuple(t.off) for t in run(trust, 20, (SPEED, TURN), did=(0.0, 0.0))} == {("learned",)}
+    assert not trust.flags
+
+
+def test_wheels_known_to_be_wrong_are_not_found_out_again():
+    """Nor is their failure taken for the beginning of another, before or after."""
+    trust = trust_in([{"source": "wheels", "start_s": 1.0, "end_s": 2.0}])
+    before, during = run(trust, 10, (SPEED, TURN)), run(trust, 10, (0.0, 0.0), first=10)
+    after = run(trust, 10, (SPEED, TURN), first=20)
+    assert [t.off for t in (*before, *after)] == [{}] * 20
+    assert [t.off for t in during] == [{"wheels": "distrusted"}] * 10
+    assert not trust.flags
