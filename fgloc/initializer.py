@@ -155,7 +155,7 @@ class Initializer:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            known: the robot is believed to be elsewhere. Then it takes two landmarks, and that nearly everything agrees:
+            known: the robot is believed to be elsewhere. Then it takes two landmarks, and nearly everything to agree:
                 some wrong ids agree with some place always.
         """
         self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))

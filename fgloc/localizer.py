@@ -18,7 +18,7 @@ from fgloc.graph.estimator import Estimator, fuse
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.interval import interval_scale
-from fgloc.graph.log import Belief
+from fgloc.graph.log import Belief, Sighting
 from fgloc.graph.weights import Weights
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
@@ -142,8 +142,7 @@ class Localizer:
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
-        weighed = self.weights.weigh(k, step.stamp_ns, sightings, prior, self._calibration())
-        believed, _, decisions = self._whereabouts.hold(*weighed)
+        believed, _, decisions = self._weigh(k, step, sightings, prior)
         if self.calibrator is not None:
             self.calibrator.start(prior.pose, prior.cov)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
@@ -166,9 +165,7 @@ class Localizer:
             motions, scale, returned = self._return(k, step, motions, sightings)
             decisions += returned
             predicted = self.estimator.predict(motions)
-            believed, refused, weighed = self._whereabouts.hold(
-                *self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
-            )
+            believed, refused, weighed = self._weigh(k, step, sightings, predicted)
             place = None
             if not believed:
                 contrary = [s.raw for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)]
@@ -186,9 +183,7 @@ class Localizer:
                 motions = [worsened(m, doubt=doubt) for m in motions]
                 self.rejections["motion.overruled"] += 1
                 predicted = self.estimator.predict(motions)
-                believed, refused, weighed = self.weights.weigh(
-                    k, step.stamp_ns, sightings, predicted, self._calibration()
-                )
+                believed, refused, weighed = self._weigh(k, step, sightings, predicted)
         # 3. Fuse
         with self.stopwatch("fuse"):
             rebuilt = self.estimator.rebuilt
@@ -213,6 +208,16 @@ class Localizer:
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else ""
         )
         return self._estimate(step, belief, [*decisions, *weighed])
+
+    def _weigh(
+        self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: Belief
+    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
+        """What is believed and refused, with the decisions; nothing against a given first pose that holds."""
+        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+        believed, refused, decisions = self._whereabouts.hold(*weighed)
+        if held := sum(d.reason == CONTRADICTS for d in decisions):
+            self.rejections["sightings.contradict_initial_pose"] += held
+        return believed, refused, decisions
 
     def _revise(self, k: int, trust: Trust) -> list[Decision]:
         """Take back what the wheels, which are not believed any more, have said in the steps before this one."""

@@ -57,6 +57,7 @@ class SourceTrust:
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
         self._first_ns: int | None = None
         self._reason = "slip"
+        self._unwitnessed_s = 0.0
 
     def reset(self) -> None:
         """A new segment."""
@@ -73,7 +74,8 @@ class SourceTrust:
         readings = replace(readings, **dict.fromkeys(off))
         difference = self._sources.disagreement(readings) if self._config.adaptive else None
         if difference is None:
-            return Trust(off)
+            return self._unwitnessed(step.dt, readings, off)
+        self._unwitnessed_s = 0.0
         verdict = self._disagreement.judge(step.dt, *difference)
         self._travelled(step.dt, readings)
         if not verdict.flagged:
@@ -87,6 +89,16 @@ class SourceTrust:
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
         return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+
+    def _unwitnessed(self, dt: float, readings: Readings, off: Mapping[str, str]) -> Trust:
+        """Nothing to compare the wheels with: what was thought of them a moment ago holds for a while."""
+        if readings.wheels is None or not self._disagreement.flagged:
+            return Trust(off)
+        self._unwitnessed_s += dt
+        if self._unwitnessed_s > self._config.window_s:
+            self.reset()
+            return Trust(off)
+        return Trust({"wheels": self._reason, **off})
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9
