@@ -117,7 +117,7 @@ class Localizer:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         self._segment = step.segment
         self.sources.begin_segment()
-        self.trust.reset()
+        self.trust.begin(step)
         self.weights.begin_segment()
         self._prior = self._whereabouts.begin_segment(self.estimator.belief)
 

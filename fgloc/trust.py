@@ -55,19 +55,23 @@ class SourceTrust:
         self._track_m = track_m
         self._disagreement = Disagreement(config)
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
-        self._first_ns: int | None = None
+        self._first_ns: int | None = None  # of the run
         self._reason = "slip"
         self._unwitnessed_s = 0.0
 
+    def begin(self, step: Step) -> None:
+        """The first step of the run, or of a segment."""
+        if self._first_ns is None:
+            self._first_ns = step.start_ns
+        self.reset()
+
     def reset(self) -> None:
-        """A new segment."""
+        """Nothing connects what comes with what was."""
         self._disagreement.reset()
         self._travels.clear()
 
     def judge(self, step: Step, readings: Readings) -> Trust:
         """Take in what the sources say of a step that follows the last one."""
-        if self._first_ns is None:
-            self._first_ns = step.start_ns
         off = self._known_failures(step)
         if "wheels" in off:  # nothing to be found out
             self.reset()

@@ -140,3 +140,12 @@ def test_a_known_failure_is_left_out_from_the_start(tmp_path, witness):
     assert (error < 0.1) == (witness == "learned")  # without a witness nobody knows the way, and it says so
     assert (sigma < 0.2) == (witness == "learned")
     assert not any("disagreed" in note for note in made.localizer.notes)  # nothing that was not known
+
+
+def test_a_known_failure_is_dated_from_the_first_step_however_late_the_first_pose(tmp_path):
+    world = World(room(), seconds=14.0, blind=((0.0, 8.0),))
+    made = chain(tmp_path, "learned", distrust=[{"source": "wheels", "start_s": 10.0, "end_s": 12.0}])
+    estimates = made.run(world.events())
+    stamps = [seconds(d) for e in estimates for d in e.decisions if d.reason == "distrusted"]
+    assert 10.0 < min(stamps) <= 10.1 + 1e-6
+    assert 12.0 - 1e-6 <= max(stamps) <= 12.1 + 1e-6

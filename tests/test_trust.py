@@ -103,7 +103,9 @@ class Witness:
 def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> SourceTrust:
     config = Config.model_validate({"weights": {"distrust": distrust, **weights}})
     sources = MotionSources(config, WheelMotion(config.wheels), Witness() if learned else None)
-    return SourceTrust(config.weights, sources, track)
+    trust = SourceTrust(config.weights, sources, track)
+    trust.begin(Step(0, 0, 10**18, 10**18))
+    return trust
 
 
 def reading(source: str, i: int, v: float, omega: float, cov=COV / 2) -> MotionMeasurement:
