@@ -217,6 +217,8 @@ class Localizer:
         believed, refused, decisions = self._whereabouts.hold(*weighed)
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held
+        if self._whereabouts.holds_given:
+            self.weights.quarantine.forget()  # they all seem moved from there
         return believed, refused, decisions
 
     def _revise(self, k: int, trust: Trust) -> list[Decision]:

@@ -46,9 +46,9 @@ def leaps(estimates) -> list[float]:
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_fault_52_a_map_shifted_as_a_whole_against_the_given_first_pose(kind):
-    world, chain, estimates = drive(kind, seconds=8.0)
+    world, chain, estimates = drive(kind, seconds=16.0)
     assert max(leaps(estimates)) < 0.1  # no snap
-    assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates) < 0.2
+    assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates) < 0.25
     assert {e.mode for e in estimates if seconds(e) > 2.5} == {Mode.DEAD_RECKONING}
     decisions = [d for e in estimates for d in e.decisions]
     refused = [d for d in decisions if d.landmark_id >= 0]
@@ -58,7 +58,7 @@ def test_fault_52_a_map_shifted_as_a_whole_against_the_given_first_pose(kind):
     assert told.reason == "contradicts initial_pose"
     assert told.weight == 0.0
     assert math.hypot(*chain.localizer._whereabouts.defied[:2]) == pytest.approx(np.hypot(*SHIFT[:2]), abs=0.1)
-    (note,) = [n for n in chain.localizer.notes if "contradict" in n]
+    (note,) = chain.localizer.notes  # of single markers that seem to be moved not a word
     assert "the given first pose" in note
     assert "correct estimator.initial_pose or the map" in note
 
