@@ -19,7 +19,7 @@ from benchmarks.adaptive_runs import CASES, cell
 from datasets.sim.record import robot_settings
 from datasets.sim.scenario import Scenario
 
-WAY, TURN = 10.0, 10.0  # as tuned
+WAY, TURN = 5.0, 5.0  # as tuned
 _FACTORS = (1.0, 3.0, 10.0, 30.0)
 _CASES = ("none", "slip", "mu01", "dark30")
 

@@ -45,6 +45,7 @@ _PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
 _REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
+_HEARD = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
@@ -104,7 +105,8 @@ class _Agreed:
     @property
     def compelling(self) -> bool:
         """Whether it says that the robot is not where it was believed to be."""
-        return self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * _REDUNDANT
+        known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
+        return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * _REDUNDANT
 
     def beats(self, other: _Agreed) -> bool:
         """Whether a place that explains about as much is so much worse that it is none."""
@@ -206,8 +208,12 @@ class Initializer:
             if trimmed is None:
                 return None
             fit = trimmed
-        share = sum(map(_information, agreeing)) / sum(map(_information, sightings))
-        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing}
+        told: dict[int, float] = {}
+        for m in agreeing:
+            told[m.landmark_id] = told.get(m.landmark_id, 0.0) + _information(m)
+        share = sum(told.values()) / sum(map(_information, sightings))
+        heard = {i for i, information in told.items() if information > _HEARD * max(told.values())}
+        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in heard}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         return _Agreed(fit, share, len(residuals), sum(residuals.values()) - 3)

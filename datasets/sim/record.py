@@ -97,13 +97,13 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
     else:
         wheels = {"source": "twist"}
     wheels["noise"] = {
-        "x_per_sqrt_m": 0.01,
-        "y_per_sqrt_m": 0.005,
-        "yaw_per_sqrt_m": 0.02,
-        "xy_per_sqrt_rad": 0.005,
-        "yaw_per_sqrt_rad": 0.02 if robot.kind == "diff_drive" else 0.2,
-        "xy_per_sqrt_s": 0.001,
-        "yaw_per_sqrt_s": 0.001,
+        "x_per_sqrt_m": 0.02,
+        "y_per_sqrt_m": 0.01,
+        "yaw_per_sqrt_m": 0.04,
+        "xy_per_sqrt_rad": 0.01,
+        "yaw_per_sqrt_rad": 0.04 if robot.kind == "diff_drive" else 0.2,
+        "xy_per_sqrt_s": 0.002,
+        "yaw_per_sqrt_s": 0.002,
     }
     # Corners are good to 0.04 px at rest and worse in motion. NEES/3 online of the suite's validation recordings is 0.4
     # with 0.2 px where no wheel slips, 1.7 with 0.1 px on patches, and between 0.66 and 1.6 on both with this.
