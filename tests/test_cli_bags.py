@@ -83,8 +83,11 @@ def test_files_of_other_settings_do_not_count(bags, tmp_path):
 
 def test_a_lost_robot_among_many_exits_with_3(bags, tmp_path):
     given = [bags / "one" / "bag", bags / "lost" / "bag"]
-    run_before(given, tmp_path)
-    code, stdout, stderr = fgloc("smooth", *given, "--out", tmp_path)
+    (tmp_path / "fixed.yaml").write_text("weights: {adaptive: false}\n")  # else it is found again at once
+    settings = load_config(tmp_path / "fixed.yaml")
+    for job in plan_bags(given, None, lambda bag: settings, "fgloc smooth a b").jobs:
+        execute(job, tmp_path / "out")
+    code, stdout, stderr = fgloc("smooth", *given, "--config", tmp_path / "fixed.yaml", "--out", tmp_path / "out")
     assert code == 3
     assert "LOST for part of a run" in stderr
     shares = {line.split()[0]: float(line.split()[-2]) for line in stdout.splitlines()[1:3]}
