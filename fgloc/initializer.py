@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import Fit, joint_fit, sighting_cost
+from fgloc.graph.place import Fit, joint_fit, sighting_cost
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     CornerMeasurement,

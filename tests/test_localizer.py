@@ -28,7 +28,7 @@ from fgloc import se2
 from fgloc.carry import carry
 from fgloc.config import MotionConfig
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.weights import joint_fit
+from fgloc.graph.place import joint_fit
 from fgloc.motion import load_model, save_model
 from fgloc.motion.source import LearnedMotion
 from fgloc.types import CornerMeasurement, LandmarkMap, Mode

@@ -13,8 +13,9 @@ from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.interval import interval_scale
 from fgloc.graph.log import Belief
+from fgloc.graph.place import chi2_bound
 from fgloc.graph.quarantine import Quarantine, displacement
-from fgloc.graph.weights import Weights, chi2_bound
+from fgloc.graph.weights import Weights
 from fgloc.types import CornerMeasurement, LandmarkMap, RangeBearingMeasurement
 
 R = np.diag([0.015, 0.06]) ** 2

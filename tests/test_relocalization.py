@@ -10,7 +10,7 @@ import fgloc.initializer
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.weights import joint_fit
+from fgloc.graph.place import joint_fit
 from fgloc.initializer import Initializer
 from fgloc.localizer import Localizer
 from fgloc.types import (

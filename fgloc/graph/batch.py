@@ -18,7 +18,7 @@ from fgloc.errors import EstimatorError
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
 from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
 from fgloc.graph.log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.weights import chi2_bound
+from fgloc.graph.place import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,

@@ -11,7 +11,8 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.log import Belief
-from fgloc.graph.weights import REDUNDANT, chi2_bound, joint_fit
+from fgloc.graph.place import chi2_bound, joint_fit
+from fgloc.graph.weights import REDUNDANT
 from fgloc.types import LandmarkMeasurement
 
 _LIKELY = 0.9  # a NIS that is exceeded less often than the rest of this scales the interval

@@ -6,40 +6,30 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
-from functools import lru_cache
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
+from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, whitened
 from fgloc.graph.log import Belief, Sighting
+from fgloc.graph.place import Fit, cauchy_k, chi2_bound, joint_fit, joint_nis, values_at
 from fgloc.graph.quarantine import Quarantine
 from fgloc.selfcal import Calibration
 from fgloc.types import (
     CornerMeasurement,
     Decision,
-    FloatArray,
     LandmarkMeasurement,
     MarkerPoseMeasurement,
     RangeBearingMeasurement,
 )
 
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
-_GAUSS_NEWTON_STEPS = 4
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 _LATELY_NS = 20_000_000_000
-_BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
-
-
-@lru_cache(maxsize=256)
-def chi2_bound(probability: float, dof: int) -> float:
-    """χ² quantile."""
-    return float(chi2.ppf(probability, dof))
 
 
 class Weights:
@@ -76,11 +66,11 @@ class Weights:
         """
         believed, refused, decisions = [], [], []
         fitting, gated = [], []
-        values = _values(k, predicted.pose)
+        values = values_at(k, predicted.pose)
         for given in measurements:
             raw, weight = self._share_information(self._with_map_error(given, predicted))
             m = raw if calibration is None else calibration.apply(raw)
-            sighting = self._factors.sighting(k, m, _cauchy_k(m, self._config), raw)
+            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), raw)
             nis, dof, reason = self._judge(k, sighting, predicted, values)
             if not reason:
                 fitting.append(m.landmark_id)
@@ -212,111 +202,3 @@ class Weights:
         """Count refusals anew."""
         self.refused_in_a_row = 0
         self._refused_ids.clear()
-
-
-def joint_nis(
-    k: int, sighting: Sighting, predicted: Belief, factors: LandmarkFactors, residual: FloatArray, J: FloatArray
-) -> float:
-    """Least ``|x ⊖ predicted|²_P + |h(x)|²_R`` over poses x: the NIS without the linearisation at the prediction."""
-    information = np.asarray(np.linalg.inv(predicted.cov), dtype=np.float64)
-    m = sighting.measurement
-    pose, offset, best = predicted.pose, np.zeros(3), float(residual @ residual)
-    for _ in range(_GAUSS_NEWTON_STEPS):
-        pose = se2.compose(pose, _newton_step(information, offset, residual, J))
-        if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
-            break
-        residual, J = whitened(sighting.factors, _values(k, pose), sighting.cauchy_k)
-        offset = se2.log(se2.between(predicted.pose, pose))
-        best = min(best, float(offset @ information @ offset + residual @ residual))
-    return best
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """A pose that sightings alone give: covariance of the right perturbation, robust cost, number of residuals."""
-
-    pose: FloatArray
-    cov: FloatArray
-    cost: float
-    dof: int
-
-    @property
-    def redundancy(self) -> int:
-        """How many residuals there are more than are needed for a pose."""
-        return self.dof - 3
-
-    def bound(self, probability: float) -> float:
-        """What the cost exceeds as seldom as one minus this."""
-        return chi2_bound(probability, max(self.redundancy, 1))
-
-
-def joint_fit(
-    start: FloatArray,
-    sightings: Sequence[LandmarkMeasurement],
-    factors: LandmarkFactors,
-    config: Config,
-    iterations: int = 4 * _GAUSS_NEWTON_STEPS,
-) -> Fit | None:
-    """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
-
-    Gauss–Newton with Cauchy weights, so that one wrong sighting does not spoil the place.
-    """
-    made = [(m, factors.make(0, m, None)) for m in sightings]
-    pose, previous = start, math.inf
-    for _ in range(iterations):
-        normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
-        values = _values(0, pose)
-        for m, unary in made:
-            if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
-                cost, dof = cost + _BEHIND_COST, dof + 8  # cannot be projected: as wrong as can be, and without a pull
-                continue
-            r, J = whitened(unary, values, None)
-            k = _cauchy_k(m, config)
-            weight = k**2 / (k**2 + float(r @ r) / len(r) * 2.0)  # as if of one two-dimensional sighting
-            cost += _robust_cost(r, k)
-            dof += len(r)
-            normal += weight * J.T @ J
-            pull += weight * J.T @ r
-        if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
-            return None
-        if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
-            break
-        previous = cost
-        pose = se2.compose(pose, se2.exp(_solve(normal, -pull)))
-    cov = np.linalg.inv(normal)
-    return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
-
-
-def sighting_cost(
-    pose: FloatArray, m: LandmarkMeasurement, factors: LandmarkFactors, config: Config
-) -> tuple[float, int] | None:
-    """Robust cost and degrees of freedom of one sighting made from a pose; None if it cannot have been."""
-    if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
-        return None
-    r, _ = whitened(factors.make(0, m, None), _values(0, pose), None)
-    return _robust_cost(r, _cauchy_k(m, config)), len(r)
-
-
-def _cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
-    return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
-
-
-def _robust_cost(residual: FloatArray, k: float) -> float:
-    """Cauchy's cost of a whitened residual, as if it were that of two-dimensional sightings."""
-    pairs = len(residual) / 2.0
-    return k**2 * math.log1p(float(residual @ residual) / pairs / k**2) * pairs
-
-
-def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:
-    gradient = information @ offset + J.T @ residual
-    return se2.exp(_solve(information + J.T @ J, -gradient))
-
-
-def _solve(A: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-
-
-def _values(k: int, pose: FloatArray) -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(pose_key(k), gtsam.Pose2(*pose))
-    return values
