@@ -16,6 +16,7 @@ _REASONS = {
     "frozen": "they stood still while the robot moved",
     "left_wheel_dead": "the left wheel's encoder stood still",
     "right_wheel_dead": "the right wheel's encoder stood still",
+    "contradicted": "sightings contradicted it; is the model this robot's?",
 }
 
 
@@ -64,4 +65,5 @@ def flag_notes(flags: Mapping[str, int]) -> Iterator[str]:
     """Of sources that were flagged, by "source.reason"."""
     for kind, n in sorted(flags.items()):
         source, reason = kind.split(".")
-        yield f"the {source} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"
+        name = "learned motion" if source == "learned" else source
+        yield f"the {name} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"

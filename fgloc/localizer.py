@@ -199,7 +199,9 @@ class Localizer:
         self._count_landmarks(weighed)
         if believed:
             self._whereabouts.fixed(self.estimator.elapsed_s)
-        self.sources.went(readings, belief if believed else None)
+        fix = belief if believed else None
+        self.sources.went(readings, fix)
+        self.trust.hear(readings, fix)
         if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
             self._get_lost()
         frame = self.estimator.log.keyframes[k]
@@ -222,13 +224,13 @@ class Localizer:
         return believed, refused, decisions
 
     def _revise(self, k: int, trust: Trust) -> list[Decision]:
-        """Take back what the wheels, which are not believed any more, have said in the steps before this one."""
+        """Take back what a source, which is not believed any more, has said in the steps before this one."""
         if trust.span < 2:
             return []
         log = self.estimator.log.keyframes
         changed, decisions = {}, []
         for frame in (log[i] for i in range(k - trust.span + 1, k) if i in log and log[i].prior is None):
-            frame.off = {**frame.off, "wheels": trust.off["wheels"]}
+            frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
                 decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")

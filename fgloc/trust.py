@@ -9,8 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgloc.arbiter import Arbiter
 from fgloc.config import WeightsConfig
 from fgloc.disagreement import Disagreement
+from fgloc.graph.log import Belief
 from fgloc.motions import MotionSources
 from fgloc.types import FloatArray, Readings, Step
 
@@ -25,11 +27,13 @@ class Trust:
 
     Attributes:
         off: source -> why it is not believed.
+        accused: the source, of the two that were compared, that is thought to be wrong.
         span: for how many of the newest steps, this one included; more than one where a failure is seen only now.
         nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
     """
 
     off: Mapping[str, str] = field(default_factory=dict)
+    accused: str = "wheels"
     span: int = 1
     nis: float = math.nan
 
@@ -54,6 +58,7 @@ class SourceTrust:
         self._sources = sources
         self._track_m = track_m
         self._disagreement = Disagreement(config)
+        self._arbiter = Arbiter()
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
         self._first_ns: int | None = None  # of the run
         self._reason = "slip"
@@ -68,6 +73,7 @@ class SourceTrust:
     def reset(self) -> None:
         """Nothing connects what comes with what was."""
         self._disagreement.reset()
+        self._arbiter.reset()
         self._travels.clear()
 
     def judge(self, step: Step, readings: Readings) -> Trust:
@@ -83,7 +89,11 @@ class SourceTrust:
         verdict = self._disagreement.judge(step.dt, *difference)
         self._travelled(step.dt, readings)
         if not verdict.flagged:
+            self._arbiter.reset()
             return Trust(off, nis=verdict.nis)
+        if self._arbiter.sides_with_wheels and readings.learned is not None:
+            self.flags["learned.contradicted"] += verdict.since > 0
+            return Trust({"learned": "contradicted", **off}, "learned", max(verdict.since, 1), verdict.nis)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -92,7 +102,12 @@ class SourceTrust:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+        return Trust({"wheels": reason, **off}, "wheels", max(verdict.since, 1), verdict.nis)
+
+    def hear(self, readings: Readings, fix: Belief | None) -> None:
+        """Where the step led, if sightings have told it: while sources disagree, that says which of them is wrong."""
+        if self._disagreement.flagged:
+            self._arbiter.hear(readings, fix)
 
     def _unwitnessed(self, dt: float, readings: Readings, off: Mapping[str, str]) -> Trust:
         """Nothing to compare the wheels with: what was thought of them a moment ago holds for a while."""
