@@ -14,6 +14,7 @@ from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.localizer import Localizer
 from fgloc.motion import load_model, save_model
+from fgloc.motion.card import Kinematics
 from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -47,12 +48,12 @@ def failing(world: World, tell, witness: str):
     return sorted(made, key=lambda e: e.received_ns)
 
 
-def chain(tmp_path, witness: str, keep_all: bool = False, **weights) -> Chain:
+def chain(tmp_path, witness: str, keep_all: bool = False, kinematics: Kinematics | None = None, **weights) -> Chain:
     settings = config(weights=weights)
     settings = settings.model_copy(update={"wheels": settings.wheels.model_copy(update={"track": TRACK})})
     made, world_map, learned = Chain(settings, room()), room(), None
     if witness == "learned":  # the robot does what it is told to
-        card = make_card("naive")
+        card = make_card("naive").model_copy(update={"kinematics": kinematics or Kinematics()})
         save_model(tmp_path / "m.safetensors", make_tensors(card, np.random.default_rng(0)), card)
         learned = LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
     gyro = Gyro(GyroConfig()) if witness == "gyro" else None
@@ -93,6 +94,20 @@ def test_fault_31_a_stuck_or_slipping_wheel_in_the_dark(tmp_path, tell, reason, 
     (note,) = adaptive.localizer.notes
     assert said in note
     assert "1 time(s)" in note
+
+
+def test_a_model_of_another_robot_does_not_overrule_sound_wheels(tmp_path):
+    world = World(room(), seconds=24.0, blind=((14.0, 20.0),))
+    other = Kinematics(scale_v=0.5, scale_omega=1.4)
+    events = failing(world, lambda left, right: (left, right), "learned")
+    judged = chain(tmp_path, "learned", kinematics=other)
+    estimates = judged.run(events)
+    accused = [d for e in estimates for d in e.decisions if d.reason == "contradicted"]
+    assert {d.kind for d in accused} == {"learned"}
+    assert min((d.stamp_ns - START_NS) * 1e-9 for d in accused) < 5.0
+    in_the_dark_s = [e for e in estimates if 14.0 < seconds(e) < 20.0]
+    assert max(position_error(e, world.truth(e.stamp_ns)) for e in in_the_dark_s) < 0.2
+    assert any("is the model this robot's?" in note for note in judged.localizer.notes)
 
 
 def test_fault_31_the_gyro_witnesses_a_wheel_that_stands_still(tmp_path):
