@@ -229,7 +229,8 @@ class Localizer:
             return []
         log = self.estimator.log.keyframes
         changed, decisions = {}, []
-        for frame in (log[i] for i in range(k - trust.span + 1, k) if i in log and log[i].prior is None):
+        frames = (log[i] for i in range(k - trust.span + 1, k) if i in log)
+        for frame in (f for f in frames if f.prior is None and trust.accused not in f.off):
             frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions

@@ -19,6 +19,7 @@ from fgloc.types import FloatArray, Readings, Step
 _MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
 _LEAST_M = 0.03  # of a wheel's travel: less says nothing
 _EVIDENCE_S = 1.0  # of travel from which a kind of failure is told
+_PROBATION_S = 20.0  # a model that sightings contradicted is believed again when it has agreed for this long
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class SourceTrust:
         self._first_ns: int | None = None  # of the run
         self._reason = "slip"
         self._unwitnessed_s = 0.0
+        self._probation_s = 0.0  # that the witness has still to stand
 
     def begin(self, step: Step) -> None:
         """The first step of the run, or of a segment."""
@@ -90,9 +92,11 @@ class SourceTrust:
         self._travelled(step.dt, readings)
         if not verdict.flagged:
             self._arbiter.reset()
-            return Trust(off, nis=verdict.nis)
+            self._probation_s = max(self._probation_s - step.dt, 0.0)
+            return Trust(off | ({"learned": "contradicted"} if self._probation_s else {}), nis=verdict.nis)
         if self._arbiter.sides_with_wheels and readings.learned is not None:
-            self.flags["learned.contradicted"] += verdict.since > 0
+            self.flags["learned.contradicted"] += not self._probation_s
+            self._probation_s = _PROBATION_S
             return Trust({"learned": "contradicted", **off}, "learned", max(verdict.since, 1), verdict.nis)
         if verdict.since:
             self._reason = "slip"

@@ -108,6 +108,8 @@ def test_a_model_of_another_robot_does_not_overrule_sound_wheels(tmp_path):
     in_the_dark_s = [e for e in estimates if 14.0 < seconds(e) < 20.0]
     assert max(position_error(e, world.truth(e.stamp_ns)) for e in in_the_dark_s) < 0.2
     assert any("is the model this robot's?" in note for note in judged.localizer.notes)
+    assert judged.localizer.trust.flags["learned.contradicted"] == 1  # not each time that the two part again
+    assert all(d.weight == 0.0 for e in estimates[-50:] for d in e.decisions if d.kind == "learned")
 
 
 def test_fault_31_the_gyro_witnesses_a_wheel_that_stands_still(tmp_path):
