@@ -7,9 +7,9 @@ trains on the first 60 % of each robot's run, stops and calibrates on the next 1
 truth slides sideways faster than 0.012 m/s, as no wheel does, Vicon jumped: such samples are cut everywhere, and
 ``*.uncut_...`` tests the same models with them. Coverage at one step is that of a step of 0.2 s. ``finetune`` adapts
 the models of ``loro`` to the first minute of the robot left out, and tests both on the rest. ``selftruth`` trains as
-``loro`` does, once on Vicon's poses and once on what ``fgloc smooth`` makes of the same runs without a learned model;
-both are tested against Vicon. ``limits``, ``husky`` and ``sim``: see `benchmarks.identification_limits`, `_husky` and
-`_sim`.
+``loro`` does, once on Vicon's poses and once on what ``fgloc smooth`` makes of the same runs without a learned model,
+each robot's commands calibrated by its own sightings (``fgloc calibrate``); both are tested against Vicon. ``limits``,
+``husky`` and ``sim``: see `benchmarks.identification_limits`, `_husky` and `_sim`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import torch
 from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
 from datasets import mrclam
+from fgloc.calibration import calibrate
 from fgloc.config import load_config
 from fgloc.motion import MotionModel, load_model, save_model
 from fgloc.motion.card import Kinematics, Split
@@ -184,12 +185,14 @@ def _sampled(name: str, commands: list[CommandEvent], stamps: FloatArray, poses:
 
 
 def _smoothed(source: Path, robot: int, recorded: Run, scratch: Path) -> Run:
-    """The run with the estimate of our own batch smoothing in place of its truth."""
+    """The run with our own batch smoothing in place of its truth, its commands calibrated on the run."""
     bag = mrclam.convert(source, robot, scratch / f"robot{robot}")
     robot_yaml = find_beside(bag, "robot.yaml")
     if robot_yaml is None:
         raise FileNotFoundError(f"the converter wrote no robot.yaml beside {bag}")
-    trajectory = run(bag, find_beside(bag, "map.yaml"), load_config(robot_yaml), "batch").trajectory
+    map_path = find_beside(bag, "map.yaml")
+    config, _ = calibrate([bag], map_path, load_config(robot_yaml))
+    trajectory = run(bag, map_path, config, "batch").trajectory
     return _sampled(recorded.name, list(recorded.commands), trajectory.stamps_ns, trajectory.poses, _SMOOTHED)
 
 

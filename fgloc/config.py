@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -110,6 +111,9 @@ class WheelsConfig(Section):
     scale_v: float = Field(1.0, gt=0, description="true over reported forward speed")
     scale_omega: float = Field(1.0, gt=0, description="true over reported yaw rate")
     yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
+    slowdown: float = Field(
+        0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
+    )
     delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
     hold_s: float = Field(0.5, gt=0, description="a twist is held for this long when the next one is missing")
     zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
@@ -275,6 +279,9 @@ class BatchConfig(Section):
         description="graduated non-convexity: gnc weighs wheels and landmarks anew, other motion is believed; "
         "gnc_all weighs every factor, for comparison",
     )
+    calibrate_wheels: bool = Field(
+        False, description="find the wheels' gains from the run itself, see `fgloc calibrate`; without a learned motion"
+    )
 
 
 class TruthConfig(Section):
@@ -307,6 +314,19 @@ class Config(Section):
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
 _SHIPPED = "shipped:"
 _MODELS = Path(__file__).parent / "motion" / "models"
+
+
+def yaml_of(config: Config, folder: Path) -> str:
+    """What `load_config` reads back from a file in this folder: the values that were given, without the defaults."""
+    data = config.model_dump(mode="json", exclude_unset=True)
+    for section, key in _PATH_KEYS:
+        path = getattr(getattr(config, section), key)
+        if path is not None:
+            shipped = path.is_relative_to(_MODELS)
+            data[section][key] = (
+                f"{_SHIPPED}{path.relative_to(_MODELS).with_suffix('')}" if shipped else os.path.relpath(path, folder)
+            )
+    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
 
 
 def load_config(path: Path) -> Config:

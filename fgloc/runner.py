@@ -32,6 +32,7 @@ from fgloc.types import (
     Step,
     Trajectory,
     TruthEvent,
+    WheelCalibration,
 )
 
 RunMode = Literal["batch", "online"]
@@ -110,9 +111,11 @@ def run(
         raise EstimatorError(" ".join([_never_found(replay, rejections), *hints]))
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
+    wheels: WheelCalibration | None = None
     if mode == "batch":
-        estimates, landmarks, more = smooth_run(parts)
-        notes = (*notes, *more)
+        smoothed = smooth_run(parts)
+        estimates, landmarks, wheels = smoothed.estimates, smoothed.landmarks, smoothed.wheels
+        notes = (*notes, *smoothed.notes)
     if again := len(estimates) - len(last_pass(estimates)):
         notes = (
             *notes,
@@ -132,6 +135,7 @@ def run(
         landmarks=landmarks,
         spans=replay.spans(),
         source=recording_path,
+        wheels=wheels,
     )
 
 

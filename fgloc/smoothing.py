@@ -19,21 +19,33 @@ from fgloc.types import (
     LandmarkMap,
     MotionMeasurement,
     RangeBearingMeasurement,
+    WheelCalibration,
 )
+from fgloc.wheelcal import calibrate_wheels
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
 _NUDGE = 0.005  # of log scale, and of radians: finite differences
 _NEWTON_STEPS = 2
 
 
-def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tuple[str, ...]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedRun:
+    """Estimates at every keyframe, with the modes they had online, and what else came out."""
+
+    estimates: list[Estimate]
+    landmarks: LandmarkMap | None  # given or estimated
+    notes: tuple[str, ...]
+    wheels: WheelCalibration | None
+
+
+def smooth_run(parts: Assembly) -> SmoothedRun:
     """Smooth a run that was replayed with ``keep_all``.
 
     Args:
         parts: the run's parts; the localizer's log is read, and its motions are replaced.
 
-    Returns:
-        Estimates at every keyframe (with the modes they had online), the map (given or estimated), and notes.
+    Raises:
+        EstimatorError: the graph cannot be solved, or holds no wheels that could be calibrated.
     """
     localizer, config = parts.localizer, parts.config
     solver = BatchSmoother(localizer.estimator.log, localizer.factors, config.batch, config.estimator.gate_probability)
@@ -53,6 +65,10 @@ def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tup
             f"Sightings calibrated on top of the configuration: ranges x {scale:.4f} ± {sigmas[0]:.4f}, "
             f"bearings - {offset:.4f} ± {sigmas[1]:.4f} rad."
         )
+    wheels = None
+    if config.batch.calibrate_wheels:
+        wheels = calibrate_wheels(parts, solver)
+        notes.append(f"Wheels calibrated on this run: {wheels}.")
     result = solver.result()
     estimates = [
         Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov, float(pose[2])), frame.mode)
@@ -62,7 +78,7 @@ def smooth_run(parts: Assembly) -> tuple[list[Estimate], LandmarkMap | None, tup
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
-    return estimates, landmarks, tuple(notes)
+    return SmoothedRun(estimates, landmarks, tuple(notes), wheels)
 
 
 def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

@@ -386,6 +386,19 @@ class Heard:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class WheelCalibration:
+    """Gains of the wheels that fit a run best."""
+
+    names: tuple[str, ...]  # as `fgloc.config.WheelsConfig` has them
+    value: FloatArray  # (n,)
+    cov: FloatArray  # (n, n)
+
+    def __str__(self) -> str:
+        rows = zip(self.names, self.value.tolist(), np.sqrt(abs(np.diag(self.cov))).tolist(), strict=True)
+        return ", ".join(f"{name} {value:.4f} ± {sigma:.4f}" for name, value, sigma in rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
     """A whole run, ready to be evaluated and written."""
 
@@ -401,3 +414,4 @@ class RunResult:
     landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
     spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None
+    wheels: WheelCalibration | None = None  # if it was asked for

@@ -78,7 +78,7 @@ def test_only_a_model_that_reads_velocity_is_asked_again_at_the_smoothed_one(tmp
     save_model(tmp_path / "model.safetensors", make_tensors(card, np.random.default_rng(0)), card)
     bag = write_world(tmp_path, World(beacons(), seconds=8.0))
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
-    estimates, _, _ = smooth_run(parts)
+    estimates = smooth_run(parts).estimates
     heard = parts.localizer.sources._learned.heard
     if kind == "displacement":
         assert not heard
@@ -96,7 +96,7 @@ def test_no_velocity_leads_across_a_jump(tmp_path):
     second = World(beacons(), seed=1, seconds=5.0, start_ns=START_NS + 200 * 10**9, start_s=9.0)
     bag = write_world(tmp_path, World(beacons(), seconds=5.0), second)
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
-    estimates, _, _ = smooth_run(parts)
+    estimates = smooth_run(parts).estimates
     heard = np.array(list(parts.localizer.sources._learned.heard.values()))
     assert len(heard) == len(estimates) - 2
     assert np.abs(heard[:, 0]).max() < 2 * SPEED

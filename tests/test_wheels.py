@@ -234,6 +234,14 @@ def test_scales_and_veer():
     assert pose == pytest.approx(se2.exp((0.45 * seconds, 0.0, (0.24 - 0.045) * seconds)), abs=1e-9)
 
 
+@pytest.mark.parametrize(("omega", "share"), [(0.0, 1.0), (0.2, 0.8), (-0.2, 0.8), (1.5, 0.0)])
+def test_a_robot_that_slows_down_in_turns(omega, share):
+    steps = run(stepper(), [command(t, 0.5, omega) for t in times(1, 3, 20)])
+    pose, _, _ = total(steps, WheelsConfig(source="command", scale_v=1.1, slowdown=1.0))
+    seconds = (steps[-1].stamp_ns - steps[0].stamp_ns) * 1e-9
+    assert pose == pytest.approx(se2.exp((0.55 * share * seconds, 0.0, omega * seconds)), abs=1e-9)
+
+
 def test_auto_prefers_odometry_and_says_so(drive):
     events = in_order_of_receipt(
         [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 10, 20)],

@@ -40,6 +40,7 @@ app.command()(runs.smooth)
 app.command()(runs.online)
 app.command()(tools.evaluate)
 app.command(name="map")(runs.make_map)
+app.command()(runs.calibrate)
 app.command()(sweeps.ablate)
 
 

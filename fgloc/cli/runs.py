@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 import fgloc
@@ -111,6 +112,27 @@ def make_map(
     write_map(result.landmarks, out)
     typer.echo(f"{len(result.landmarks)} landmarks in {out}")
     exit_if_lost(result.modes)
+
+
+def calibrate(
+    bags: Bags,
+    out: Annotated[Path, typer.Option("--out", metavar="ROBOT.yaml", help="configuration file to be written")],
+    map_file: MapOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Find the gains of wheels, or of commands that stand in for them, from what the recordings saw of a map."""
+    from fgloc.calibration import calibrate as calibrated
+    from fgloc.config import yaml_of
+    from fgloc.recording.outputs import write_text
+
+    before = configured(bags[0], config, None)
+    with run_bar("calibrate") as progress:
+        after, found = calibrated(bags, map_file, before, progress)
+    write_text(out, f"# {typed()}\n# {found}\n{yaml_of(after, out.parent)}")
+    told = zip(found.names, found.value.tolist(), np.sqrt(np.diag(found.cov)).tolist(), strict=True)
+    rows = [(n, f"{getattr(before.wheels, n):.4f}", f"{value:.4f} ± {sigma:.4f}") for n, value, sigma in told]
+    typer.echo(columns(("wheels", "before", "calibrated"), rows))
+    typer.echo(f"configuration: {out}")
 
 
 def _localise(

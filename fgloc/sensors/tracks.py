@@ -67,7 +67,8 @@ class Track:
             vx = vy = 0.0
         if abs(w) < config.zero_yaw_rate:
             w = 0.0
-        vx, vy = config.scale_v * vx, config.scale_v * vy
+        scale = config.scale_v * max(0.0, 1.0 - config.slowdown * abs(w))
+        vx, vy = scale * vx, scale * vy
         return vx, vy, config.scale_omega * w + config.yaw_per_m * vx
 
     def _extend(self, stamp_ns: int, twist: Twist | None, held: Twist | None) -> None:

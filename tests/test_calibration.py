@@ -1,0 +1,143 @@
+"""Wheels calibrated on a recording: the true gains are found, and the path is as long as it was."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from datasets.bag import BagWriter
+from fgloc import cli, se2
+from fgloc.calibration import calibrate
+from fgloc.config import Config, load_config, model_path, yaml_of
+from fgloc.errors import EstimatorError
+from fgloc.runner import run
+
+START_NS = 1_700_000_000_000_000_000
+BEACONS = {0: (4.0, 0.5), 1: (0.5, 4.0), 2: (-4.0, -0.5), 3: (-0.5, -4.0)}
+TRUE = {"scale_v": 1.06, "scale_omega": 0.93, "yaw_per_m": -0.05, "slowdown": 0.6, "delay_s": 0.2}
+OF_WHEELS = ("scale_v", "scale_omega", "yaw_per_m")
+NOISE = {"x_per_sqrt_m": 0.01, "y_per_sqrt_m": 0.003, "yaw_per_sqrt_m": 0.02, "yaw_per_sqrt_rad": 0.0}
+LANDMARKS = {"range_sigma_m": 0.03, "bearing_sigma_rad": 0.01}
+SECONDS = 60
+
+
+def settings(source: str) -> Config:
+    sigmas = {"scale_sigma": 0.1, "turn_scale_sigma": 0.1, "yaw_per_m_sigma": 0.1}
+    wheels = {"source": source, "noise": NOISE, "hold_s": 0.2, **sigmas}
+    return Config.model_validate({"wheels": wheels, "landmarks": LANDMARKS})
+
+
+def drive(folder: Path, seed: int, told_by: str) -> Path:
+    """A robot that obeys with the true gains, told by commands or telling by odometry; one beacon seen every 2 s."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform([0.1, -0.8], [0.4, 0.8], (SECONDS // 3 + 1, 2))
+    slow, late = (TRUE["slowdown"], round(TRUE["delay_s"] * 100)) if told_by == "command" else (0.0, 0)
+    pose, told = np.zeros(3), [(0.0, 0.0)] * (1 + late // 5)
+    with BagWriter(folder / "bag") as bag:
+        for k in range(SECONDS * 100):
+            stamp = START_NS + k * 10_000_000
+            if k % 5 == 0:
+                v, omega = levels[k // 300]
+                omega -= 0.3 * math.hypot(pose[0], pose[1]) * math.sin(pose[2] - math.atan2(-pose[1], -pose[0]))  # back
+                if told_by == "command":
+                    bag.command("/cmd_vel", stamp, v, omega)
+                else:
+                    bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (v, omega))
+                told.append((v, omega))
+            if k % 20 == 0:
+                bag.truth(
+                    "/truth", stamp, (pose[0], pose[1], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2))
+                )
+            if k % 200 == 0 or k == 20:
+                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, int(i)) for i in rng.choice(4, 2, False)])
+            v, omega = told[-1 - late // 5]
+            v *= TRUE["scale_v"] * max(0.0, 1.0 - slow * abs(omega))
+            turn = TRUE["scale_omega"] * omega + TRUE["yaw_per_m"] * v
+            way = 0.01 * v + NOISE["x_per_sqrt_m"] * math.sqrt(0.01 * abs(v)) * rng.normal()
+            pose = se2.compose(pose, se2.exp((way, 0.0, 0.01 * turn)))
+    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
+    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
+    (folder / "robot.yaml").write_text(yaml_of(settings("twist" if told_by == "wheels" else told_by), folder))
+    return folder / "bag"
+
+
+def sight(rng: np.random.Generator, pose: np.ndarray, i: int) -> tuple[int, float, float]:
+    x, y, _ = se2.between(pose, (*BEACONS[i], 0.0))
+    return i, math.hypot(x, y) + rng.normal(0.0, 0.03), math.atan2(y, x) + rng.normal(0.0, 0.01)
+
+
+def length(poses: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+
+
+@pytest.fixture(scope="module")
+def commanded(tmp_path_factory) -> Path:
+    return drive(tmp_path_factory.mktemp("commanded"), 1, "command")
+
+
+@pytest.fixture(scope="module")
+def wheeled(tmp_path_factory) -> list[Path]:
+    return [drive(tmp_path_factory.mktemp("wheeled"), seed, "wheels") for seed in (2, 3)]
+
+
+def test_the_gains_of_commands_are_found_and_the_path_gets_its_length(commanded, tmp_path):
+    out = tmp_path / "calibrated.yaml"
+    result = CliRunner().invoke(cli.app, ["calibrate", str(commanded), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    wheels = load_config(out).wheels
+    for name, tolerance in (("scale_v", 0.02), ("scale_omega", 0.02), ("yaw_per_m", 0.03), ("slowdown", 0.1)):
+        assert getattr(wheels, name) == pytest.approx(TRUE[name], abs=tolerance), name
+    assert wheels.delay_s == pytest.approx(TRUE["delay_s"], abs=0.03)
+    assert wheels.hold_s == 0.2  # what was given stays
+    errors = []
+    for config in (settings("command"), load_config(out)):
+        smoothed = run(commanded, commanded.parent / "map.yaml", config, "batch")
+        poses = smoothed.trajectory.poses
+        truth = se2.interpolate(smoothed.truth.stamps_ns, smoothed.truth.poses, smoothed.trajectory.stamps_ns)
+        errors.append(abs(length(poses) / length(truth) - 1.0))
+    assert errors[1] < 0.02
+    assert errors[0] > 3.0 * errors[1]
+
+
+def test_sigmas_are_honest_and_shrink_with_every_recording(wheeled):
+    config, map_path = settings("twist"), wheeled[0].parent / "map.yaml"
+    one, both = (calibrate(bags, map_path, config)[1] for bags in (wheeled[:1], wheeled))
+    for found in (one, both):
+        assert found.names == OF_WHEELS
+        error = found.value - [TRUE[name] for name in OF_WHEELS]
+        assert error @ np.linalg.solve(found.cov, error) < 16.3  # χ², 3 dof, 0.999
+    assert (np.diag(both.cov) < 0.8 * np.diag(one.cov)).all()
+    assert (np.sqrt(np.diag(both.cov)) < 0.03).all()
+
+
+def test_a_run_that_is_asked_to_calibrates_itself(wheeled):
+    config = settings("twist").model_copy(
+        update={"batch": Config.model_validate({"batch": {"calibrate_wheels": True}}).batch}
+    )
+    result = run(wheeled[0], wheeled[0].parent / "map.yaml", config, "batch")
+    assert result.wheels is not None
+    assert result.wheels.value[0] == pytest.approx(TRUE["scale_v"], abs=0.03)
+    assert f"Wheels calibrated on this run: {result.wheels}." in result.notes
+
+
+def test_recordings_with_different_wheels_are_refused(commanded, wheeled):
+    with pytest.raises(EstimatorError, match="some of the recordings have wheels"):
+        calibrate([commanded, wheeled[0]], commanded.parent / "map.yaml", settings("auto"))
+
+
+def test_a_written_configuration_is_read_back(tmp_path):
+    values = {
+        "wheels": {"scale_v": 0.9, "noise": {"x_per_sqrt_m": 0.01}},
+        "camera": {"file": tmp_path / "cameras" / "front.yaml"},
+        "motion": {"model": model_path("shipped:mrclam/all")},
+    }
+    config = Config.model_validate(values)
+    (tmp_path / "robot.yaml").write_text(yaml_of(config, tmp_path))
+    text = (tmp_path / "robot.yaml").read_text()
+    assert "shipped:mrclam/all" in text
+    assert "file: cameras/front.yaml" in text
+    assert load_config(tmp_path / "robot.yaml") == config
