@@ -261,9 +261,6 @@ class WeightsConfig(Section):
         30.0, gt=0, description="squared Mahalanobis distance of two sources that flags a disagreement"
     )
     release_s: float = Field(0.6, gt=0, description="agreement for this long ends it")
-    slip_scale: float = Field(
-        3.0, ge=1, description="on the variance of the way that the learned motion tells while the wheels slip"
-    )
     quarantine_after: int = Field(
         6, gt=0, description="refusals in excess of what is believed that quarantine a marker"
     )

@@ -158,7 +158,8 @@ class Localizer:
         with self.stopwatch("weigh"):
             trust = self.trust.judge(step, readings)
             decisions = self._revise(k, trust)
-            motions = self.sources.combine(readings, trust.off)
+            footing = self.estimator.log.footing(k)
+            motions = self.sources.combine(readings, trust.off, footing)
             if not motions:
                 motions = [self.sources.unknown(step)]
                 self.rejections["motion.silent"] += 1
@@ -205,7 +206,7 @@ class Localizer:
         if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
             self._get_lost()
         frame = self.estimator.log.keyframes[k]
-        frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, scale, doubt
+        frame.readings, frame.off, frame.footing, frame.scale, frame.doubt = readings, trust.off, footing, scale, doubt
         decisions += motion_decisions(
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else ""
         )
@@ -232,6 +233,7 @@ class Localizer:
         frames = (log[i] for i in range(k - trust.span + 1, k) if i in log)
         for frame in (f for f in frames if f.prior is None and trust.accused not in f.off):
             frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
+            frame.footing = self.estimator.log.footing(frame.k)
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
                 decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")

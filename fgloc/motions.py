@@ -10,6 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.footing import Footing
 from fgloc.graph.log import Belief, Keyframe
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
@@ -49,8 +50,6 @@ class MotionSources:
         self._learned = learned
         self._joint = joint
         self.gyro = gyro
-        way = math.sqrt(config.weights.slip_scale)
-        self._slip_scale = np.outer((way, way, 1.0), (way, way, 1.0))
         self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
         self._way_m = self._turn_rad = 0.0  # what the wheels have told since the last fix
 
@@ -105,14 +104,17 @@ class MotionSources:
             return None
         return self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
 
-    def combine(self, readings: Readings, off: Mapping[str, str] | None = None) -> list[MotionMeasurement]:
+    def combine(
+        self, readings: Readings, off: Mapping[str, str] | None = None, footing: Footing | None = None
+    ) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other.
 
         Args:
             readings: what the sources say.
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
-                knows the distance, kept with room for a slip. The other sources enter as they are, but for the way
-                that the learned motion tells while the wheels slip, which it knows less well.
+                knows the distance, kept with room for a slip.
+            footing: at the start of the step; what the sources miss there, they miss alike, so that as many factors as
+                there are each get that many times the room.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
@@ -120,8 +122,6 @@ class MotionSources:
             learned = None
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
-        if learned is not None and off.get("wheels") == "slip":
-            learned = replace(learned, cov=learned.cov * self._slip_scale)
         if wheels is not None and "wheels" in off:
             wheels = None if learned is not None else self._doubtful(wheels, off["wheels"])
         elif wheels is not None and learned is not None:
@@ -130,6 +130,9 @@ class MotionSources:
             elif self._joint is not None:
                 learned = self._joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
+        if known and footing is not None and self._config.weights.adaptive:
+            room = footing.room(known[-1], off.get("wheels") == "slip")
+            known = [worsened(m, doubt=len(known) * room) for m in known]
         if gyro is not None and known:
             known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
         return known
@@ -142,7 +145,7 @@ class MotionSources:
 
     def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
-        made = self.combine(readings or frame.readings, frame.off)
+        made = self.combine(readings or frame.readings, frame.off, frame.footing)
         return [worsened(m, frame.scale, frame.doubt) for m in made]
 
     def disagreement(self, readings: Readings) -> tuple[FloatArray, FloatArray] | None:

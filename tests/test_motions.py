@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.footing import Footing
 from fgloc.graph.estimator import fuse
 from fgloc.graph.log import Belief, Keyframe
 from fgloc.localizer import Localizer
@@ -97,13 +98,26 @@ def test_what_enters_when_a_source_is_not_believed(tmp_path):
     dead = some.combine(all_say, {"wheels": "frozen"})
     assert names(dead) == ["learned", "gyro"]
     assert dead[0] is LEARNED  # plain: there is nothing left that it is correlated with
-    slipping = some.combine(all_say, {"wheels": "slip"})
+    slipping = some.combine(all_say, {"wheels": "slip"}, Footing())
     assert slipping[0].cov[2, 2] == LEARNED.cov[2, 2]
     assert slipping[0].cov[0, 0] > LEARNED.cov[0, 0]  # the way is known less well in a slip
+    fixed = sources(learned_motion(tmp_path), weights={"adaptive": False})
+    soft = fixed.combine(all_say, footing=Footing(firm_s=1.0))
+    assert [m.cov.tolist() for m in soft] == [m.cov.tolist() for m in fixed.combine(all_say)]
     without = some.combine(all_say, {"learned": "distrusted"})
     assert names(without) == ["wheels", "gyro"]
     assert without[0] is WHEELS
     assert names(some.combine(all_say, {"gyro": "distrusted"})) == ["wheels", "learned"]
+
+
+def test_what_all_sources_miss_is_not_averaged_away(tmp_path):
+    pair = Readings(WHEELS, LEARNED)
+    some, soft = sources(learned_motion(tmp_path)), Footing(firm_s=1.0)
+    room = soft.room(LEARNED, slips=False)
+    assert np.diag(room)[:2].min() > 0.0
+    _, cov = fuse(some.combine(pair, footing=soft))
+    _, firm = fuse(some.combine(pair))
+    assert (np.linalg.eigvalsh(cov - firm - room) > -1e-12).all()  # more than the firm floor's, by the room at least
 
 
 def test_wheels_that_alone_know_the_way_are_kept_with_room_for_a_slip():

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 
+from fgloc.footing import Footing
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 
@@ -47,6 +48,7 @@ class Keyframe:
     mode: Mode = Mode.OK
     readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
     off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
+    footing: Footing = field(default_factory=Footing)  # at the start of the step
     scale: float = 1.0  # on the covariances of the motions that these make ...
     doubt: FloatArray | None = None  # ... and what was added to them
 
@@ -69,6 +71,13 @@ class MeasurementLog:
             if self.keyframes[oldest].elapsed_s >= horizon:
                 break
             del self.keyframes[oldest]
+
+    def footing(self, k: int) -> Footing:
+        """At the start of the step to keyframe ``k``: what became of it in the step before."""
+        before = self.keyframes.get(k - 1)
+        if before is None or before.step is None:
+            return Footing()
+        return before.footing.then(before.off.get("wheels") == "slip", before.step.dt)
 
     def since(self, elapsed_s: float) -> Iterator[Keyframe]:
         """Keyframes not older than the given time of the estimator's own clock."""
