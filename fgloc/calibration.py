@@ -12,6 +12,7 @@ from fgloc.errors import EstimatorError
 from fgloc.runner import Progress, find_beside, run
 from fgloc.types import WheelCalibration
 
+_DIGITS = 5
 _ROUNDS = 2  # with the gains of the first, sightings are believed and refused that were not before
 
 
@@ -41,7 +42,7 @@ def calibrate(
         )
         found = [run(bag, map_path or find_beside(bag, "map.yaml"), alone, "batch", progress).wheels for bag in bags]
         pooled = _pooled([wheels for wheels in found if wheels is not None])
-        gains = dict(zip(pooled.names, pooled.value.tolist(), strict=True))
+        gains = dict(zip(pooled.names, pooled.value.round(_DIGITS).tolist(), strict=True))
         config = config.model_copy(update={"wheels": config.wheels.model_copy(update=gains)})
     return config, pooled
 

@@ -22,7 +22,7 @@ TRUE = {"scale_v": 1.06, "scale_omega": 0.93, "yaw_per_m": -0.05, "slowdown": 0.
 OF_WHEELS = ("scale_v", "scale_omega", "yaw_per_m")
 NOISE = {"x_per_sqrt_m": 0.01, "y_per_sqrt_m": 0.003, "yaw_per_sqrt_m": 0.02, "yaw_per_sqrt_rad": 0.0}
 LANDMARKS = {"range_sigma_m": 0.03, "bearing_sigma_rad": 0.01}
-SECONDS = 60
+SECONDS = {"command": 60, "wheels": 40}
 
 
 def settings(source: str) -> Config:
@@ -34,11 +34,11 @@ def settings(source: str) -> Config:
 def drive(folder: Path, seed: int, told_by: str) -> Path:
     """A robot that obeys with the true gains, told by commands or telling by odometry; one beacon seen every 2 s."""
     rng = np.random.default_rng(seed)
-    levels = rng.uniform([0.1, -0.8], [0.4, 0.8], (SECONDS // 3 + 1, 2))
+    levels = rng.uniform([0.1, -0.8], [0.4, 0.8], (SECONDS[told_by] // 3 + 1, 2))
     slow, late = (TRUE["slowdown"], round(TRUE["delay_s"] * 100)) if told_by == "command" else (0.0, 0)
     pose, told = np.zeros(3), [(0.0, 0.0)] * (1 + late // 5)
     with BagWriter(folder / "bag") as bag:
-        for k in range(SECONDS * 100):
+        for k in range(SECONDS[told_by] * 100):
             stamp = START_NS + k * 10_000_000
             if k % 5 == 0:
                 v, omega = levels[k // 300]
