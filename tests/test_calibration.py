@@ -129,6 +129,22 @@ def test_recordings_with_different_wheels_are_refused(commanded, wheeled):
         calibrate([commanded, wheeled[0]], commanded.parent / "map.yaml", settings("auto"))
 
 
+def test_a_learned_motion_leaves_no_wheels_to_calibrate(commanded):
+    config = Config.model_validate(
+        settings("command").model_dump(exclude_unset=True)
+        | {"motion": {"model": "shipped:mrclam/all"}, "batch": {"calibrate_wheels": True}}
+    )
+    with pytest.raises(EstimatorError, match="leave out --model"):
+        run(commanded, commanded.parent / "map.yaml", config, "batch")
+
+
+def test_gains_that_no_robot_has_are_not_written(wheeled):
+    config = settings("twist")
+    far = config.model_copy(update={"wheels": config.wheels.model_copy(update={"scale_v": 0.4})})
+    with pytest.raises(EstimatorError, match="cannot be calibrated on this run: scale_v"):
+        calibrate(wheeled[:1], wheeled[0].parent / "map.yaml", far)
+
+
 def test_a_written_configuration_is_read_back(tmp_path):
     values = {
         "wheels": {"scale_v": 0.9, "noise": {"x_per_sqrt_m": 0.01}},
