@@ -33,6 +33,7 @@ from training.config import (
 from training.controls import controls, draw_controls
 from training.data import Run
 from training.export import card_of, tensors_of
+from training.models import DisplacementNet
 from training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
 
 
@@ -72,6 +73,28 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
             got = model.predict(run.commands, start, start + steps * SECOND // 10, velocity)
             assert got is not None
             np.testing.assert_allclose(got.motion, poses[steps - 1], atol=1e-6)
+        if isinstance(net, DisplacementNet):
+            _, x = net.inputs(samples, torch.tensor([k]), 1)
+            got = model.predict(run.commands, start, start + SECOND // 10, None)
+            assert got is not None
+            variances = np.exp(net.log_density(x).detach().numpy()[0, 0]) * 0.1
+            np.testing.assert_allclose(np.diag(got.cov), variances, rtol=1e-4)
+
+
+def test_the_variance_starts_from_the_sizes_of_changes(tmp_path: Path) -> None:
+    run = sensing(0, 30.0)
+    network = NetworkConfig(
+        hidden=(32, 32), inputs=("commands", "effort"), edges_s=(0.0, 0.1, 0.3, 0.5), signal_edges_s=(0.0, 0.1, 0.35)
+    )
+    net = training.new_net(network, [run])
+    assert isinstance(net, DisplacementNet)
+    assert isinstance(net.variance, torch.nn.Sequential)
+    features = net.samples([run]).features
+    told, torque = features[:, :6].reshape(-1, 3, 2), features[:, 6:].reshape(-1, 3, 2)
+    units = torch.relu(net.variance[0]((features - net.mean) / net.std)).detach()
+    changes = torch.cat([part[:, :-1].sub(part[:, 1:]).flatten(1) for part in (told, torque)], dim=1)
+    scales = torch.cat([net.std[:4], net.std[6:10]])
+    np.testing.assert_allclose(units[:, 0:16:2] + units[:, 1:16:2], changes.abs() / scales, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -305,6 +305,17 @@ def test_errors_that_cancel_weigh_more_over_short_windows(runs: dict[str, Run]) 
         assert values.mean() / 3 == pytest.approx(1.0, abs=0.25)
 
 
+def test_errors_that_cancel_altogether_leave_doubt(runs: dict[str, Run]) -> None:
+    exact = noisy_rollouts(runs, NoiseDensity(xy_per_sqrt_s=1e-4, yaw_per_sqrt_s=1e-4), 0)
+    straight = [replace(r, covs=np.tile(1e-4 * np.eye(3), (len(r.covs), 1, 1))) for r in exact]
+    rng = np.random.default_rng(1)
+    seen = [replace(r, truth=r.truth + rng.normal(size=r.truth.shape) * 0.01) for r in straight]
+    scale, memory = fit_variance(seen, CalibrationConfig())
+    assert max(memory.share) < 0.0
+    assert min(memory.share) >= -9.0 - 1e-6  # a tenth of what one step shows stays
+    assert min(scale) > 0.02
+
+
 def test_joint_errors_are_estimated(runs: dict[str, Run]) -> None:
     shared, own = noisy_rollouts(runs, NOISE, 0), noisy_rollouts(runs, NOISE, 1)
     config = CalibrationConfig(window_s=2.0)

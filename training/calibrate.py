@@ -23,6 +23,7 @@ _FIELDS = tuple(NoiseDensity.model_fields)
 _MIN_STEP_VARIANCE = 1e-12  # keeps a covariance definite where the robot rests
 _MIN_DENSITY = 1e-4
 _MIN_FACTOR = 1e-4
+_MIN_LONG = 0.1  # of what short windows show: what cancels in the end still leaves doubt
 _FIT_WINDOW_S = 2.0
 
 
@@ -116,7 +117,8 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
     def fitted(times_s: tuple[float, ...], start: FloatArray) -> tuple[FloatArray, float]:
         all_hidden = ErrorMemory(time_s=_row(np.array(times_s)), share=(_ALMOST_ONE,) * 3)
         shown = np.array([all_hidden.growth(horizon) for horizon in window_s])[of_window, :, None, None]
-        return _most_likely(e, np.concatenate([shown * basis, (1.0 - shown) * basis], axis=1), start)
+        of_short = _MIN_LONG * shown + 1.0 - shown
+        return _most_likely(e, np.concatenate([shown * basis, of_short * basis], axis=1), start)
 
     # The best time constant for all axes, then each axis' own
     start = np.full(6, 0.5)
@@ -125,7 +127,8 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
         tried = [(*times_s[:axis], t, *times_s[axis + 1 :]) for t in config.memory_s]
         times_s = min(tried, key=lambda times_s: fitted(times_s, start)[1])
     best, _ = fitted(times_s, start)
-    long, short = np.maximum(best, _MIN_FACTOR).reshape(2, 3)
+    more, short = np.maximum(best, _MIN_FACTOR).reshape(2, 3)
+    long = more + _MIN_LONG * short
     share = np.minimum(1.0 - short / long, _ALMOST_ONE)
     return _row(long), ErrorMemory(time_s=_row(np.array(times_s)), share=_row(share))
 

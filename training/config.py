@@ -39,6 +39,9 @@ class NetworkConfig(Section):
     hidden: tuple[int, ...] = Field(
         (128, 128), description="gru: units of the cell, then of layers; naive, lag, arx: unused"
     )
+    variance_units: int = Field(
+        64, gt=0, description="displacement: width of the layers, as many as the mean has, that tell the variance"
+    )
     members: int = Field(1, ge=1, le=64, description="displacement: networks trained from different seeds and averaged")
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
     edges_s: tuple[float, ...] = Field(
@@ -87,7 +90,7 @@ class OptimizationConfig(Section):
     nll_beta: float = Field(
         0.0, ge=0, le=1, description="β of the β-NLL: 0 is the likelihood, 1 gives sure and unsure windows equal weight"
     )
-    variance_iterations: int = Field(500, ge=0)
+    variance_iterations: int = Field(1500, ge=0)
 
 
 class CalibrationConfig(Section):

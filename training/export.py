@@ -25,6 +25,14 @@ def tensors_of(nets: list[MotionNet]) -> Tensors:
     return out
 
 
+def _widths(net: MotionNet) -> tuple[int, ...]:
+    """Of the hidden layers as `tensors_of` stacks them."""
+    kind, hidden = net.config.kind, net.config.hidden
+    if kind in ("naive", "lag", "arx"):
+        return ()
+    return tuple(h + net.config.variance_units for h in hidden) if kind == "displacement" else hidden
+
+
 def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> ModelCard:
     """The card of a network that is trained and not yet calibrated."""
     network = config.network
@@ -36,7 +44,7 @@ def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> 
             robot=config.robot,
             inputs=network.inputs if displacement else ("commands", "velocity") if velocity else ("commands",),
             dt_s=network.dt_s,
-            hidden=() if network.kind in ("naive", "lag", "arx") else network.hidden,
+            hidden=_widths(net),
             members=network.members,
             hold_s=network.hold_s,
             history_s=max(network.edges_s[-1], net.kinematics.delay_s) if displacement else _WARM_UP_S,

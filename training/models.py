@@ -73,11 +73,48 @@ class DisplacementNet(nn.Module):
         else:
             net = mlp([len(mean), *config.hidden, 3])
             self.trunk, self.mean_head = net[:-1], net[-1]
-        width = self.mean_head.in_features
-        self.variance_head = nn.Linear(width, 3)
+        self.variance: nn.Sequential | nn.Linear = (
+            nn.Linear(self.mean_head.in_features, 3) if config.kind == "gru" else self._variance_net()
+        )
+        head = self.variance if isinstance(self.variance, nn.Linear) else self.variance[-1]
         with torch.no_grad():
-            self.variance_head.weight.zero_()
-            self.variance_head.bias.copy_(torch.log(torch.tensor([1e-2, 1e-2, 3e-2]) ** 2))
+            head.weight.zero_()
+            head.bias.copy_(torch.log(torch.tensor([1e-2, 1e-2, 3e-2]) ** 2))
+
+    def _variance_net(self) -> nn.Sequential:
+        """A network of its own, as deep as the mean's: what makes motion uncertain is not what makes it.
+
+        Its first units start as the sizes of changes from age to age, then of the inputs themselves: robots pick up
+        changed commands at instants that nobody knows.
+        """
+        units = self.config.variance_units
+        net = mlp([len(self.mean), *[units] * len(self.config.hidden), 3])
+        first = net[0]
+        rows, offsets = [], []
+        for younger, older in [*self._neighbors(), *((i, None) for i in range(len(self.mean)))]:
+            row, offset = torch.zeros(len(self.mean)), float(self.mean[younger] / self.std[younger])
+            row[younger] = 1.0
+            if older is not None:
+                row[older] = -float(self.std[older] / self.std[younger])
+                offset -= float(self.mean[older] / self.std[younger])
+            rows += [row, -row]
+            offsets += [offset, -offset]
+        n = min(units, len(rows))
+        with torch.no_grad():
+            first.weight[:n] = torch.stack(rows[:n])
+            first.bias[:n] = torch.tensor(offsets[:n])
+        return net
+
+    def _neighbors(self) -> list[tuple[int, int]]:
+        """Columns of the same input at neighboring ages."""
+        found, first = [], 0
+        for ages, channels in [
+            (len(self.config.edges_s) - 1, 2),
+            *((len(self.config.signal_edges_s), CHANNELS[name]) for name in self.measured),
+        ]:
+            found += [(i, i + channels) for i in range(first, first + (ages - 1) * channels)]
+            first += ages * channels
+        return found
 
     def _features(self, run: Run) -> FloatArray:
         middles = run.times + 0.5 * run.dt_s
@@ -113,10 +150,10 @@ class DisplacementNet(nn.Module):
         """Samples of runs, in order."""
         return _samples(runs, [self._features(run) for run in runs], [self._base(run) for run in runs])
 
-    def hidden(
-        self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None
+    def inputs(
+        self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Base twists ``(b, steps, 3)`` and last hidden layer ``(b, steps, ·)``.
+        """Base twists ``(b, steps, 3)`` and normalized inputs ``(b, steps, ·)``.
 
         With ``rng``, half of the windows are told the velocity at their start, with noise (if the model reads it), and
         the gyro has a bias that is not known.
@@ -136,20 +173,40 @@ class DisplacementNet(nn.Module):
                 middles = (torch.arange(steps) + 0.5) * samples.dt_s
                 innovation = known[:, None] * torch.exp(-middles / self.config.velocity_decay_s)[:, None]
             x = torch.cat([x, innovation], dim=-1)
-        return base, self.trunk((x - self.mean) / self.std)
+        return base, (x - self.mean) / self.std
 
     def roll(self, samples: Samples, starts: Tensor, steps: int, rng: torch.Generator | None = None) -> Tensor:
         """Poses ``(b, steps, 3)`` after each step, seen from the start."""
-        base, hidden = self.hidden(samples, starts, steps, rng)
-        return integrate((base + self.scale * self.mean_head(hidden)) * samples.dt_s)
+        base, x = self.inputs(samples, starts, steps, rng)
+        return integrate((base + self.scale * self.mean_head(self.trunk(x))) * samples.dt_s)
+
+    def log_density(self, x: Tensor) -> Tensor:
+        """Log-variances per second ``(..., 3)`` of normalized inputs."""
+        if isinstance(self.variance, nn.Linear):
+            with torch.no_grad():
+                x = self.trunk(x)
+        return self.variance(x)
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and biases; the last layer has the mean's rows, then the variance's."""
+        """Weights and biases; the last layer has the mean's rows, then the variance's.
+
+        The two networks lie side by side in one: rows of both on the inputs, then blocks.
+        """
         trunk = self.trunk.layers if isinstance(self.trunk, Trunk) else self.trunk
-        linear = [m for m in trunk if isinstance(m, nn.Linear)]
-        heads = (self.mean_head, self.variance_head)
-        last = (torch.cat([h.weight for h in heads]), torch.cat([h.bias for h in heads]))
-        return [*((m.weight, m.bias) for m in linear), last]
+        mean = [*_linear(trunk), self.mean_head]
+        if isinstance(self.variance, nn.Linear):
+            last = [
+                torch.cat([getattr(m, name) for m in (self.mean_head, self.variance)]) for name in ("weight", "bias")
+            ]
+            return [*((m.weight, m.bias) for m in mean[:-1]), (last[0], last[1])]
+        pairs = list(zip(mean, _linear(self.variance), strict=True))
+        weights = [torch.cat([m.weight for m in pairs[0]])]
+        weights += [torch.block_diag(m.weight, v.weight) for m, v in pairs[1:]]
+        return [(w, torch.cat([m.bias, v.bias])) for w, (m, v) in zip(weights, pairs, strict=True)]
+
+
+def _linear(net: nn.Sequential) -> list[nn.Linear]:
+    return [m for m in net if isinstance(m, nn.Linear)]
 
 
 class NaiveNet(nn.Module):

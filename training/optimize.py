@@ -153,7 +153,7 @@ def train_variance(
     config: OptimizationConfig,
     checkpoint: Checkpoint | None = None,
 ) -> Curve:
-    """Likelihood of the composed errors over windows and over pieces of them; only the variance head learns."""
+    """Likelihood of the composed errors over windows and over pieces of them; only the variance learns."""
     samples = net.samples(training)
     piece = max(1, round(config.variance_piece_s / samples.dt_s))
     steps = piece * max(1, round(config.variance_horizon_s / samples.dt_s / piece))
@@ -164,10 +164,10 @@ def train_variance(
 
     def loss_of(on: Samples, chosen: Tensor) -> Tensor:
         with torch.no_grad():
-            _, hidden = net.hidden(on, chosen, steps, None)
+            _, x = net.inputs(on, chosen, steps)
             poses = torch.cat([torch.zeros(len(chosen), 1, 3), net.roll(on, chosen, steps)], dim=1)
             truth = on.poses[chosen[:, None] + torch.arange(steps + 1)]
-        log_density = net.variance_head(hidden)
+        log_density = net.log_density(x)
         return sum(_nll_of_pieces(poses, truth, log_density, length, on.dt_s, config.nll_beta) for length in lengths)
 
     def loss_of_batch(rng: torch.Generator) -> Tensor:
@@ -179,7 +179,7 @@ def train_variance(
 
     plan = Plan("variance", config.variance_iterations, config.learning_rate, _VARIANCE_EVERY, None, anneal=False)
     judge = score if validation else None
-    return descend(plan, net.variance_head, loss_of_batch, judge, config.seed, checkpoint or Checkpoint())
+    return descend(plan, net.variance, loss_of_batch, judge, config.seed, checkpoint or Checkpoint())
 
 
 def _nll_of_pieces(poses: Tensor, truth: Tensor, log_density: Tensor, length: int, dt_s: float, beta: float) -> Tensor:
