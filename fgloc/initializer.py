@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
+from fgloc.agreement import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
 from fgloc.carry import carry
 from fgloc.config import Config
 from fgloc.graph.estimator import fuse
@@ -29,24 +30,12 @@ from fgloc.types import (
 )
 
 _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
-_MAX_COST_PER_DOF = 4.0
-_MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
-_SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
-_MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
 _MAX_STEPS = 400
-_LEAST_SHARE = {
-    1: 0.8,
-    2: 0.6,
-}  # of the sightings that a place has to explain, by the number of landmarks they are of ...
-_LEAST_SHARE_OF_MANY = 0.52  # ... and of three or more: the rest have wrong ids, or were moved
-_WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to be known better:
-_PARTIAL_COST_PER_DOF = 1.5
-_PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
-_REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 _HEARD = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
+_CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
 _MAX_PLACES = 4  # that are fitted to the end
@@ -71,47 +60,13 @@ class Start:
         steps: what was collected, oldest first; the first one's motions are to be ignored.
         first: weak prior for the oldest step, to be followed by all its sightings.
         newest: pose at the newest step with the covariance that the sightings give.
+        contrary: sightings that contradict the place, by stamp and landmark: the weak prior could not refuse them.
     """
 
     steps: tuple[Collected, ...]
     first: Belief
     newest: Belief
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Agreed:
-    """A place, fitted to the sightings that it explains: their share of all, and of how many landmarks they are.
-
-    The share is of the information, because of what was carried far any place explains anything; that of a landmark
-    alone is of the number.
-    """
-
-    fit: Fit
-    share: float
-    landmarks: int
-    redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
-
-    @property
-    def certain(self) -> bool:
-        """Whether it explains enough, well enough, and is known well enough."""
-        if self.share < _LEAST_SHARE.get(self.landmarks, _LEAST_SHARE_OF_MANY) or self.fit.dof < 4:
-            return False
-        whole = self.share >= _WHOLE_SHARE
-        if not whole and self.redundancy < _REDUNDANT:
-            return False
-        cost, sigma = (_MAX_COST_PER_DOF, _MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
-        return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
-
-    @property
-    def compelling(self) -> bool:
-        """Whether it says that the robot is not where it was believed to be."""
-        known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
-        return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * _REDUNDANT
-
-    def beats(self, other: _Agreed) -> bool:
-        """Whether a place that explains about as much is so much worse that it is none."""
-        worse = other.fit.cost > _MAX_COST_PER_DOF * other.fit.dof
-        return worse or (self.share == other.share and other.fit.cost > self.fit.cost + _MARGIN)
+    contrary: frozenset[SightingKey]
 
 
 class Initializer:
@@ -126,11 +81,14 @@ class Initializer:
         self._map = landmark_map
         self._factors = factors
         self._steps: deque[Collected] = deque(maxlen=_MAX_STEPS)
+        self._doubted: frozenset[int] = frozenset()  # landmarks that contradicted one another
+        self._since_ns: int | None = None  # the first sighting of the search
         self.waiting = True
 
     def reset(self) -> None:
         """Look for the pose again."""
         self._steps.clear()
+        self._doubted, self._since_ns = frozenset(), None
         self.waiting = True
 
     @property
@@ -164,36 +122,66 @@ class Initializer:
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
         while self._steps[0].step.stamp_ns < horizon:
             self._steps.popleft()
-        newest = self._solve(known) if sightings else None
-        if newest is None:
+        if sightings and self._since_ns is None:
+            self._since_ns = step.stamp_ns
+        best = self._solve(known) if sightings else None
+        if best is None:
             return None
         self.waiting = False
         back = se2.inverse(self._travelled())
         steps = tuple(self._steps)
         self._steps.clear()
-        return Start(steps, Belief(se2.compose(newest.pose, back), _WEAK_PRIOR.copy()), newest)
+        self._doubted, self._since_ns = frozenset(), None
+        first = Belief(se2.compose(best.fit.pose, back), _WEAK_PRIOR.copy())
+        return Start(steps, first, Belief(best.fit.pose, best.fit.cov), best.contrary)
 
-    def _solve(self, known: bool) -> Belief | None:
+    def _solve(self, known: bool) -> Agreed | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
         few = _spread(here, _MAX_ROUGH)
         rough = [fit for c in self._candidates(here) if (fit := self._fit(c, few, _ROUGH_ITERATIONS)) is not None]
         places: list[FloatArray] = []
         for fit in sorted(rough, key=lambda fit: fit.cost):
-            if len(places) < _MAX_PLACES and all(_apart(fit.pose, other) for other in places):
+            if len(places) < _MAX_PLACES and all(apart(fit.pose, other) for other in places):
                 places.append(fit.pose)
         found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
         found.sort(key=lambda agreed: (-agreed.share, agreed.fit.cost))
         if not found:
             return None
         best = found[0]
-        rivals = [other for other in found[1:] if _apart(best.fit.pose, other.fit.pose)]
+        rivals = [other for other in found[1:] if apart(best.fit.pose, other.fit.pose)]
+        if best.redundancy < REDUNDANT and not known:
+            if best.opposing:
+                self._doubted |= best.opposing | best.agreeing
+            if best.agreeing & self._doubted:
+                return None
         if not best.certain or (known and not best.compelling):
             return None
         if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None
-        return Belief(best.fit.pose, best.fit.cov)
+        if not known and not self._waited() and not self._checked(best, here):
+            return None
+        return best
 
-    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> _Agreed | None:
+    def _waited(self) -> bool:
+        """Whether that is not to be expected any more."""
+        since = self._steps[-1].step.stamp_ns - (self._since_ns or 0)
+        return since > self._config.estimator.initialise_s * 1e9
+
+    def _checked(self, best: Agreed, sightings: Sequence[LandmarkMeasurement]) -> bool:
+        """Whether beacons tell this place even if any one of them is left out: so that no single one can feign it."""
+        agreeing = [
+            m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.contrary
+        ]
+        few = self._map is not None and len(self._map) < _CHECKABLE
+        if few or not all(isinstance(m, RangeBearingMeasurement) for m in agreeing):
+            return True
+        for landmark_id in best.agreeing:
+            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id], _ITERATIONS)
+            if fit is None or (np.sqrt(np.diag(fit.cov)) > MAX_SIGMA).any() or apart(fit.pose, best.fit.pose):
+                return False
+        return True
+
+    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> Agreed | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
         fit = self._fit(place, sightings, _ITERATIONS)
         if fit is None:
@@ -216,11 +204,20 @@ class Initializer:
         residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in heard}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
-        return _Agreed(fit, share, len(residuals), sum(residuals.values()) - 3)
+        contrary = [m for m in sightings if not any(m is other for other in agreeing)]
+        return Agreed(
+            fit,
+            share,
+            len(residuals),
+            sum(residuals.values()) - 3,
+            frozenset(told),
+            frozenset(m.landmark_id for m in contrary) - frozenset(told),
+            frozenset((m.stamp_ns, m.landmark_id) for m in contrary),
+        )
 
     def _explains(self, pose: FloatArray, m: LandmarkMeasurement) -> bool:
         cost = sighting_cost(pose, m, self._factors, self._config)
-        return cost is not None and cost[0] < _MAX_COST_PER_DOF * cost[1]
+        return cost is not None and cost[0] < MAX_COST_PER_DOF * cost[1]
 
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
         return joint_fit(start, sightings, self._factors, self._config, iterations)
@@ -266,11 +263,6 @@ class Initializer:
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:
     """All of them or, of too many, every second, third and so on."""
     return sightings[:: max(1, -(-len(sightings) // most))]
-
-
-def _apart(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two poses are two places."""
-    return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())
 
 
 def _information(m: LandmarkMeasurement) -> float:

@@ -14,7 +14,7 @@ from fgloc.account import flag_notes, motion_decisions, moved_notes, place_decis
 from fgloc.carry import measure_carried
 from fgloc.config import Config
 from fgloc.graph.ekf import ExtendedKalmanFilter
-from fgloc.graph.estimator import Estimator, fuse
+from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.interval import interval_scale
@@ -23,10 +23,10 @@ from fgloc.graph.weights import Weights
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
 from fgloc.motions import MotionSources, worsened
-from fgloc.selfcal import Calibration, Calibrator
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
+from fgloc.suspicion import Suspicion
 from fgloc.timing import Stopwatch
 from fgloc.trust import SourceTrust, Trust
 from fgloc.types import (
@@ -89,9 +89,8 @@ class Localizer:
         self._landmarks = landmarks
         known = landmark_map.landmarks.values() if landmark_map is not None else ()
         self._sizes = {landmark.landmark_id: landmark.size_m for landmark in known}
-        self.calibrator: Calibrator | None = None
-        if landmark_map is not None and config.landmarks.self_calibrating:
-            self.calibrator = Calibrator(config.landmarks, landmark_map)
+        self._suspicion = Suspicion(config, landmark_map, self.estimator, self.weights)
+        self.calibrator = self._suspicion.calibrator
         self._whereabouts = Whereabouts(config, landmark_map, self.factors)
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
@@ -133,6 +132,7 @@ class Localizer:
         if self._whereabouts.lost:
             return self._found(step, started.newest, [])
         first, *rest = started.steps
+        self.weights.contrary = started.contrary
         estimate = self._start(first.step, started.first, first.sightings)
         decisions = [*estimate.decisions]
         for later in rest:
@@ -143,8 +143,7 @@ class Localizer:
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
         believed, _, decisions = self._weigh(k, step, sightings, prior)
-        if self.calibrator is not None:
-            self.calibrator.start(prior.pose, prior.cov)
+        self._suspicion.start(prior, believed)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
@@ -194,8 +193,7 @@ class Localizer:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
             weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
-        if self.calibrator is not None:
-            self.calibrator.step(*fuse(motions), [s.raw for s in believed])
+        accused = self._suspicion.look(k, step.stamp_ns, motions, believed, kept)
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
@@ -203,6 +201,9 @@ class Localizer:
         fix = belief if believed else None
         self.sources.went(readings, fix)
         self.trust.hear(readings, fix)
+        if accused:  # the pose was corrected: no motion leads from where it was thought to be
+            self.sources.begin_segment()
+            self.trust.reset()
         if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
             self._get_lost()
         frame = self.estimator.log.keyframes[k]
@@ -210,13 +211,13 @@ class Localizer:
         decisions += motion_decisions(
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else ""
         )
-        return self._estimate(step, belief, [*decisions, *weighed])
+        return self._estimate(step, frame.belief, [*decisions, *weighed, *accused])
 
     def _weigh(
         self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: Belief
     ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
         """What is believed and refused, with the decisions; nothing against a given first pose that holds."""
-        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._calibration())
+        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._suspicion.calibration)
         believed, refused, decisions = self._whereabouts.hold(*weighed)
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held
@@ -294,9 +295,6 @@ class Localizer:
             *moved_notes(self.weights.quarantine.displacements),
             *flag_notes(self.trust.flags),
         )
-
-    def _calibration(self) -> Calibration | None:
-        return None if self.calibrator is None else self.calibrator.calibration
 
     def _count_landmarks(self, decisions: Sequence[Decision]) -> None:
         self.counts.update(d.kind for d in decisions if not d.reason)

@@ -73,6 +73,10 @@ class Calibrator:
         self._cov = np.zeros((5, 5))
         self._cov[:3, :3], self._cov[3:, 3:] = cov, calibration
 
+    def take(self, pose: FloatArray, value: FloatArray, cov: FloatArray) -> None:
+        """Another filter over the same state knows better; ``cov`` (5, 5) of pose and calibration."""
+        self._pose, self._value, self._cov = pose.copy(), value.copy(), cov.copy()
+
     def step(self, motion: FloatArray, cov: FloatArray, sightings: Iterable[LandmarkMeasurement]) -> None:
         """Move, then take in sightings as they were before correction (with the covariance they are used with)."""
         F = np.eye(5)

@@ -48,7 +48,8 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         EstimatorError: the graph cannot be solved, or holds no wheels that could be calibrated.
     """
     localizer, config = parts.localizer, parts.config
-    solver = BatchSmoother(localizer.estimator.log, localizer.factors, config.batch, config.estimator.gate_probability)
+    log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
+    solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability, moved)
     if config.batch.robust == "gnc" and solver.outliers:
         solver.replace_motions(_without(parts, solver))
     if parts.learned is not None and parts.learned.reads_velocity:

@@ -55,7 +55,7 @@ def seconds(estimate) -> float:
 def test_a_drive_is_followed_closely(kind, bound_m):
     for seed in range(2):
         world, chain, estimates = drive(kind, seed=seed, seconds=12.0)
-        assert len(estimates) == chain.steps
+        assert chain.steps - len(estimates) < 3  # a third beacon is waited for
         assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < bound_m
         assert modes(estimates) == [Mode.OK]
 
@@ -244,7 +244,7 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
     counts = chain.localizer.weights.rejections
-    assert counts["sightings.gate"] + counts["sightings.quarantined"] == len(refused)
+    assert sum(counts[f"sightings.{why}"] for why in ("gate", "quarantined", "contradicts_start")) == len(refused)
     assert counts["sightings.quarantined"] > 40
     moved_by = chain.localizer.weights.quarantine.displacements
     assert list(moved_by) == [2]

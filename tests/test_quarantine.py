@@ -144,7 +144,7 @@ def test_a_sighting_that_fits_now_and_then_clears_a_landmark():
     for i, pose in enumerate(poses(5, 60)):
         quarantine.disagree([factors.sighting(0, beacon(pose, stands, rng), None)], 0, pose, factors)
         if i % 2:
-            quarantine.fits(2)
+            quarantine.fits(factors.sighting(0, beacon(pose, world.landmarks[2], rng), None), 0, pose, factors)
     assert not quarantine.holds(2)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -60,9 +60,14 @@ class BatchSmoother:
     """
 
     def __init__(
-        self, log: MeasurementLog, factors: LandmarkFactors, config: BatchConfig, gate_probability: float
+        self,
+        log: MeasurementLog,
+        factors: LandmarkFactors,
+        config: BatchConfig,
+        gate_probability: float,
+        moved: Collection[int] = (),
     ) -> None:
-        """Take the log, whose filtered beliefs are the initial values.
+        """Take the log, whose filtered beliefs are the initial values; landmarks that were moved are left out.
 
         Raises:
             EstimatorError: the log is empty.
@@ -75,8 +80,7 @@ class BatchSmoother:
         self.believed: dict[int, tuple[Sighting, ...]] = {}
         self.outliers: dict[int, frozenset[str]] = {}
         seen = {
-            frame.k: tuple(s for s in (*frame.sightings, *frame.refused) if self._in_front(s, frame.belief.pose))
-            for frame in self.frames
+            frame.k: tuple(s for s in _of_others(frame, moved) if self._in_front(s, frame)) for frame in self.frames
         }
         try:
             self._begin(seen, gate_probability)
@@ -130,9 +134,9 @@ class BatchSmoother:
             if good:
                 self.believed[k] = (*self.believed[k], sighting)
 
-    def _in_front(self, sighting: Sighting, pose: FloatArray) -> bool:
+    def _in_front(self, sighting: Sighting, frame: Keyframe) -> bool:
         m = sighting.measurement
-        return not isinstance(m, CornerMeasurement) or self._factors.depth(m, pose) > MIN_DEPTH_M
+        return not isinstance(m, CornerMeasurement) or self._factors.depth(m, frame.belief.pose) > MIN_DEPTH_M
 
     def stamps_ns(self) -> IntArray:
         """Times of the keyframes ``(n,)``."""
@@ -194,6 +198,10 @@ class BatchSmoother:
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
         params.setRelativeErrorTol(1e-7)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _of_others(frame: Keyframe, moved: Collection[int]) -> list[Sighting]:
+    return [s for s in (*frame.sightings, *frame.refused) if s.measurement.landmark_id not in moved]
 
 
 def _with_deep_stack(work: Callable[[], _T]) -> _T:

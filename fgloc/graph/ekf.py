@@ -54,6 +54,9 @@ class ExtendedKalmanFilter(Estimator):
         left = np.eye(3) - K @ H
         frame.belief = Belief(pose, left @ P @ left.T + K @ K.T)
 
+    def _begin_at(self, newest: Keyframe) -> None:
+        """A filter holds nothing else."""
+
     def _build_again(self, changed: Sequence[int]) -> None:
         """Filter anew; the oldest belief in the log, which nothing leads to any more, stands as it was changed."""
         if changed:

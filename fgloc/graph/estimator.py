@@ -116,6 +116,22 @@ class Estimator(ABC):
         self._build_again([frame.k for frame in inside])
         self.belief = self.log.keyframes[self._k].belief
 
+    def correct(self, belief: Belief, landmark_id: int) -> None:
+        """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
+        for frame in self.log.keyframes.values():
+            of_it = tuple(s for s in frame.sightings if s.measurement.landmark_id == landmark_id)
+            if of_it:
+                frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
+                frame.refused = (*frame.refused, *of_it)
+        newest = self.log.keyframes[self._k]
+        newest.belief = belief
+        self._begin_at(newest)
+        self.belief = newest.belief
+
+    @abstractmethod
+    def _begin_at(self, newest: Keyframe) -> None:
+        """Forget what led to the belief of this keyframe, which stands as it is."""
+
     @abstractmethod
     def _build_again(self, changed: Sequence[int]) -> None:
         """Motions and beliefs of these keyframes (in order) have changed: take the log up as it is now."""

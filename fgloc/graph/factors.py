@@ -102,10 +102,15 @@ class LandmarkFactors:
         return None if landmark is None else landmark.cov
 
     def sighting(
-        self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, raw: LandmarkMeasurement | None = None
+        self,
+        k: int,
+        m: LandmarkMeasurement,
+        cauchy_k: float | None,
+        raw: LandmarkMeasurement | None = None,
+        alone: LandmarkMeasurement | None = None,
     ) -> Sighting:
-        """The measurement with its factors at keyframe k (and what it was before calibration); raises as `make`."""
-        return Sighting(m, raw or m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
+        """The measurement with its factors at keyframe k (and what it was before, see `Sighting`); raises as `make`."""
+        return Sighting(m, raw or m, alone or raw or m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
 
     def make(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> list[gtsam.NonlinearFactor]:
         """Factors of one sighting at keyframe k.
@@ -129,6 +134,13 @@ class LandmarkFactors:
         ad = se2.adjoint(m.pose)  # perturbation of T_base_marker, moved to the robot's side
         noise = robust(gaussian(_symmetric(ad @ m.cov @ ad.T)), cauchy_k)
         return [gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), noise)]
+
+    def near(self, landmark_id: int, displacement: FloatArray, within_m: float) -> list[int]:
+        """Other known landmarks this near to where one would stand if it were displaced so ``(2,)`` in the map."""
+        known = self._known or {}
+        place = known[landmark_id].position[:2] + displacement
+        near = (i for i, other in known.items() if math.hypot(*(other.position[:2] - place)) <= within_m)
+        return [i for i in near if i != landmark_id]
 
     def distance(self, landmark_id: int, pose: FloatArray) -> float:
         """How far [m] a known landmark is from the base at this pose, in the plane."""

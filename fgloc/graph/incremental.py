@@ -128,6 +128,12 @@ class IncrementalEstimator(Estimator):
             held, new = new[: len(frame.motions)], new[len(frame.motions) :]
             self._slots[frame.k] = frame.elapsed_s, held
 
+    def _begin_at(self, newest: Keyframe) -> None:
+        if self._config.kind == "fixed_lag":
+            newest.belief = self._replayed([newest], newest.belief.pose)
+        else:
+            self._build_again([newest.k])
+
     def _build_again(self, changed: Sequence[int]) -> None:
         newest = self.log.keyframes[self._k]
         initial = newest.belief.pose

@@ -28,6 +28,7 @@ class Sighting:
 
     measurement: LandmarkMeasurement
     raw: LandmarkMeasurement  # before self-calibration
+    alone: LandmarkMeasurement  # before that, and before sightings near in time shared their information
     cauchy_k: float | None
     factors: tuple[gtsam.NonlinearFactor, ...]
 

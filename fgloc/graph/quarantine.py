@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -18,6 +18,7 @@ _REMEMBERED = 12  # displacements of a landmark
 _AGREE_M, _AGREE_SHARE = 0.25, 0.15  # how far they may lie from their median: at least, and of the displacement
 _LEAST_M, _LEAST_SHARE = 0.05, 0.05  # nearer to its place, plus this share of the distance: ill seen, not moved
 _BELIEVED_COUNTS = 2.0  # a sighting that fits weighs as much as this many that do not
+_MISREAD_SHARE = 0.15  # of the sightings of what stands there: rarer ones may be of that, misread
 _ITERATIONS = 4
 
 
@@ -30,6 +31,8 @@ class _Case:
     distances: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # that it was seen from [m]
     held: bool = False
     fitted: int = 0  # sightings in a row that fitted although it was held
+    refused: int = 0  # sightings
+    before: Counter[int] = field(default_factory=Counter)  # sightings of each landmark that had fitted until then
 
 
 class Quarantine:
@@ -45,6 +48,7 @@ class Quarantine:
         """Take how many refusals, in excess of what is believed, put a landmark into quarantine."""
         self._after = after
         self._cases: dict[int, _Case] = {}
+        self._fitted: Counter[int] = Counter()  # sightings of each landmark
 
     @property
     def displacements(self) -> dict[int, FloatArray]:
@@ -59,18 +63,28 @@ class Quarantine:
         """What was held against landmarks was held against them from a wrong place."""
         self._cases.clear()
 
+    def accuse(self, landmark_id: int, displacement: FloatArray) -> None:
+        """Other evidence says that this landmark stands so far ``(2,)`` [m] from its place."""
+        case = self._cases[landmark_id] = _Case(held=True)
+        case.places.append(displacement)
+
     def holds(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""
         case = self._cases.get(landmark_id)
         return case is not None and case.held
 
-    def fits(self, landmark_id: int) -> None:
-        """A sighting agreed with the prediction."""
+    def fits(self, sighting: Sighting, k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
+        """A sighting agreed with the prediction; arguments as those of `disagree`."""
+        landmark_id = sighting.measurement.landmark_id
+        self._fitted[landmark_id] += 1
         case = self._cases.get(landmark_id)
         if case is None:
             return
         if case.held:
-            case.fitted += 1
+            # One that is seen too badly to be refused is no sign that it is back in its place.
+            place, moved = displacement(sighting, k, pose, factors), np.median(case.places, axis=0)
+            back = place is not None and math.hypot(*place) < math.hypot(*(place - moved))
+            case.fitted = case.fitted + 1 if back else 0
             if case.fitted > 2 * self._after:
                 del self._cases[landmark_id]
             return
@@ -88,16 +102,28 @@ class Quarantine:
             factors: of the map.
         """
         for sighting in refused:
-            case = self._cases.setdefault(sighting.measurement.landmark_id, _Case())
+            landmark_id = sighting.measurement.landmark_id
+            if landmark_id not in self._cases:
+                self._cases[landmark_id] = _Case(before=self._fitted.copy())
+            case = self._cases[landmark_id]
             case.fitted = 0
             if case.held:
                 continue
             case.score += 1.0
+            case.refused += 1
             place = displacement(sighting, k, pose, factors)
             if place is not None:
                 case.places.append(place)
-                case.distances.append(factors.distance(sighting.measurement.landmark_id, pose))
-            case.held = case.score >= self._after and self._moved(case)
+                case.distances.append(factors.distance(landmark_id, pose))
+            moved = case.score >= self._after and self._moved(case)
+            case.held = moved and not self._misread(landmark_id, case, factors)
+
+    def _misread(self, landmark_id: int, case: _Case, factors: LandmarkFactors) -> bool:
+        """Whether it may be others that are read as this one: it stands where they do, and is seen far less often."""
+        moved = np.median(case.places, axis=0)
+        others = factors.near(landmark_id, moved, max(_AGREE_M, _AGREE_SHARE * math.hypot(*moved)))
+        of_others = sum(self._fitted[i] - case.before[i] for i in others)
+        return case.refused < _MISREAD_SHARE * of_others
 
     def _moved(self, case: _Case) -> bool:
         if len(case.places) < self._after:

@@ -38,6 +38,7 @@ class Weights:
     Attributes:
         rejections: refused sightings by reason.
         refused_in_a_row: sightings refused since the last one believed.
+        contrary: sightings, by stamp and landmark, that contradict the place where the run starts: not to be believed.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
@@ -46,6 +47,7 @@ class Weights:
         self._last_used_ns: dict[int, int] = {}
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
+        self.contrary: frozenset[tuple[int, int]] = frozenset()
         self.refused_in_a_row = 0
         self._refused_ids: set[int] = set()
         self._believed_ns = 0  # the newest keyframe at which something was believed
@@ -68,16 +70,23 @@ class Weights:
         fitting, gated = [], []
         values = values_at(k, predicted.pose)
         for given in measurements:
-            raw, weight = self._share_information(self._with_map_error(given, predicted))
+            alone = self._with_map_error(given, predicted)
+            raw, weight = self._share_information(alone)
             m = raw if calibration is None else calibration.apply(raw)
-            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), raw)
-            nis, dof, reason = self._judge(k, sighting, predicted, values)
+            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), raw, alone)
+            judged = sighting
+            if weight < 1.0:
+                c = alone if calibration is None else calibration.apply(alone)
+                judged = self._factors.sighting(k, c, cauchy_k(c, self._config), alone)
+            nis, dof, reason = self._judge(k, judged, predicted, values)
             if not reason:
-                fitting.append(m.landmark_id)
+                fitting.append(sighting)
             elif reason == "gate":
                 gated.append(sighting)
             if self.quarantine.holds(m.landmark_id):
                 reason = "quarantined"
+            elif (m.stamp_ns, m.landmark_id) in self.contrary:
+                reason = "contradicts_start"
             if reason:
                 refused.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
@@ -108,15 +117,15 @@ class Weights:
             self._refused_ids.update(contrary)
         return believed, refused, decisions
 
-    def _compare(self, k: int, fitting: Sequence[int], gated: Sequence[Sighting], predicted: Belief) -> None:
+    def _compare(self, k: int, fitting: Sequence[Sighting], gated: Sequence[Sighting], predicted: Belief) -> None:
         """Others were believed, now or just before: what disagrees beside them may have been moved.
 
         Without them, in the dark say, the prediction is too little known to say that a landmark is back in its place.
         """
         if not self._config.weights.adaptive or not self._factors.known:
             return
-        for landmark_id in fitting:
-            self.quarantine.fits(landmark_id)
+        for sighting in fitting:
+            self.quarantine.fits(sighting, k, predicted.pose, self._factors)
         self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:

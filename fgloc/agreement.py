@@ -1,0 +1,72 @@
+"""A place that sightings agree on, and when it is beyond doubt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.graph.place import Fit
+from fgloc.types import FloatArray
+
+MAX_COST_PER_DOF = 4.0
+_MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
+MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
+_SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
+_LEAST_SHARE = {
+    1: 0.8,
+    2: 0.6,
+}  # of the sightings that a place has to explain, by the number of landmarks they are of ...
+_LEAST_SHARE_OF_MANY = 0.52  # ... and of three or more: the rest have wrong ids, or were moved
+_WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to be known better:
+_PARTIAL_COST_PER_DOF = 1.5
+_PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
+REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
+
+SightingKey = tuple[int, int]
+"""Stamp [ns] and landmark of a sighting."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreed:
+    """A place, fitted to the sightings that it explains: their share of all, and of how many landmarks they are.
+
+    The share is of the information, because of what was carried far any place explains anything; that of a landmark
+    alone is of the number.
+    """
+
+    fit: Fit
+    share: float
+    landmarks: int
+    redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
+    agreeing: frozenset[int]  # landmarks that it explains ...
+    opposing: frozenset[int]  # ... and those that it does not
+    contrary: frozenset[SightingKey]  # sightings that it does not
+
+    @property
+    def certain(self) -> bool:
+        """Whether it explains enough, well enough, and is known well enough."""
+        if self.share < _LEAST_SHARE.get(self.landmarks, _LEAST_SHARE_OF_MANY) or self.fit.dof < 4:
+            return False
+        whole = self.share >= _WHOLE_SHARE
+        if (self.opposing or not whole) and self.redundancy < REDUNDANT:
+            return False
+        cost, sigma = (MAX_COST_PER_DOF, MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
+        return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
+
+    @property
+    def compelling(self) -> bool:
+        """Whether it says that the robot is not where it was believed to be."""
+        known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
+        return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * REDUNDANT
+
+    def beats(self, other: Agreed) -> bool:
+        """Whether a place that explains about as much is so much worse that it is none."""
+        worse = other.fit.cost > MAX_COST_PER_DOF * other.fit.dof
+        return worse or (self.share == other.share and other.fit.cost > self.fit.cost + _MARGIN)
+
+
+def apart(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two poses are two places."""
+    return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())
