@@ -18,6 +18,7 @@ from fgloc.types import FloatArray
 from training.config import NetworkConfig
 from training.data import Run
 from training.recurrent import Trunk
+from training.variance import start, variance_net
 
 _RATE_S = 0.2  # a robot's velocities change within about this time
 
@@ -73,37 +74,12 @@ class DisplacementNet(nn.Module):
         else:
             net = mlp([len(mean), *config.hidden, 3])
             self.trunk, self.mean_head = net[:-1], net[-1]
-        self.variance: nn.Sequential | nn.Linear = (
-            nn.Linear(self.mean_head.in_features, 3) if config.kind == "gru" else self._variance_net()
-        )
-        head = self.variance if isinstance(self.variance, nn.Linear) else self.variance[-1]
-        with torch.no_grad():
-            head.weight.zero_()
-            head.bias.copy_(torch.log(torch.tensor([1e-2, 1e-2, 3e-2]) ** 2))
-
-    def _variance_net(self) -> nn.Sequential:
-        """A network of its own, as deep as the mean's: what makes motion uncertain is not what makes it.
-
-        Its first units start as the sizes of changes from age to age, then of the inputs themselves: robots pick up
-        changed commands at instants that nobody knows.
-        """
-        units = self.config.variance_units
-        net = mlp([len(self.mean), *[units] * len(self.config.hidden), 3])
-        first = net[0]
-        rows, offsets = [], []
-        for younger, older in [*self._neighbors(), *((i, None) for i in range(len(self.mean)))]:
-            row, offset = torch.zeros(len(self.mean)), float(self.mean[younger] / self.std[younger])
-            row[younger] = 1.0
-            if older is not None:
-                row[older] = -float(self.std[older] / self.std[younger])
-                offset -= float(self.mean[older] / self.std[younger])
-            rows += [row, -row]
-            offsets += [offset, -offset]
-        n = min(units, len(rows))
-        with torch.no_grad():
-            first.weight[:n] = torch.stack(rows[:n])
-            first.bias[:n] = torch.tensor(offsets[:n])
-        return net
+        self.variance: nn.Sequential | nn.Linear
+        if config.kind == "gru":
+            self.variance = start(nn.Linear(self.mean_head.in_features, 3))
+        else:
+            own = mlp([len(mean), *[config.variance_units] * len(config.hidden), 3])
+            self.variance = variance_net(own, self.mean, self.std, self._neighbors())
 
     def _neighbors(self) -> list[tuple[int, int]]:
         """Columns of the same input at neighboring ages."""
