@@ -315,6 +315,24 @@ def test_fault_67_an_exception_in_gtsam_rebuilds_the_window_without_the_offender
     assert after.pose[0] == pytest.approx(7.1, abs=1e-6)
 
 
+def after_a_slip(*seen, cauchy_k: float = 3.0) -> np.ndarray:
+    """Where the estimator puts a robot at the origin that it believed to be 6 cm and 0.03 rad off."""
+    walls = LandmarkFactors(wall_map())
+    estimator = IncrementalEstimator(EstimatorConfig(), walls)
+    estimator.start(0, Belief(np.array([-0.1, 0.0, 0.0]), np.eye(3) * 1e-8))
+    slipped = MotionMeasurement("wheels", 0, 10**8, np.array([0.16, 0.0, 0.03]), np.diag([0.06, 0.06, 0.03]) ** 2)
+    return estimator.update(10**8, 0.1, [slipped], [walls.sighting(1, m, cauchy_k) for m in seen]).pose
+
+
+def test_sightings_that_agree_are_not_taken_for_outliers_because_the_prediction_is_off():
+    """Kernels weigh where they are linearized; two markers tell in the first step that it is the prediction."""
+    a, b = (corner_sighting(np.zeros(3), wall_map().landmarks[i]) for i in (0, 7))
+    assert np.abs(after_a_slip(a, b) - after_a_slip(a, b, cauchy_k=1000.0)).max() < 1e-4
+    liar = corner_sighting(np.array([0.0, 0.2, 0.0]), wall_map().landmarks[7])
+    misled = np.linalg.norm(after_a_slip(a, liar, cauchy_k=1000.0)[:2])
+    assert np.linalg.norm(after_a_slip(a, liar)[:2]) < 0.6 * misled  # where they do not agree, kernels hold them back
+
+
 def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
     """What is left after a rebuild is as sure as if nothing had happened."""
     behind = Landmark(11, np.array([-3.0, 0.0, 0.3]), WALL, 0.2)

@@ -19,6 +19,7 @@ from fgloc.config import EstimatorConfig
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
 from fgloc.graph.log import Belief, Keyframe
+from fgloc.graph.place import likeliest
 from fgloc.types import (
     FloatArray,
     LandmarkMeasurement,
@@ -94,7 +95,8 @@ class IncrementalEstimator(Estimator):
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
             self._backend = self._new_backend()
             self._slots.clear()
-        backend, initial = self._backend, frame.belief.pose
+        backend = self._backend
+        initial = likeliest(frame.k, frame.belief, frame.sightings, self._factors)
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
             self._keep_slots(frame, backend.update(graph, values, frame.k, frame.elapsed_s))

@@ -18,6 +18,7 @@ from fgloc.graph.log import Belief, Sighting
 from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
+_FAIR = 1.0  # half the squared sigmas of a residual; 0.5 are expected
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
 
 
@@ -63,7 +64,7 @@ def joint_fit(
         normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
         values = values_at(0, pose)
         for m, unary in made:
-            if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+            if _is_behind(m, pose, factors):
                 cost, dof = cost + _BEHIND_COST, dof + 8  # cannot be projected: as wrong as can be, and without a pull
                 continue
             r, J = whitened(unary, values, None)
@@ -87,7 +88,7 @@ def sighting_cost(
     pose: FloatArray, m: LandmarkMeasurement, factors: LandmarkFactors, config: Config
 ) -> tuple[float, int] | None:
     """Robust cost and degrees of freedom of one sighting made from a pose; None if it cannot have been."""
-    if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+    if _is_behind(m, pose, factors):
         return None
     r, _ = whitened(factors.make(0, m, None), values_at(0, pose), None)
     return _robust_cost(r, cauchy_k(m, config)), len(r)
@@ -113,12 +114,47 @@ def joint_nis(
     pose, offset, best = predicted.pose, np.zeros(3), float(residual @ residual)
     for _ in range(_GAUSS_NEWTON_STEPS):
         pose = se2.compose(pose, _newton_step(information, offset, residual, J))
-        if isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M:
+        if _is_behind(m, pose, factors):
             break
         residual, J = whitened(sighting.factors, values_at(k, pose), sighting.cauchy_k)
         offset = se2.log(se2.between(predicted.pose, pose))
         best = min(best, float(offset @ information @ offset + residual @ residual))
     return best
+
+
+def likeliest(k: int, predicted: Belief, sightings: Sequence[Sighting], factors: LandmarkFactors) -> FloatArray:
+    """Pose that prediction and believed sightings together make likeliest: where to linearize first.
+
+    Robust kernels weigh residuals where they are linearized: at a prediction that is far off they take sound sightings
+    for outliers, and hold the pose back. Where two landmarks or more agree on a pose, it is the prediction that is off.
+    """
+    if len({s.measurement.landmark_id for s in sightings}) < 2 or not factors.known:
+        return predicted.pose
+    if any(_is_behind(s.measurement, predicted.pose, factors) for s in sightings):
+        return predicted.pose
+    if _fit(k, predicted.pose, sightings):
+        return predicted.pose
+    information = np.asarray(np.linalg.inv(predicted.cov), dtype=np.float64)
+    pose = predicted.pose
+    for _ in range(2):
+        values, offset = values_at(k, pose), se2.log(se2.between(predicted.pose, pose))
+        rows = [whitened(s.factors, values, s.cauchy_k) for s in sightings]
+        residual, J = np.concatenate([r for r, _ in rows]), np.vstack([J for _, J in rows])
+        pose = se2.compose(pose, _newton_step(information, offset, residual, J))
+        if any(_is_behind(s.measurement, pose, factors) for s in sightings):
+            return predicted.pose
+    return pose if _fit(k, pose, sightings) else predicted.pose
+
+
+def _is_behind(m: LandmarkMeasurement, pose: FloatArray, factors: LandmarkFactors) -> bool:
+    return isinstance(m, CornerMeasurement) and factors.depth(m, pose) < MIN_DEPTH_M
+
+
+def _fit(k: int, pose: FloatArray, sightings: Sequence[Sighting]) -> bool:
+    """Whether the sightings are where they are expected, within their own noise."""
+    values = values_at(k, pose)
+    made = [f for s in sightings for f in s.factors]
+    return bool(sum(f.error(values) for f in made) < _FAIR * sum(f.dim() for f in made))
 
 
 def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:
