@@ -261,8 +261,10 @@ class Initializer:
 
 
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:
-    """All of them or, of too many, every second, third and so on."""
-    return sightings[:: max(1, -(-len(sightings) // most))]
+    """All of them or, of too many, every second, third and so on of each landmark: those seen in turns are all kept."""
+    if len(sightings) <= most:
+        return sightings
+    return sorted(sightings, key=lambda m: m.landmark_id)[:: -(-len(sightings) // most)]
 
 
 def _information(m: LandmarkMeasurement) -> float:

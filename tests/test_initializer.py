@@ -192,3 +192,32 @@ def test_on_a_wrong_map_the_search_stays_bounded(markers):
         search.step(*(lambda pose, m=m: seen_corners(pose, m) for m in visible))
         assert len(search.initializer._steps) <= 11, k
     assert search.initializer.waiting
+
+
+def test_of_three_beacons_no_two_are_taken_at_their_word():
+    """Two of them tell a place, but if one was moved a false one: a third is waited for, up to a time."""
+    a, b, c = point(1, 3.0, 1.0), point(2, 1.0, 3.0), point(3, -2.0, 2.0)
+    search = Search(landmark_map(a, b, c))
+    pair = [lambda pose: seen_point(pose, a), lambda pose: seen_point(pose, b)]
+    assert search.step(*pair) is None
+    assert close(search.step(*pair, lambda pose: seen_point(pose, c)), search.pose, 0.02, 0.02)
+    search, waited = Search(landmark_map(a, b, c)), 1
+    while (start := search.step(*pair)) is None:
+        waited += 1
+    assert waited * STEP_NS * 1e-9 == pytest.approx(5.0, abs=0.5)  # estimator.initialise_s
+    assert close(start, search.pose, 0.02, 0.02)
+
+
+def test_fault_51_beacons_that_contradict_one_another_begin_no_run():
+    """The map has one of them two metres off: whatever two of the three agree on, the third denies."""
+    a, b, c = point(1, 3.0, 1.0), point(2, 1.0, 3.0), point(3, -2.0, 2.0)
+    search = Search(landmark_map(a, b, c))
+    stands = point(2, 2.0, 1.5)
+    seen = [lambda pose, m=m: seen_point(pose, m) for m in (a, stands, c)]
+    assert all(search.step(*seen) is None for _ in range(40))
+    assert all(search.step(*seen[:2]) is None for _ in range(40))  # what was denied is not forgotten
+    d, e = point(4, 0.5, -3.0), point(5, 3.5, -1.0)
+    search = Search(landmark_map(a, b, c, d, e))
+    start = search.step(*seen, lambda pose: seen_point(pose, d), lambda pose: seen_point(pose, e))
+    assert close(start, search.pose, 0.02, 0.02)
+    assert {landmark_id for _, landmark_id in start.contrary} == {2}

@@ -88,6 +88,23 @@ def test_fault_49_wrong_ids_scatter_and_name_nobody():
     assert not accused(wrong, factors).holds(7)
 
 
+def test_fault_49_one_landmark_now_and_then_misread_as_another_does_not_name_that_one():
+    """Its refused sightings agree on a place, but somebody else stands there and is seen far more often."""
+    rng, world = np.random.default_rng(6), beacons()
+    factors, quarantine, rarely = LandmarkFactors(world), Quarantine(AFTER), Quarantine(AFTER)
+    for k, pose in enumerate(poses(6, 200)):
+        right = factors.sighting(0, beacon(pose, world.landmarks[0], rng), None)
+        wrong = factors.sighting(0, replace(beacon(pose, world.landmarks[0], rng), landmark_id=3), None)
+        rarely.fits(right, 0, pose, factors)
+        if k % 10 == 0:
+            rarely.disagree([wrong], 0, pose, factors)
+        quarantine.fits(right, 0, pose, factors)
+        if k % 3 == 0:  # that often it is no misreading
+            quarantine.disagree([wrong], 0, pose, factors)
+    assert not rarely.holds(3)
+    assert quarantine.holds(3)
+
+
 def test_a_landmark_that_is_only_ill_seen_is_not_named():
     """A range 4 % too long is no displacement worth a name; 15 % would be."""
     rng, world = np.random.default_rng(3), beacons()
