@@ -13,6 +13,7 @@ from fgloc.types import FloatArray
 MAX_COST_PER_DOF = 4.0
 _MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
+_SHARP = 0.4  # times that, of a place that one beacon could feign
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
 _LEAST_SHARE = {
     1: 0.8,
@@ -54,6 +55,11 @@ class Agreed:
             return False
         cost, sigma = (MAX_COST_PER_DOF, MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
         return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
+
+    @property
+    def sharp(self) -> bool:
+        """Whether it is known well enough to be a place although nothing checks it."""
+        return bool((np.sqrt(np.diag(self.fit.cov)) <= _SHARP * MAX_SIGMA).all())
 
     @property
     def compelling(self) -> bool:

@@ -35,6 +35,7 @@ _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains les
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
 _HEARD = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
+_PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 _CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
@@ -158,14 +159,14 @@ class Initializer:
             return None
         if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None
-        if not known and not self._waited() and not self._checked(best, here):
+        if not known and not self._checked(best, here) and not (best.sharp and self._waited()):
             return None
         return best
 
     def _waited(self) -> bool:
         """Whether that is not to be expected any more."""
         since = self._steps[-1].step.stamp_ns - (self._since_ns or 0)
-        return since > self._config.estimator.initialise_s * 1e9
+        return since > _PATIENCE * self._config.estimator.initialise_s * 1e9
 
     def _checked(self, best: Agreed, sightings: Sequence[LandmarkMeasurement]) -> bool:
         """Whether beacons tell this place even if any one of them is left out: so that no single one can feign it."""
