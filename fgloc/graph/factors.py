@@ -34,6 +34,7 @@ _KERNELS = {
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create(2.385),
     "dcs": gtsam.noiseModel.mEstimator.DCS.Create(1.0),
 }
+_LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
@@ -160,6 +161,29 @@ class LandmarkFactors:
         base = np.column_stack([c * dx + s * dy, -s * dx + c * dy, corners[:, 2]])
         T = m.camera.T_base_cam
         return float(((base - T[:3, 3]) @ T[:3, 2]).min())
+
+    def lookalikes(self, m: CornerMeasurement, pose: FloatArray) -> list[int]:
+        """Other markers of the same size that the base at this pose sees about where this one was seen."""
+        if self._known is None:
+            raise EstimatorError("what else a marker may be needs a known map")
+        size = self._known[m.landmark_id].size_m
+        others = [x for i, x in self._known.items() if i != m.landmark_id and x.size_m == size]
+        x, y, yaw = pose
+        c, s = math.cos(yaw), math.sin(yaw)
+        T, K = m.camera.T_base_cam, m.camera.K
+        u, v = m.corners_px.mean(axis=0)
+        found = []
+        for other in others:
+            dx, dy = other.position[0] - x, other.position[1] - y
+            right, down, depth = T[:3, :3].T @ (
+                np.array([c * dx + s * dy, -s * dx + c * dy, other.position[2]]) - T[:3, 3]
+            )
+            if depth < MIN_DEPTH_M:
+                continue
+            across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
+            if across < _LOOKALIKE:
+                found.append(other.landmark_id)
+        return found
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
         if isinstance(m, RangeBearingMeasurement):

@@ -109,6 +109,12 @@ class Weights:
         if believed:
             self.forget_refusals()
             self._believed_ns = stamp_ns
+            for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted, values):
+                gated = [s for s in gated if s is not misread]
+                refused.remove(misread)
+                believed.append(sighting)
+                fitting.append(sighting)
+                decisions.append(decision)
         if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
         if not believed:
@@ -116,6 +122,53 @@ class Weights:
             self.refused_in_a_row += len(contrary)
             self._refused_ids.update(contrary)
         return believed, refused, decisions
+
+    def _read_again(
+        self,
+        k: int,
+        stamp_ns: int,
+        refused: Sequence[Sighting],
+        decisions: list[Decision],
+        predicted: Belief,
+        values: gtsam.Values,
+    ) -> list[tuple[Sighting, Sighting, Decision]]:
+        """Refused markers whose code was misread: what was refused, what it was, and the decision on that.
+
+        Beside others that are believed, a marker that cannot be where it was seen, in a place where exactly one other
+        would be seen that was not, is that other.
+        """
+        if not self._config.weights.adaptive or not self._factors.known:
+            return []
+        found = []
+        seen = {d.landmark_id for d in decisions if not d.reason}
+        rows = [i for i, d in enumerate(decisions) if d.reason]
+        for i, misread in zip(rows, refused, strict=True):
+            m = misread.measurement
+            if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, CornerMeasurement):
+                continue
+            fits = []
+            for other in self._factors.lookalikes(m, predicted.pose):
+                if other in seen or self.quarantine.holds(other):
+                    continue
+                again = dataclasses.replace(m, landmark_id=other)
+                sighting = self._factors.sighting(k, again, misread.cauchy_k)
+                nis, dof, reason = self._judge(k, sighting, predicted, values)
+                if not reason:
+                    fits.append((sighting, nis, dof))
+            if len(fits) != 1:
+                continue
+            sighting, nis, dof = fits[0]
+            other = sighting.measurement.landmark_id
+            seen.add(other)
+            self._last_used_ns[other] = m.stamp_ns
+            self.rejections[f"sightings.{decisions[i].reason}"] -= 1
+            self.rejections["sightings.misread"] += 1
+            decisions[i] = dataclasses.replace(decisions[i], reason="misread")
+            found.append(
+                (misread, sighting, Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, ""))
+            )
+        self.rejections += Counter()  # drops the zeros
+        return found
 
     def _compare(self, k: int, fitting: Sequence[Sighting], gated: Sequence[Sighting], predicted: Belief) -> None:
         """Others were believed, now or just before: what disagrees beside them may have been moved.
