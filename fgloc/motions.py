@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.footing import Footing
+from fgloc.graph.footing import Footing
 from fgloc.graph.log import Belief, Keyframe
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion

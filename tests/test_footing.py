@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgloc.footing import Footing
+from fgloc.graph.footing import Footing
 from fgloc.graph.log import Belief, Keyframe, MeasurementLog
 from fgloc.types import MotionMeasurement, Step
 

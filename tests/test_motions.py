@@ -13,8 +13,8 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
-from fgloc.footing import Footing
 from fgloc.graph.estimator import fuse
+from fgloc.graph.footing import Footing
 from fgloc.graph.log import Belief, Keyframe
 from fgloc.localizer import Localizer
 from fgloc.motion import load_model, save_model

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from fgloc.footing import Footing
+from fgloc.graph.footing import Footing
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 
