@@ -14,6 +14,7 @@ from fgloc.carry import carry
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
+from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
 from fgloc.graph.incremental import IncrementalEstimator
@@ -354,6 +355,34 @@ def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
     usual, rebuilt = filtered(False), filtered(True)
     assert np.allclose(rebuilt.pose, usual.pose, atol=1e-6)
     assert np.allclose(rebuilt.cov, usual.cov, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [IncrementalEstimator, ExtendedKalmanFilter], ids=["fixed_lag", "ekf"])
+def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(kind):
+    """The beliefs before the correction are still in the log, and still wrong."""
+    estimator = kind(EstimatorConfig(), LandmarkFactors(wall_map()))
+    estimator.start(0, Belief(np.zeros(3), np.eye(3) * 1e-4))
+    step = [MotionMeasurement("wheels", 0, 10**8, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)]
+    for k in range(1, 4):
+        estimator.update(k * 10**8, 0.1, step)
+    estimator.correct(Belief(np.array([0.3, 0.5, 0.0]), np.eye(3) * 1e-4), 7)
+    for k in range(4, 7):
+        estimator.update(k * 10**8, 0.1, step)
+    estimator.inflate(0.15, 4.0)
+    assert estimator.belief.pose == pytest.approx((0.6, 0.5, 0.0), abs=1e-6)
+    assert estimator.update(7 * 10**8, 0.1, step).pose == pytest.approx((0.7, 0.5, 0.0), abs=1e-6)
+
+
+def test_moved_landmarks_are_left_out_of_the_batch_that_begins_again():
+    """A marker seen as if from close by takes the first trial step past it; the second beginning knows of the moved."""
+    walls, start = LandmarkFactors(wall_map()), Belief(np.zeros(3), np.eye(3) * 100.0)
+    sound, moved = (walls.sighting(0, corner_sighting(np.zeros(3), wall_map().landmarks[i]), 3.0) for i in (0, 7))
+    near = walls.sighting(0, corner_sighting(np.array([2.7, 0.0, 0.0]), wall_map().landmarks[0]), 300.0)
+    log = MeasurementLog()
+    log.append(Keyframe(0, 0, 0.0, start, prior=start, sightings=(sound, moved), refused=(near,)))
+    solver = BatchSmoother(log, walls, BatchConfig(), 0.9999, {7})
+    assert near not in solver.believed[0]  # the first beginning failed
+    assert solver.believed[0] == (sound,)
 
 
 def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -80,12 +80,13 @@ class BatchSmoother:
         self.believed: dict[int, tuple[Sighting, ...]] = {}
         self.outliers: dict[int, frozenset[str]] = {}
         seen = {
-            frame.k: tuple(s for s in _of_others(frame, moved) if self._in_front(s, frame)) for frame in self.frames
+            frame.k: tuple(s for s in _of_others((*frame.sightings, *frame.refused), moved) if self._in_front(s, frame))
+            for frame in self.frames
         }
         try:
             self._begin(seen, gate_probability)
         except RuntimeError:  # a trial step took the camera past a marker that the online gate had refused, rightly
-            self._begin({frame.k: frame.sightings for frame in self.frames}, gate_probability)
+            self._begin({frame.k: _of_others(frame.sightings, moved) for frame in self.frames}, gate_probability)
 
     def _begin(self, sightings: dict[int, tuple[Sighting, ...]], probability: float) -> None:
         """Solve with all of these, decide which of them are believed, and solve again."""
@@ -200,8 +201,8 @@ class BatchSmoother:
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _of_others(frame: Keyframe, moved: Collection[int]) -> list[Sighting]:
-    return [s for s in (*frame.sightings, *frame.refused) if s.measurement.landmark_id not in moved]
+def _of_others(sightings: Iterable[Sighting], moved: Collection[int]) -> tuple[Sighting, ...]:
+    return tuple(s for s in sightings if s.measurement.landmark_id not in moved)
 
 
 def _with_deep_stack(work: Callable[[], _T]) -> _T:

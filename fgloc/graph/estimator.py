@@ -32,6 +32,7 @@ class Estimator(ABC):
         self.rebuilt = 0
         self.belief: Belief | None = None
         self._k = -1
+        self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
         self._elapsed_s = 0.0
 
     @property
@@ -124,7 +125,7 @@ class Estimator(ABC):
                 frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
                 frame.refused = (*frame.refused, *of_it)
         newest = self.log.keyframes[self._k]
-        newest.belief = belief
+        newest.belief, self._corrected = belief, self._k
         self._begin_at(newest)
         self.belief = newest.belief
 
@@ -144,7 +145,7 @@ class Estimator(ABC):
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
-        for k in range(changed[0], self._k + 1):
+        for k in range(max(changed[0], self._corrected + 1), self._k + 1):
             before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
             if before is None or frame.prior is not None:
                 continue

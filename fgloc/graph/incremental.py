@@ -166,7 +166,7 @@ class IncrementalEstimator(Estimator):
             return list(self.log.keyframes.values())
         if frame.prior is not None:
             return []
-        frames = list(self.log.since(frame.elapsed_s - self._config.lag_s))
+        frames = [f for f in self.log.since(frame.elapsed_s - self._config.lag_s) if f.k >= self._corrected]
         starts = [i for i, f in enumerate(frames) if f.prior is not None]
         return frames[starts[-1] :] if starts else frames
 
