@@ -88,8 +88,7 @@ class Initializer:
 
     def reset(self) -> None:
         """Look for the pose again."""
-        self._steps.clear()
-        self._doubted, self._since_ns = frozenset(), None
+        self.forget()
         self.waiting = True
 
     @property
@@ -100,6 +99,7 @@ class Initializer:
     def forget(self) -> None:
         """What was collected is of no use any more: the robot is where it was believed to be."""
         self._steps.clear()
+        self._doubted, self._since_ns = frozenset(), None
 
     def collect(
         self,
@@ -131,8 +131,7 @@ class Initializer:
         self.waiting = False
         back = se2.inverse(self._travelled())
         steps = tuple(self._steps)
-        self._steps.clear()
-        self._doubted, self._since_ns = frozenset(), None
+        self.forget()
         first = Belief(se2.compose(best.fit.pose, back), _WEAK_PRIOR.copy())
         return Start(steps, first, Belief(best.fit.pose, best.fit.cov), best.contrary)
 

@@ -221,3 +221,14 @@ def test_fault_51_beacons_that_contradict_one_another_begin_no_run():
     start = search.step(*seen, lambda pose: seen_point(pose, d), lambda pose: seen_point(pose, e))
     assert close(start, search.pose, 0.02, 0.02)
     assert {landmark_id for _, landmark_id in start.contrary} == {2}
+
+
+def test_a_new_search_waits_as_long_as_the_first_did():
+    """What was refused for a moment, and explained by the next fix, is not when a robot got lost much later."""
+    a, b, c = point(1, 3.0, 1.0), point(2, 1.0, 3.0), point(3, -2.0, 2.0)
+    search = Search(landmark_map(a, b, c))
+    search.initializer.collect(Step(0, 0, 0, STEP_NS), [], [seen_point(TRUTH, c)], known=True)
+    search.initializer.forget()
+    search.stamp_ns = 3600 * 10**9
+    pair = [lambda pose: seen_point(pose, a), lambda pose: seen_point(pose, b)]
+    assert all(search.step(*pair) is None for _ in range(50))
