@@ -77,6 +77,26 @@ def test_without_the_moved_beacon_the_pose_is_right_and_its_covariance_honest():
     assert np.mean(nees) / 3 < 2.2  # χ² of 30 degrees of freedom, 99.9 %: 2
 
 
+def test_an_accusation_puts_the_robot_where_angles_are_wrapped():
+    world = beacons()
+    suspects, _ = listened(3, world, moved(world, 3, 0.4, -0.3), steps=400)
+    accused = suspects.accused
+    assert accused is not None
+    assert -np.pi <= accused.pose[2] < np.pi
+
+
+def test_sightings_after_the_clock_went_back_share_nothing_with_those_before():
+    world, covs = beacons(), []
+    for before_ns in (10**9, 3600 * 10**9):
+        suspects = Suspects(world, repeat_s=2.0)
+        for stamp_ns in (before_ns, 100 * 10**9):
+            suspects.start(truth_at(0.0), *NONE)
+            seen = sighting(np.random.default_rng(0), truth_at(0.0), world.landmarks[2], stamp_ns)
+            suspects.step(np.zeros(3), np.zeros((3, 3)), [seen])
+        covs.append(suspects.belief[1])
+    assert covs[0] == pytest.approx(covs[1])
+
+
 def drive(world: LandmarkMap, shown: LandmarkMap | None, seed: int, keep_all: bool = False, **landmarks):
     made = World(world, seed=seed, seconds=40.0, rate=5, shown=shown)
     chain = Chain(config(landmarks=landmarks), world, keep_all=keep_all)

@@ -150,7 +150,7 @@ class Suspects:
         """Scale on the covariance of a sighting that follows the last of its beacon."""
         last = self._last_ns.get(m.landmark_id)
         self._last_ns[m.landmark_id] = m.stamp_ns
-        return 1.0 if last is None else max(1.0, self._repeat_s / max((m.stamp_ns - last) * 1e-9, 0.01))
+        return 1.0 if last is None else max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 0.01))
 
     @property
     def accused(self) -> Accusation | None:
@@ -171,6 +171,7 @@ class Suspects:
             return None
         cov = self._cov[row, :5, :5].copy()
         pose, calibration = self._pose[row].copy(), self._calibration[row].copy()
+        pose[2] = se2.wrap(float(pose[2]))
         return Accusation(self._ids[row - 1], moved.copy(), float(best), pose, calibration, cov)
 
     def _misread(self, row: int) -> bool:
