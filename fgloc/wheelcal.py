@@ -69,7 +69,7 @@ class _Fit:
         self.start = self.value = np.array([getattr(self._config, name) for name in gains])
         told = {i: _wheels_of(f.motions) for i, f in enumerate(solver.frames) if f.prior is None}
         factors = {i: wheels for i, wheels in told.items() if wheels is not None}
-        if parts.learned is not None or not factors:
+        if parts.learned is not None or not factors or not parts.wheels.source:
             raise EstimatorError(
                 "wheels can be calibrated where they, or commands in their place, are in the graph by themselves: "
                 "leave out --model, and see wheels.source"

@@ -138,6 +138,12 @@ def test_a_learned_motion_leaves_no_wheels_to_calibrate(commanded):
         run(commanded, commanded.parent / "map.yaml", config, "batch")
 
 
+def test_wheels_that_never_spoke_are_not_calibrated(commanded):
+    """Silence is in the graph as a robot that stands; it says nothing of gains."""
+    with pytest.raises(EstimatorError, match=r"see wheels\.source"):
+        calibrate([commanded], commanded.parent / "map.yaml", settings("twist"))
+
+
 def test_gains_that_no_robot_has_are_not_written(wheeled):
     config = settings("twist")
     far = config.model_copy(update={"wheels": config.wheels.model_copy(update={"scale_v": 0.4})})
