@@ -97,6 +97,19 @@ def test_the_variance_starts_from_the_sizes_of_changes(tmp_path: Path) -> None:
     np.testing.assert_allclose(units[:, 0:16:2] + units[:, 1:16:2], changes.abs() / scales, atol=1e-4)
 
 
+def test_the_variance_does_not_follow_a_velocity_that_it_was_never_told(runs: dict[str, Run]) -> None:
+    network = NetworkConfig(hidden=(16, 16), edges_s=(0.0, 0.1, 0.3, 0.5), inputs=("commands", "velocity"))
+    net = training.new_net(network, list(runs.values()))
+    assert isinstance(net, DisplacementNet)
+    config = OptimizationConfig(variance_iterations=5, batch=16, variance_horizon_s=1.0)
+    optimize.train_variance(net, list(runs.values()), [], config)
+    _, x = net.inputs(net.samples(list(runs.values())), torch.tensor([30, 60]), 1)
+    told = x.clone()
+    told[..., -2:] = 3.0
+    assert not torch.equal(net.log_density(x)[0], net.log_density(x)[1])  # it has learned something
+    torch.testing.assert_close(net.log_density(told), net.log_density(x))
+
+
 @pytest.mark.parametrize(
     ("inputs", "edges"),
     [(("commands", "gyro"), (0.0,)), (("commands", "velocity", "gyro", "effort", "wheels"), (0.0, 0.1, 0.35))],

@@ -47,7 +47,7 @@ def mlp(widths: list[int]) -> nn.Sequential:
 
 
 class DisplacementNet(nn.Module):
-    """Residual twist on the best known kinematics; log-variances from the last hidden layer."""
+    """Residual twist on the best known kinematics; log-variances from a network of their own (gru: a layer)."""
 
     def __init__(
         self, config: NetworkConfig, kinematics: Kinematics, wheel_kinematics: Kinematics, runs: list[Run]
@@ -80,6 +80,9 @@ class DisplacementNet(nn.Module):
         else:
             own = mlp([len(mean), *[config.variance_units] * len(config.hidden), 3])
             self.variance = variance_net(own, self.mean, self.std, self._neighbors())
+            if "velocity" in config.inputs:  # which nobody tells while the variance is learned: it would stay random
+                with torch.no_grad():
+                    own[0].weight[:, -2:] = 0.0
 
     def _neighbors(self) -> list[tuple[int, int]]:
         """Columns of the same input at neighboring ages."""
