@@ -16,6 +16,7 @@ from fgloc.graph.weights import Weights
 from fgloc.selfcal import Calibration, Calibrator
 from fgloc.types import Decision, FloatArray, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
+_MOST_BEACONS = 500  # one filter each: with more of them a step takes too long
 _ASTRAY = 25.0  # squared Mahalanobis distance to the estimate, above which the filters have lost the way: begun anew
 
 
@@ -36,7 +37,8 @@ class Suspicion:
         self._suspects: Suspects | None = None
         if landmark_map is not None and config.landmarks.self_calibrating:
             self.calibrator = Calibrator(config.landmarks, landmark_map)
-        beacons = landmark_map is not None and not any(m.size_m for m in landmark_map.landmarks.values())
+        landmarks = () if landmark_map is None else landmark_map.landmarks.values()
+        beacons = not any(m.size_m for m in landmarks) and len(landmarks) <= _MOST_BEACONS
         if landmark_map is not None and beacons and config.weights.adaptive:
             self._suspects = Suspects(landmark_map, config.landmarks.repeat_s)
         self._estimator, self._weights = estimator, weights

@@ -34,6 +34,7 @@ _KERNELS = {
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create(2.385),
     "dcs": gtsam.noiseModel.mEstimator.DCS.Create(1.0),
 }
+_MOST_LOOKALIKES = 10
 _LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
@@ -163,7 +164,10 @@ class LandmarkFactors:
         return float(((base - T[:3, 3]) @ T[:3, 2]).min())
 
     def lookalikes(self, m: CornerMeasurement, pose: FloatArray) -> list[int]:
-        """Other markers of the same size that the base at this pose sees about where this one was seen."""
+        """Other markers of the same size that the base at this pose sees about where this one was seen.
+
+        None of them where they hang so densely that the place does not tell.
+        """
         if self._known is None:
             raise EstimatorError("what else a marker may be needs a known map")
         size = self._known[m.landmark_id].size_m
@@ -183,7 +187,7 @@ class LandmarkFactors:
             across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
             if across < _LOOKALIKE:
                 found.append(other.landmark_id)
-        return found
+        return found if len(found) <= _MOST_LOOKALIKES else []
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
         if isinstance(m, RangeBearingMeasurement):
