@@ -113,7 +113,10 @@ def run(
     landmarks: LandmarkMap | None = parts.landmark_map
     wheels: WheelCalibration | None = None
     if mode == "batch":
-        smoothed = smooth_run(parts)
+        try:
+            smoothed = smooth_run(parts)
+        except EstimatorError as error:
+            raise EstimatorError(" ".join([_sentence(str(error)), *hints])) from error
         estimates, landmarks, wheels = smoothed.estimates, smoothed.landmarks, smoothed.wheels
         notes = (*notes, *smoothed.notes)
     if again := len(estimates) - len(last_pass(estimates)):

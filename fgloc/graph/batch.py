@@ -171,7 +171,8 @@ class BatchSmoother:
         try:
             return _with_deep_stack(self._result)
         except RuntimeError as error:
-            raise EstimatorError(f"the covariances of the batch cannot be had: {error}") from error
+            why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
+            raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
 
     def _result(self) -> Smoothed:
         marginals = gtsam.Marginals(self._graph, self._values)
