@@ -13,6 +13,7 @@ from fgloc.runner import Progress, find_beside, run
 from fgloc.types import WheelCalibration
 
 _DIGITS = 5
+_SIGHTINGS = ("corners", "range_bearing", "marker_pose")
 _ROUNDS = 2  # with the gains of the first, sightings are believed and refused that were not before
 
 
@@ -31,7 +32,7 @@ def calibrate(
         The configuration with the gains in it, and the gains with their covariance.
 
     Raises:
-        FglocError: a recording cannot be used, or holds no wheels.
+        FglocError: a recording cannot be used, or holds no wheels or no sightings.
     """
     for _ in range(_ROUNDS):
         alone = config.model_copy(
@@ -40,11 +41,21 @@ def calibrate(
                 "batch": config.batch.model_copy(update={"calibrate_wheels": True}),
             }
         )
-        found = [run(bag, map_path or find_beside(bag, "map.yaml"), alone, "batch", progress).wheels for bag in bags]
-        pooled = _pooled([wheels for wheels in found if wheels is not None])
+        pooled = _pooled([_calibrated(bag, map_path, alone, progress) for bag in bags])
         gains = dict(zip(pooled.names, pooled.value.round(_DIGITS).tolist(), strict=True))
         config = config.model_copy(update={"wheels": config.wheels.model_copy(update=gains)})
     return config, pooled
+
+
+def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Progress | None) -> WheelCalibration:
+    result = run(bag, map_path or find_beside(bag, "map.yaml"), config, "batch", progress)
+    assert result.wheels is not None  # asked for by the configuration
+    if not any(result.counts.get(kind) for kind in _SIGHTINGS):
+        raise EstimatorError(
+            f"{bag}: no sighting of a landmark was used, and without sightings nothing tells what the wheels' gains "
+            f"are; see `fgloc info {bag}`"
+        )
+    return result.wheels
 
 
 def _pooled(found: Sequence[WheelCalibration]) -> WheelCalibration:

@@ -144,6 +144,13 @@ def test_wheels_that_never_spoke_are_not_calibrated(commanded):
         calibrate([commanded], commanded.parent / "map.yaml", settings("twist"))
 
 
+def test_a_run_without_sightings_tells_no_gains(commanded):
+    deaf = {"recording": {"topics": {"sightings": "none"}}, "estimator": {"initial_pose": [0.0, 0.0, 0.0]}}
+    config = Config.model_validate(settings("command").model_dump(exclude_unset=True) | deaf)
+    with pytest.raises(EstimatorError, match="no sighting of a landmark was used"):
+        calibrate([commanded], commanded.parent / "map.yaml", config)
+
+
 def test_gains_that_no_robot_has_are_not_written(wheeled):
     config = settings("twist")
     far = config.model_copy(update={"wheels": config.wheels.model_copy(update={"scale_v": 0.4})})
