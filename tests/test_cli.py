@@ -147,8 +147,6 @@ def test_bad_input_is_one_line_and_code_1(bag, tmp_path):
     assert "absent.safetensors" in refused("smooth", bag, "--model", tmp_path / "absent.safetensors", *out)
     (tmp_path / "typo.yaml").write_text("wheels: {scale: 2}\n")
     assert "wheels.scale" in refused("smooth", bag, "--config", tmp_path / "typo.yaml", *out)
-    (tmp_path / "file").write_text("")
-    assert "cannot be written" in refused("smooth", bag, "--out", tmp_path / "file")
     assert not (tmp_path / "out").exists()
 
 
@@ -165,6 +163,16 @@ def test_bad_input_is_one_line_and_code_1(bag, tmp_path):
 )
 def test_usage_is_code_2(arguments):
     assert fgloc(*arguments)[0] == 2
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_run(bag, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _, said = fgloc("smooth", bag, "--out", tmp_path / "file")
+    assert code == 2
+    assert "is a file" in said
+    code, _, said = fgloc("calibrate", bag, "--out", tmp_path)
+    assert code == 2
+    assert "is a directory" in said
 
 
 def test_real_time_replay_takes_the_recordings_time(tmp_path):

@@ -15,7 +15,9 @@ BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
 Bag = Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)]
 Bags = Annotated[list[Path], typer.Argument(metavar="BAG...", help=BAG_HELP)]
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results; made if missing")]
+Out = Annotated[
+    Path, typer.Option("--out", metavar="DIR", file_okay=False, help="folder for the results; made if missing")
+]
 MapOption = Annotated[
     Path | None, typer.Option("--map", metavar="MAP", help="marker map; default: map.yaml beside the bag, else none")
 ]

@@ -1,4 +1,4 @@
-"""Commands of one run: ``demo``, ``smooth``, ``online`` and ``map``."""
+"""Commands of one robot: ``demo``, ``smooth``, ``online``, ``map`` and ``calibrate``."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ class Speed(StrEnum):
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the results")] = Path("demo-out"),
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", file_okay=False, help="folder for the results")] = Path(
+        "demo-out"
+    ),
 ) -> None:
     """Smooth the bundled recording and replay it online; say where the reports are."""
     if not SAMPLE.is_dir():
@@ -97,7 +99,7 @@ def online(
 
 def make_map(
     bag: Bag,
-    out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", help="map file to be written")],
+    out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", dir_okay=False, help="map file to be written")],
     model: ModelOption = None,
     config: ConfigOption = None,
 ) -> None:
@@ -116,7 +118,9 @@ def make_map(
 
 def calibrate(
     bags: Bags,
-    out: Annotated[Path, typer.Option("--out", metavar="ROBOT.yaml", help="configuration file to be written")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="ROBOT.yaml", dir_okay=False, help="configuration file to be written")
+    ],
     map_file: MapOption = None,
     config: ConfigOption = None,
 ) -> None:
