@@ -13,7 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
+
+try:
+    import torch
+except ModuleNotFoundError as missing:
+    raise SystemExit("error: torch is not installed; in the repository: pip install -e '.[train]'") from missing
 from tqdm import tqdm
 
 from fgloc.errors import ConfigError, FglocError, RecordingError

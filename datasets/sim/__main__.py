@@ -7,6 +7,11 @@ from typing import Annotated
 
 import typer
 
+try:
+    import mujoco  # noqa: F401
+except ModuleNotFoundError as error:
+    raise SystemExit("error: MuJoCo is not installed; in the repository: pip install -e '.[sim]'") from error
+
 from datasets.sim.record import record as record_run
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.errors import FglocError

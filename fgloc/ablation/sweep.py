@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -104,7 +105,10 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         import dask
         import distributed
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{error.name} is not installed, and sweeps run on it: pip install 'fgloc[sweep]'") from error
+        raise ConfigError(
+            f"{error.name} is not installed, and many runs at once need it: "
+            f"{sys.executable} -m pip install 'dask[distributed]'"
+        ) from error
     settings = {
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.scheduler.allowed-failures": _DEATHS,
