@@ -59,11 +59,11 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     panels: list[Panel] = []
     if result.spans:
         heard = {f"{topic} ({h.count})": h.times for topic, h in result.spans.items()}
-        panels.append((len(heard), lambda axes: _activity(axes, "heard", heard, GREY, bridge=True)))
+        panels.append((len(heard), lambda axes: _activity(axes, result, "heard", heard, GREY, bridge=True)))
     if motions:
         panels.append((1.5 * len({d.kind for d in motions}), lambda axes: _weights(axes, result, motions)))
     if flags:
-        panels.append((len(flags), lambda axes: _activity(axes, "flags", flags, RED, bridge=False)))
+        panels.append((len(flags), lambda axes: _activity(axes, result, "flags", flags, RED, bridge=False)))
     if known:
         panels.append((5.0, lambda axes: _fit(axes, result, known)))
     if sightings:
@@ -72,7 +72,9 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     if matched is not None:
         panels += [(4.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in (False, True)]  # type: ignore[misc]
     if not panels:
-        panels.append((1.0, lambda axes: _activity(axes, "keyframes", {"all": _poses(result)}, BLUE, bridge=True)))
+        panels.append(
+            (1.0, lambda axes: _activity(axes, result, "keyframes", {"all": _poses(result)}, BLUE, bridge=True))
+        )
     heights = [height + 0.8 for height, _ in panels]
     figure = Figure(figsize=(WIDTH, 0.9 + _ROW_IN * sum(heights)), dpi=110, layout="constrained")
     axes_of: list[Axes] = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[
@@ -125,10 +127,11 @@ def _flags(result: RunResult, decisions: Sequence[Decision]) -> dict[str, FloatA
     }
 
 
-def _activity(axes: Axes, title: str, rows: Mapping[str, FloatArray], color: str, bridge: bool) -> None:
+def _activity(
+    axes: Axes, result: RunResult, title: str, rows: Mapping[str, FloatArray], color: str, bridge: bool
+) -> None:
     """One row a name: bars where items came at a steady rate (`bridge`), else a tick each."""
-    everything = np.concatenate(list(rows.values()))
-    span = max(float(np.ptp(everything)), 1.0)
+    span = max(float(np.ptp(_poses(result))), 1.0)
     for row, times in enumerate(rows.values()):
         axes.broken_barh(_bars(np.unique(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
     _rows(axes, title, list(rows))
