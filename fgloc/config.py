@@ -310,6 +310,7 @@ class Config(Section):
 
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
 _SHIPPED = "shipped:"
+_LONGEST = 80  # characters of a wrong value that are shown
 _MODELS = Path(__file__).parent / "motion" / "models"
 
 
@@ -324,6 +325,11 @@ def yaml_of(config: Config, folder: Path) -> str:
                 f"{_SHIPPED}{path.relative_to(_MODELS).with_suffix('')}" if shipped else os.path.relpath(path, folder)
             )
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
+
+
+def _short(value: object) -> str:
+    said = repr(value)
+    return said if len(said) <= _LONGEST else said[:_LONGEST] + " ..."
 
 
 def load_config(path: Path) -> Config:
@@ -349,5 +355,7 @@ def load_config(path: Path) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+        lines = [
+            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {_short(e['input'])})" for e in error.errors()
+        ]
         raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error

@@ -106,7 +106,8 @@ class Stepper:
             if count >= 10:
                 notes.append(
                     f"{topic}: {count} messages were dropped, their stamps lie ahead of the other sensors' "
-                    f"(the last by {ahead_ns * 1e-9:.2f} s): correct them with recording.stamp_offset_s"
+                    f"(the last by {ahead_ns * 1e-9:.2f} s): correct them with recording.stamp_offset_s, "
+                    "or take the receive times of whichever clock is wrong with recording.received_stamps"
                 )
         for topic, source in self._sources.items():
             if source.patience_ns > self._reorder_ns:

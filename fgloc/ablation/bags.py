@@ -49,7 +49,7 @@ def plan_bags(bags: Sequence[Path], map_file: Path | None, configure: Callable[[
     for name, bag in zip(names, bags, strict=True):
         try:
             if not bag.exists():
-                raise ConfigError(f"{bag}: there is no such recording")
+                raise ConfigError(f"{bag}: does not exist; expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3")
             config = configure(bag)
         except FglocError as error:
             errors[name] = str(error)

@@ -102,7 +102,8 @@ def read_tum(path: Path) -> Trajectory:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read ({error}); give a TUM text file") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise TrajectoryError(f"{path}: cannot be read ({why}); give a TUM text file") from error
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):

@@ -147,7 +147,7 @@ def read_document(path: Path, error: type[FglocError]) -> Item:
             raise error(f"{path}: {path.stat().st_size} bytes, expected less than {_MAX_BYTES}; is it the right file?")
         text = path.read_text(encoding="utf-8")
     except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror})") from cause
+        raise error(f"{path}: cannot be read ({cause.strerror}); give a YAML or JSON file") from cause
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a text file: {cause}") from cause
     try:
