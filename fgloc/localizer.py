@@ -16,6 +16,7 @@ from fgloc.config import Config
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.footing import BLIND_S
 from fgloc.graph.incremental import IncrementalEstimator
 from fgloc.graph.interval import interval_scale
 from fgloc.graph.log import Belief, Sighting
@@ -157,7 +158,7 @@ class Localizer:
         with self.stopwatch("weigh"):
             trust = self.trust.judge(step, readings)
             decisions = self._revise(k, trust)
-            footing = self.estimator.log.footing(k)
+            footing = self.estimator.log.footing(k, self._whereabouts.blind_s > BLIND_S)
             motions = self.sources.combine(readings, trust.off, footing)
             if not motions:
                 motions = [self.sources.unknown(step)]
@@ -234,7 +235,7 @@ class Localizer:
         frames = (log[i] for i in range(k - trust.span + 1, k) if i in log)
         for frame in (f for f in frames if f.prior is None and trust.accused not in f.off):
             frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
-            frame.footing = self.estimator.log.footing(frame.k)
+            frame.footing = self.estimator.log.footing(frame.k, frame.footing.blind)
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
                 decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")

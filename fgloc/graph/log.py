@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 
@@ -73,12 +73,13 @@ class MeasurementLog:
                 break
             del self.keyframes[oldest]
 
-    def footing(self, k: int) -> Footing:
+    def footing(self, k: int, blind: bool) -> Footing:
         """At the start of the step to keyframe ``k``: what became of it in the step before."""
         before = self.keyframes.get(k - 1)
         if before is None or before.step is None:
-            return Footing()
-        return before.footing.then(before.off.get("wheels") == "slip", before.step.dt)
+            return Footing(blind=blind)
+        after = before.footing.then(before.off.get("wheels") == "slip", before.step.dt)
+        return replace(after, blind=blind)
 
     def since(self, elapsed_s: float) -> Iterator[Keyframe]:
         """Keyframes not older than the given time of the estimator's own clock."""

@@ -153,8 +153,8 @@ def _is_behind(m: LandmarkMeasurement, pose: FloatArray, factors: LandmarkFactor
 def _fit(k: int, pose: FloatArray, sightings: Sequence[Sighting]) -> bool:
     """Whether the sightings are where they are expected, within their own noise."""
     values = values_at(k, pose)
-    made = [f for s in sightings for f in s.factors]
-    return bool(sum(f.error(values) for f in made) < _FAIR * sum(f.dim() for f in made))
+    cost = sum(f.error(values) for s in sightings for f in s.factors)
+    return bool(cost < _FAIR * sum(len(s.factors) * s.factors[0].dim() for s in sightings))
 
 
 def _newton_step(information: FloatArray, offset: FloatArray, residual: FloatArray, J: FloatArray) -> FloatArray:
