@@ -49,7 +49,9 @@ def test_the_same_bag_gives_the_same_bytes_twice(tmp_path):
 
 def test_every_keyframe_counts_and_every_factor_is_told(tmp_path):
     result = run(write_world(tmp_path, World(beacons(), seconds=8.0)), tmp_path / "map.yaml", config(), "online")
-    assert result.counts["wheels"] == len(result.trajectory) - 1
+    keyframes = {d.step for d in result.decisions}
+    assert result.counts["wheels"] == len(keyframes) - 1
+    assert len(keyframes) - len(result.trajectory) in (0, 1)  # the start waits for a third beacon, to be checked by
     fused = [d for d in result.decisions if d.kind == "range_bearing" and not d.reason]
     assert result.counts["range_bearing"] == len(fused)
     refused = sum(n for reason, n in result.rejections.items() if reason.startswith("sightings."))
