@@ -11,6 +11,8 @@ from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import LandmarksConfig
 from fgloc.graph.batch import BatchSmoother
+from fgloc.graph.footing import Footing
+from fgloc.localizer import Localizer
 from fgloc.selfcal import Calibration, calibration_gradient, prior, shifted
 from fgloc.types import (
     Estimate,
@@ -49,6 +51,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     """
     localizer, config = parts.localizer, parts.config
     log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
+    take_room_back(localizer)
     solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability, moved)
     if config.batch.robust == "gnc" and solver.outliers:
         solver.replace_motions(_without(parts, solver))
@@ -80,6 +83,14 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
     return SmoothedRun(estimates, landmarks, tuple(notes), wheels)
+
+
+def take_room_back(localizer: Localizer) -> None:
+    """Room for slides in the dark is not needed where sightings of the other end show them, too."""
+    for frame in localizer.estimator.log.keyframes.values():
+        if frame.footing.blind and frame.prior is None:
+            frame.footing = Footing()
+            frame.motions = tuple(localizer.sources.combine_again(frame)) or frame.motions
 
 
 def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:
