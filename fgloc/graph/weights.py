@@ -137,7 +137,7 @@ class Weights:
         Beside others that are believed, a marker that cannot be where it was seen, in a place where exactly one other
         would be seen that was not, is that other.
         """
-        if not self._config.weights.adaptive or not self._factors.known:
+        if not refused or not self._config.weights.adaptive or not self._factors.known:
             return []
         found = []
         seen = {d.landmark_id for d in decisions if not d.reason}
