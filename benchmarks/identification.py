@@ -26,7 +26,7 @@ import torch
 from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
 from datasets import mrclam
-from fgloc.calibration import calibrate
+from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
 from fgloc.motion import MotionModel, load_model, save_model
 from fgloc.motion.card import Kinematics, Split

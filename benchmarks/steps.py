@@ -22,9 +22,10 @@ from benchmarks.common import Row, main
 from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
-from fgloc.gate import Gate
 from fgloc.graph.factors import motion_factor, pose_key, prior_factor
-from fgloc.graph.incremental import isam2_params
+from fgloc.graph.isam2 import isam2_params
+from fgloc.intake.keyframing import Stepper
+from fgloc.intake.validation import Gate
 from fgloc.localizer import Localizer
 from fgloc.motion import load_model
 from fgloc.motion.source import LearnedMotion
@@ -33,7 +34,6 @@ from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stepper import Stepper
 from fgloc.timing import Stopwatch
 from fgloc.types import (
     Camera,

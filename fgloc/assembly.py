@@ -11,7 +11,8 @@ from fgloc.config import Config, Role
 from fgloc.diagnosis import Diagnosis
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, rpy_matrix
-from fgloc.gate import Gate
+from fgloc.intake.keyframing import Stepper
+from fgloc.intake.validation import Gate
 from fgloc.localizer import Localizer
 from fgloc.motion import load_model
 from fgloc.motion.source import LearnedMotion
@@ -23,7 +24,6 @@ from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stepper import Stepper
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

@@ -10,26 +10,27 @@ from collections.abc import Sequence
 import numpy as np
 
 from fgloc import se2
-from fgloc.account import flag_notes, motion_decisions, moved_notes, place_decision
-from fgloc.carry import measure_carried
 from fgloc.config import Config
+from fgloc.faults.landmark_faults import Suspicion
+from fgloc.faults.motion_faults import SourceTrust, Trust
+from fgloc.fusion.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
+from fgloc.fusion.motion import MotionSources, worsened
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.footing import BLIND_S
-from fgloc.graph.incremental import IncrementalEstimator
-from fgloc.graph.interval import interval_scale
-from fgloc.graph.log import Belief, Sighting
-from fgloc.graph.weights import Weights
+from fgloc.graph.gating import Weights
+from fgloc.graph.isam2 import IncrementalEstimator
+from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.graph.outage_inflation import interval_scale
+from fgloc.graph.slip_noise import BLIND_S
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
-from fgloc.motions import MotionSources, worsened
+from fgloc.relocalization.tracking_state import CONTRADICTS, Whereabouts
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.motion_compensation import measure_carried
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.suspicion import Suspicion
 from fgloc.timing import Stopwatch
-from fgloc.trust import SourceTrust, Trust
 from fgloc.types import (
     Decision,
     Estimate,
@@ -39,7 +40,6 @@ from fgloc.types import (
     Readings,
     Step,
 )
-from fgloc.whereabouts import CONTRADICTS, Whereabouts
 
 
 class Localizer:

@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
-from fgloc.attendance import Attendance
 from fgloc.config import Config, Role
+from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
-from fgloc.hints import image_hints
+from fgloc.intake.topic_activity import Attendance
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream

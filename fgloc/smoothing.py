@@ -9,11 +9,12 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly
+from fgloc.calibration.wheel_gains import calibrate_wheels
 from fgloc.config import LandmarksConfig
 from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.footing import Footing
+from fgloc.graph.slip_noise import Footing
 from fgloc.localizer import Localizer
-from fgloc.selfcal import Calibration, calibration_gradient, prior, shifted
+from fgloc.sensors.sighting_calibration import Calibration, calibration_gradient, prior, shifted
 from fgloc.types import (
     Estimate,
     FloatArray,
@@ -23,7 +24,6 @@ from fgloc.types import (
     RangeBearingMeasurement,
     WheelCalibration,
 )
-from fgloc.wheelcal import calibrate_wheels
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
 _NUDGE = 0.005  # of log scale, and of radians: finite differences

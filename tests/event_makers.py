@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.stepper import Stepper
+from fgloc.intake.keyframing import Stepper
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

@@ -11,11 +11,11 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import yaw_quaternion
-from fgloc.gate import Gate
+from fgloc.intake.keyframing import Stepper
+from fgloc.intake.validation import Gate
 from fgloc.localizer import Localizer
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stepper import Stepper
 from fgloc.types import (
     Camera,
     CommandEvent,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fgloc import se2
-from fgloc.arbiter import Arbiter
-from fgloc.graph.log import Belief
+from fgloc.faults.fault_isolation import Arbiter
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import FloatArray, MotionMeasurement, Readings
 
 STEP_NS = 100_000_000

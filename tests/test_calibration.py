@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from datasets.bag import BagWriter
 from fgloc import cli, se2
-from fgloc.calibration import calibrate
+from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, model_path, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run

@@ -28,16 +28,16 @@ from datasets import mrclam, pioneer, turtlebot3
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.assembly import given_pose
-from fgloc.attendance import Attendance
 from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
+from fgloc.intake.keyframing import Stepper
+from fgloc.intake.topic_activity import Attendance
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import find_beside, run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stepper import Stepper
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

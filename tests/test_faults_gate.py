@@ -23,7 +23,7 @@ from event_makers import (
 from fgloc import se2
 from fgloc.config import GateConfig, WheelsConfig
 from fgloc.errors import ConfigError
-from fgloc.gate import Gate
+from fgloc.intake.validation import Gate
 from fgloc.sensors.wheels import WheelMotion
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgloc.graph.footing import Footing
-from fgloc.graph.log import Belief, Keyframe, MeasurementLog
+from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog
+from fgloc.graph.slip_noise import Footing
 from fgloc.types import MotionMeasurement, Step
 
 DARK = Footing(blind=True)

@@ -16,7 +16,7 @@ from event_makers import (
 )
 
 from fgloc.config import GateConfig
-from fgloc.gate import Gate
+from fgloc.intake.validation import Gate
 from fgloc.types import CameraInfoEvent, TransformEvent, TruthEvent
 
 

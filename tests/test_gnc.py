@@ -11,8 +11,8 @@ from fgloc.config import BatchConfig, EstimatorConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.gnc import Candidate, graduate, surrogate_weights
-from fgloc.graph.incremental import IncrementalEstimator
-from fgloc.graph.log import Belief
+from fgloc.graph.isam2 import IncrementalEstimator
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 MAP = LandmarkMap({i: Landmark(i, np.array([2.0 * i, 2.0 * (i % 2), 0.0]), np.eye(3), 0.0) for i in range(6)})

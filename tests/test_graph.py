@@ -10,16 +10,16 @@ import pytest
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.carry import carry
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors, cartesian, gaussian, landmark_key, motion_factor, pose_key
-from fgloc.graph.incremental import IncrementalEstimator
-from fgloc.graph.log import Belief, Keyframe, MeasurementLog
-from fgloc.graph.weights import Weights
+from fgloc.graph.gating import Weights
+from fgloc.graph.isam2 import IncrementalEstimator
+from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog
+from fgloc.sensors.motion_compensation import carry
 from fgloc.types import (
     Camera,
     CornerMeasurement,

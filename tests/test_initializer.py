@@ -10,7 +10,7 @@ from robot_world import CAMERA, config, polar, project, standing
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.initializer import Initializer, Start
+from fgloc.relocalization.global_search import Initializer, Start
 from fgloc.types import (
     CornerMeasurement,
     Landmark,

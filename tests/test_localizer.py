@@ -25,12 +25,12 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.carry import carry
 from fgloc.config import MotionConfig
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.place import joint_fit
+from fgloc.graph.pose_fit import joint_fit
 from fgloc.motion import load_model, save_model
 from fgloc.motion.source import LearnedMotion
+from fgloc.sensors.motion_compensation import carry
 from fgloc.types import CornerMeasurement, LandmarkMap, Mode
 
 MAPS = {"corners": room, "beacons": beacons}

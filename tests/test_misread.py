@@ -10,8 +10,8 @@ import pytest
 from robot_world import CAMERA, SIGMA_PX, Chain, World, config, position_error, project, room, standing
 
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief
-from fgloc.graph.weights import Weights
+from fgloc.graph.gating import Weights
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import CornerMeasurement, CornersEvent, Landmark, LandmarkMap
 
 SHARE = 0.4

@@ -13,14 +13,14 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.fusion.motion import MotionSources, worsened
 from fgloc.graph.estimator import fuse
-from fgloc.graph.footing import Footing
-from fgloc.graph.log import Belief, Keyframe
+from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.slip_noise import Footing
 from fgloc.localizer import Localizer
 from fgloc.motion import load_model, save_model
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
-from fgloc.motions import MotionSources, worsened
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion

@@ -11,11 +11,11 @@ from robot_world import CAMERA, SIGMA_PX, Chain, World, beacons, config, polar, 
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.interval import interval_scale
-from fgloc.graph.log import Belief
-from fgloc.graph.place import chi2_bound
-from fgloc.graph.quarantine import Quarantine, displacement
-from fgloc.graph.weights import Weights
+from fgloc.graph.gating import Weights
+from fgloc.graph.measurement_log import Belief
+from fgloc.graph.moved_landmark_votes import Quarantine, displacement
+from fgloc.graph.outage_inflation import interval_scale
+from fgloc.graph.pose_fit import chi2_bound
 from fgloc.types import CornerMeasurement, LandmarkMap, RangeBearingMeasurement
 
 R = np.diag([0.015, 0.06]) ** 2

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-import fgloc.initializer
+import fgloc.relocalization.global_search
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.place import joint_fit
-from fgloc.initializer import Initializer
+from fgloc.graph.pose_fit import joint_fit
 from fgloc.localizer import Localizer
+from fgloc.relocalization.global_search import Initializer
 from fgloc.types import (
     Estimate,
     Landmark,
@@ -107,7 +107,8 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     config = Config()
     initializer = Initializer(config, standing, LandmarkFactors(standing))
     fits = []
-    monkeypatch.setattr(fgloc.initializer, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
+    search = fgloc.relocalization.global_search
+    monkeypatch.setattr(search, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
     for k in range(40):
         at = step(k, np.zeros(3), ())
         seen = [

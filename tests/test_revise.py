@@ -12,8 +12,8 @@ from fgloc.config import EstimatorConfig
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.incremental import IncrementalEstimator
-from fgloc.graph.log import Belief
+from fgloc.graph.isam2 import IncrementalEstimator
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 KINDS = ("fixed_lag", "isam2", "ekf")

@@ -8,7 +8,7 @@ from robot_world import CAMERA, Chain, World, beacons, config, nees
 from scipy.stats import chi2
 
 from fgloc.graph.batch import BatchSmoother
-from fgloc.selfcal import Calibration, calibration_gradient, shifted
+from fgloc.sensors.sighting_calibration import Calibration, calibration_gradient, shifted
 from fgloc.smoothing import refine
 from fgloc.types import CornerMeasurement, RangeBearingMeasurement
 

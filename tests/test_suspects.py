@@ -9,7 +9,7 @@ import pytest
 from robot_world import Chain, World, beacons, config, position_error, truth_at
 
 from fgloc import se2
-from fgloc.graph.suspects import Suspects
+from fgloc.graph.moved_landmark_glr import Suspects
 from fgloc.types import LandmarkMap, RangeBearingMeasurement
 
 COARSE = {"range_sigma_m": 0.2, "bearing_sigma_rad": 0.05}  # of which one sighting cannot show half a metre

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fgloc.config import Config, WeightsConfig
-from fgloc.disagreement import Disagreement
-from fgloc.motions import MotionSources
+from fgloc.faults.glr_test import Disagreement
+from fgloc.faults.motion_faults import SourceTrust
+from fgloc.fusion.motion import MotionSources
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.trust import SourceTrust
 from fgloc.types import MotionMeasurement, Readings, Step
 
 DT = 0.1

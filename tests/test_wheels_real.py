@@ -8,10 +8,10 @@ from real_data import real_data
 from fgloc import se2
 from fgloc.config import GateConfig, KeyframesConfig, RecordingConfig, WheelsConfig
 from fgloc.frames import quaternion_yaw
-from fgloc.gate import Gate
+from fgloc.intake.keyframing import Stepper
+from fgloc.intake.validation import Gate
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stepper import Stepper
 from fgloc.types import OdometryEvent
 
 pytestmark = pytest.mark.real_data

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fgloc.buffers import EventBuffer
 from fgloc.config import Config, GyroConfig, WheelsConfig
+from fgloc.intake.event_buffer import EventBuffer
 from fgloc.motion.card import WheelJoints
 from fgloc.motion.signals import Signals, signals_of
 from fgloc.sensors.gyro import Gyro

@@ -125,7 +125,7 @@ def calibrate(
     config: ConfigOption = None,
 ) -> None:
     """Find the gains of wheels, or of commands that stand in for them, from what the recordings saw of a map."""
-    from fgloc.calibration import calibrate as calibrated
+    from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
 

@@ -17,8 +17,8 @@ from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
 from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
-from fgloc.graph.log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.place import chi2_bound
+from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
+from fgloc.graph.pose_fit import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,

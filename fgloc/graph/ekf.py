@@ -12,7 +12,7 @@ from fgloc.config import EstimatorConfig
 from fgloc.errors import ConfigError
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors, pose_key, whitened
-from fgloc.graph.log import Belief, Keyframe
+from fgloc.graph.measurement_log import Belief, Keyframe
 
 
 class ExtendedKalmanFilter(Estimator):

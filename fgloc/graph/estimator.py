@@ -12,7 +12,7 @@ from fgloc import se2
 from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief, Keyframe, MeasurementLog, Sighting
+from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
 from fgloc.types import FloatArray, MotionMeasurement
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
-from fgloc.graph.log import Sighting
+from fgloc.graph.measurement_log import Sighting
 from fgloc.types import (
     Camera,
     CornerMeasurement,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
-from fgloc.graph.place import Fit
+from fgloc.graph.pose_fit import Fit
 from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 
-from fgloc.graph.footing import Footing
+from fgloc.graph.slip_noise import Footing
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
-from fgloc.agreement import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
-from fgloc.carry import carry
 from fgloc.config import Config
 from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief
-from fgloc.graph.place import Fit, joint_fit, sighting_cost
+from fgloc.graph.measurement_log import Belief
+from fgloc.graph.pose_fit import Fit, joint_fit, sighting_cost
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
+from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     CornerMeasurement,

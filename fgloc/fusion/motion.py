@@ -10,8 +10,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.footing import Footing
-from fgloc.graph.log import Belief, Keyframe
+from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.slip_noise import Footing
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro

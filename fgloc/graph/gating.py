@@ -13,10 +13,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, whitened
-from fgloc.graph.log import Belief, Sighting
-from fgloc.graph.place import Fit, cauchy_k, chi2_bound, joint_fit, joint_nis, values_at
-from fgloc.graph.quarantine import Quarantine
-from fgloc.selfcal import Calibration
+from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.graph.moved_landmark_votes import Quarantine
+from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, joint_nis, values_at
+from fgloc.sensors.sighting_calibration import Calibration
 from fgloc.types import (
     CornerMeasurement,
     Decision,

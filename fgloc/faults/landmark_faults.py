@@ -10,10 +10,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.estimator import Estimator, fuse
-from fgloc.graph.log import Belief, Sighting
-from fgloc.graph.suspects import Accusation, Suspects
-from fgloc.graph.weights import Weights
-from fgloc.selfcal import Calibration, Calibrator
+from fgloc.graph.gating import Weights
+from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.graph.moved_landmark_glr import Accusation, Suspects
+from fgloc.sensors.sighting_calibration import Calibration, Calibrator
 from fgloc.types import Decision, FloatArray, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 _MOST_BEACONS = 500  # one filter each: with more of them a step takes too long
@@ -24,7 +24,7 @@ class Suspicion:
     """Listens to the estimator's measurements; accuses a beacon, and takes back what it has done.
 
     Beacons are landmarks without a size. A marker's corners or pose are precise enough for the gate to refuse a moved
-    one: see `fgloc.graph.quarantine`.
+    one: see `fgloc.graph.moved_landmark_votes`.
 
     Attributes:
         calibrator: of range scale and bearing offset; None if they are not estimated.

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import GateConfig
-from fgloc.gate_sightings import EMPTIED, SightingsGate
+from fgloc.intake.field_checks import PLANAR, Changes, Parts
+from fgloc.intake.sighting_validation import EMPTIED, SightingsGate
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -26,7 +27,6 @@ from fgloc.types import (
     TransformEvent,
     TruthEvent,
 )
-from fgloc.validate import PLANAR, Changes, Parts
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
 _MAX_ANGLE = 1e9  # rad, of a joint

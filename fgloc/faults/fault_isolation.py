@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgloc import se2
-from fgloc.graph.log import Belief
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import FloatArray, MotionMeasurement, Readings
 
 _STRETCH_S = 0.5  # of dead reckoning, from one fix to another, that is held against both sources

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from fgloc import se2
-from fgloc.graph.log import Belief
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import Decision, FloatArray, MotionMeasurement, Readings
 
 _REASONS = {

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
-from fgloc.graph.log import Sighting
+from fgloc.graph.measurement_log import Sighting
 from fgloc.types import CornerMeasurement, FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark

@@ -18,8 +18,8 @@ from fgloc import se2
 from fgloc.config import EstimatorConfig
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
-from fgloc.graph.log import Belief, Keyframe
-from fgloc.graph.place import likeliest
+from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.pose_fit import likeliest
 from fgloc.types import (
     FloatArray,
     LandmarkMeasurement,

@@ -6,9 +6,9 @@ from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
 from dataclasses import dataclass
 
-from fgloc.buffers import EventBuffer
-from fgloc.clock import MOTION_EVENTS, ClockGuard, Verdict
 from fgloc.config import GateConfig, KeyframesConfig
+from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, Verdict
+from fgloc.intake.event_buffer import EventBuffer
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

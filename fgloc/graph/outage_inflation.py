@@ -10,9 +10,9 @@ from scipy.optimize import brentq
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief
-from fgloc.graph.place import chi2_bound, joint_fit
-from fgloc.graph.weights import REDUNDANT
+from fgloc.graph.gating import REDUNDANT
+from fgloc.graph.measurement_log import Belief
+from fgloc.graph.pose_fit import chi2_bound, joint_fit
 from fgloc.types import LandmarkMeasurement
 
 _LIKELY = 0.9  # a NIS that is exceeded less often than the rest of this scales the interval

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
-from fgloc.graph.log import Belief, Sighting
+from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4

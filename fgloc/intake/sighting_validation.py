@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from fgloc.config import GateConfig
+from fgloc.intake.field_checks import Changes, Parts, judge_corners
 from fgloc.types import (
     CornersEvent,
     MarkerCorners,
@@ -17,7 +18,6 @@ from fgloc.types import (
     RangeBearing,
     RangeBearingEvent,
 )
-from fgloc.validate import Changes, Parts, judge_corners
 
 EMPTIED = "emptied"  # reason of an event all parts of which were rejected, and counted, one by one
 _SHOWN_IDS = 12

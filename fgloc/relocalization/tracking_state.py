@@ -11,9 +11,9 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.log import Belief, Sighting
-from fgloc.graph.weights import NEAR_M, NEAR_RAD
-from fgloc.initializer import Initializer, Start
+from fgloc.graph.gating import NEAR_M, NEAR_RAD
+from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.relocalization.global_search import Initializer, Start
 from fgloc.types import Decision, FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 _NAMED = 3  # jumps

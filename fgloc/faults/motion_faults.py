@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgloc.arbiter import Arbiter
 from fgloc.config import WeightsConfig
-from fgloc.disagreement import Disagreement
-from fgloc.graph.log import Belief
-from fgloc.motions import MotionSources
+from fgloc.faults.fault_isolation import Arbiter
+from fgloc.faults.glr_test import Disagreement
+from fgloc.fusion.motion import MotionSources
+from fgloc.graph.measurement_log import Belief
 from fgloc.types import FloatArray, Readings, Step
 
 _MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
