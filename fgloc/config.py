@@ -39,6 +39,12 @@ class RecordingConfig(Section):
 
     topics: TopicsConfig = TopicsConfig()
     received_stamps: tuple[Role, ...] = Field((), description="roles whose header stamps are wrong: use receive times")
+    clock_sigma_s: float = Field(
+        0.003,
+        ge=0,
+        le=1.0,
+        description="s: how far the stamps of the wheels, to which all others are compared, may be off",
+    )
     stamp_offset_s: dict[Role, float] = Field({}, description="added to a role's stamps [s]: a known clock offset")
     base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
     sightings_pose: tuple[float, float, float, float, float, float] | None = Field(
@@ -119,9 +125,19 @@ class WheelsConfig(Section):
     zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
     zero_yaw_rate: float = Field(0.0, ge=0, description="rad/s below which a reported rate is rest")
     noise: NoiseDensity = NoiseDensity()
-    scale_sigma: float = Field(0.0, ge=0, le=0.5, description="how far scale_v may be off, all the time alike")
-    turn_scale_sigma: float = Field(0.0, ge=0, le=0.5, description="how far scale_omega may be off, likewise")
-    yaw_per_m_sigma: float = Field(0.0, ge=0, le=1, description="rad/m: how far yaw_per_m may be off, likewise")
+    scale_sigma: float = Field(
+        0.01,
+        ge=0,
+        le=0.5,
+        description="how far the radii of both wheels may be off alike; estimated, as all sigmas here",
+    )
+    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
+    yaw_per_m_sigma: float = Field(
+        0.015,
+        ge=0,
+        le=1,
+        description="rad/m: how far yaw_per_m may be off: 0.4 % of unequal radii at a track of 0.26 m",
+    )
 
 
 class GyroConfig(Section):
@@ -129,7 +145,10 @@ class GyroConfig(Section):
 
     use: bool = True
     yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
-    scale_sigma: float = Field(0.003, ge=0, description="rad/√rad: error of the rate's scale, by rotation turned")
+    scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
+    time_offset_sigma_s: float = Field(
+        0.005, ge=0, le=1.0, description="s: how far its clock may be off that of the wheels; estimated"
+    )
     bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
     bias_walk: float = Field(0.0003, ge=0, description="rad/s/√s")
 
@@ -139,6 +158,17 @@ class CameraConfig(Section):
 
     file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
     rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
+    position_sigma_m: float = Field(
+        0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
+    )
+    rotation_sigma_rad: float = Field(0.007, ge=0, le=0.5, description="rad: likewise, about each axis (0.4 degrees)")
+    focal_sigma: float = Field(0.003, ge=0, le=0.5, description="how far the focal length may be off, as a share")
+    principal_sigma_px: float = Field(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
+    distortion_sigma: float = Field(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
+    time_offset_sigma_s: float = Field(
+        0.012, ge=0, le=1.0, description="s: how far its clock may be off that of the wheels; estimated"
+    )
+    time_jitter_s: float = Field(0.002, ge=0, le=0.1, description="s: what each stamp is off by on its own")
 
 
 class MarkersConfig(Section):
@@ -164,10 +194,13 @@ class LandmarksConfig(Section):
     range_bias_m: float = Field(0.0, description="subtracted from the reported range")
     bearing_bias_rad: float = Field(0.0, description="subtracted from the reported bearing")
     range_scale_sigma: float = Field(
-        0.0, ge=0, le=0.5, description="how far range_scale may be off; above 0 it is estimated during the run"
+        0.005, ge=0, le=0.5, description="how far range_scale may be off; estimated during the run"
     )
     bearing_bias_sigma_rad: float = Field(
-        0.0, ge=0, le=0.5, description="how far bearing_bias_rad may be off; above 0 it is estimated during the run"
+        0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
+    )
+    time_offset_sigma_s: float = Field(
+        0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of the wheels; estimated"
     )
     yaw_sigma_rad: float | None = Field(
         None, gt=0, description="of a marker pose's yaw; None: marker poses are used as range and bearing only"
@@ -180,10 +213,14 @@ class LandmarksConfig(Section):
         description="correlation time of one landmark's errors: sightings closer than this share their information",
     )
 
-    @property
-    def self_calibrating(self) -> bool:
-        """Whether range scale or bearing offset are estimated during the run."""
-        return self.range_scale_sigma > 0.0 or self.bearing_bias_sigma_rad > 0.0
+
+class MapConfig(Section):
+    """How well the landmarks of the map were surveyed, where the map does not say it of each."""
+
+    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
+    rotation_sigma_rad: float = Field(
+        0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"
+    )
 
 
 def model_path(given: Any) -> Any:
@@ -211,6 +248,9 @@ class MotionConfig(Section):
         description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
     )
     use: bool = True
+    scale_sigma: float = Field(
+        0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
+    )
     correlation: Literal["joint", "independent"] = Field(
         "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
     )
@@ -301,6 +341,7 @@ class Config(Section):
     camera: CameraConfig = CameraConfig()
     markers: MarkersConfig = MarkersConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
+    map: MapConfig = MapConfig()
     motion: MotionConfig = MotionConfig()
     estimator: EstimatorConfig = EstimatorConfig()
     weights: WeightsConfig = WeightsConfig()

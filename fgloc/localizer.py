@@ -19,6 +19,7 @@ from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.gating import Weights
+from fgloc.graph.installation import installation_of
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.outage_inflation import interval_scale
@@ -28,7 +29,7 @@ from fgloc.motion.source import LearnedMotion
 from fgloc.relocalization.tracking_state import CONTRADICTS, Whereabouts
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.motion_compensation import measure_carried
+from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.timing import Stopwatch
 from fgloc.types import (
@@ -77,21 +78,17 @@ class Localizer:
             gyro: the gyro, if any.
         """
         self.config = config
-        self.factors = LandmarkFactors(landmark_map)
+        self.factors = LandmarkFactors(landmark_map, installation_of(config, landmark_map, landmarks.sees_corners))
         kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
         self.estimator: Estimator = kind(config.estimator, self.factors, keep_all)
         self.weights = Weights(config, self.factors)
         self.counts: Counter[str] = Counter()
         self.rejections: Counter[str] = Counter()
         self.stopwatch = Stopwatch()
-        self.sources = MotionSources(config, wheels, learned, joint, gyro)
+        self.sources = MotionSources(config, wheels, learned, joint, gyro, self.factors)
         self.trust = SourceTrust(config.weights, self.sources, config.wheels.track)
-        self._wheels = wheels
-        self._landmarks = landmarks
-        known = landmark_map.landmarks.values() if landmark_map is not None else ()
-        self._sizes = {landmark.landmark_id: landmark.size_m for landmark in known}
+        self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
         self._suspicion = Suspicion(config, landmark_map, self.estimator, self.weights)
-        self.calibrator = self._suspicion.calibrator
         self._whereabouts = Whereabouts(config, landmark_map, self.factors)
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
@@ -108,7 +105,8 @@ class Localizer:
         with self.stopwatch("motion"):
             readings = self.sources.read(step, blind_s)
         with self.stopwatch("sightings"):
-            sightings = measure_carried(step, self._landmarks, self._wheels, self._sizes)
+            offset_s = self.factors.installation.time_offset(self.factors.believed)
+            sightings = self._compensation.measure(step, offset_s)
         if self._whereabouts.waiting:
             return self._initialize(step, readings, sightings)
         return self._advance(step, readings, sightings)
@@ -169,7 +167,9 @@ class Localizer:
             believed, refused, weighed = self._weigh(k, step, sightings, predicted)
             place = None
             if not believed:
-                contrary = [s.raw for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)]
+                contrary = [
+                    s.measurement for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)
+                ]
                 place = self._whereabouts.search(step, motions, contrary, readings, predicted)
             if place is not None:
                 if not self._whereabouts.holds_given:
@@ -218,7 +218,7 @@ class Localizer:
         self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: Belief
     ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
         """What is believed and refused, with the decisions; nothing against a given first pose that holds."""
-        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted, self._suspicion.calibration)
+        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted)
         believed, refused, decisions = self._whereabouts.hold(*weighed)
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held

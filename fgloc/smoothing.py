@@ -10,24 +10,20 @@ import numpy as np
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.calibration.wheel_gains import calibrate_wheels
-from fgloc.config import LandmarksConfig
 from fgloc.graph.batch import BatchSmoother
+from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.slip_noise import Footing
 from fgloc.localizer import Localizer
-from fgloc.sensors.sighting_calibration import Calibration, calibration_gradient, prior, shifted
 from fgloc.types import (
     Estimate,
     FloatArray,
     IntArray,
     LandmarkMap,
     MotionMeasurement,
-    RangeBearingMeasurement,
     WheelCalibration,
 )
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
-_NUDGE = 0.005  # of log scale, and of radians: finite differences
-_NEWTON_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +34,7 @@ class SmoothedRun:
     landmarks: LandmarkMap | None  # given or estimated
     notes: tuple[str, ...]
     wheels: WheelCalibration | None
+    installation: InstallationBelief
 
 
 def smooth_run(parts: Assembly) -> SmoothedRun:
@@ -59,16 +56,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         for _ in range(config.batch.outer_iterations - 1):
             solver.replace_motions(_measure_again(parts, solver))
     notes = []
-    spread = np.zeros((len(solver.frames), 3, 3))
-    if localizer.calibrator is not None and parts.landmark_map is not None:
-        refined = refine(solver, parts.landmark_map, config.landmarks, localizer.calibrator.calibration)
-        spread = refined.pose_covs
-        scale, offset = np.exp(refined.value[0]), refined.value[1]
-        sigmas = np.sqrt(np.diag(refined.cov))
-        notes.append(
-            f"Sightings calibrated on top of the configuration: ranges x {scale:.4f} ± {sigmas[0]:.4f}, "
-            f"bearings - {offset:.4f} ± {sigmas[1]:.4f} rad."
-        )
     wheels = None
     if config.batch.calibrate_wheels:
         wheels = calibrate_wheels(parts, solver)
@@ -76,13 +63,13 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     result = solver.result()
     estimates = [
         Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov, float(pose[2])), frame.mode)
-        for frame, pose, cov in zip(solver.frames, result.poses, result.covs + spread, strict=True)
+        for frame, pose, cov in zip(solver.frames, result.poses, result.covs, strict=True)
     ]
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
-    return SmoothedRun(estimates, landmarks, tuple(notes), wheels)
+    return SmoothedRun(estimates, landmarks, tuple(notes), wheels, solver.installed())
 
 
 def take_room_back(localizer: Localizer) -> None:
@@ -131,69 +118,3 @@ def smoothed_velocities(stamps_ns: IntArray, poses: FloatArray) -> FloatArray:
     end = se2.interpolate(stamps_ns, poses, after)
     tangents = np.array([se2.log(se2.between(a, b)) for a, b in zip(start, end, strict=True)])
     return np.asarray(tangents[:, [0, 2]] / span[:, None])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Refined:
-    """Calibration of the sightings over the whole run.
-
-    Attributes:
-        value: ``(2,)`` log range scale, bearing offset [rad].
-        cov: ``(2, 2)``.
-        pose_covs: ``(n, 3, 3)`` what the calibration's uncertainty adds to each pose (body frame).
-    """
-
-    value: FloatArray
-    cov: FloatArray
-    pose_covs: FloatArray
-
-
-def refine(solver: BatchSmoother, landmark_map: LandmarkMap, config: LandmarksConfig, online: Calibration) -> Refined:
-    """Newton's method on the cost that is left when the poses have been solved for, by finite differences.
-
-    At the optimum over the poses, the derivative of the whole cost with respect to the calibration is the partial one
-    (envelope theorem). Its differences between nearby calibrations give the Hessian, and the poses' differences how
-    far an error of the calibration moves them.
-    """
-    fixed = config.range_scale_sigma == 0.0, config.bearing_bias_sigma_rad == 0.0
-    free = [i for i in range(2) if not fixed[i]]
-    information = np.linalg.inv(prior(config)[np.ix_(free, free)])
-    value = np.zeros(2)
-
-    def move(to: FloatArray) -> FloatArray:
-        """Solve with this calibration; gradient of the profiled cost."""
-        nonlocal value
-        value = to
-        solver.replace_sightings(lambda raw: shifted(raw, *to) if isinstance(raw, RangeBearingMeasurement) else raw)
-        return gradient()
-
-    def gradient() -> FloatArray:
-        poses, seen = [], []
-        for frame, pose in zip(solver.frames, solver.poses(), strict=True):
-            for sighting in solver.believed[frame.k]:
-                if isinstance(sighting.measurement, RangeBearingMeasurement):
-                    poses.append(pose)
-                    seen.append(sighting.measurement)
-        partial = calibration_gradient(poses, seen, landmark_map, config.cauchy_k)
-        return np.asarray(partial[free] + information @ value[free])
-
-    # 1. Every sighting was corrected by what was known when it was made: take the last word for all
-    here = move(online.value.copy())
-    # 2. Hessian of the profiled cost, and derivative of the poses
-    at, poses = value.copy(), solver.poses()
-    hessian, slopes = np.zeros((len(free), len(free))), []
-    for column, i in enumerate(free):
-        nudged = at.copy()
-        nudged[i] += _NUDGE
-        hessian[:, column] = (move(nudged) - here) / _NUDGE
-        slopes.append([se2.log(se2.between(a, b)) / _NUDGE for a, b in zip(poses, solver.poses(), strict=True)])
-    hessian = 0.5 * (hessian + hessian.T)
-    # 3. Newton, with that Hessian
-    step = here
-    for _ in range(_NEWTON_STEPS):
-        at[free] -= np.linalg.solve(hessian, step)
-        step = move(at.copy())
-    cov = np.zeros((2, 2))
-    cov[np.ix_(free, free)] = np.linalg.inv(hessian)
-    J = np.array(slopes).transpose(1, 2, 0)  # (n, 3, free)
-    return Refined(value, cov, J @ np.linalg.inv(hessian) @ J.transpose(0, 2, 1))

@@ -265,6 +265,8 @@ class Step:
         return (self.stamp_ns - self.start_ns) * 1e-9
 
 
+_AT_REST = np.zeros(3)
+
 # --- Measurements -----------------------------------------------------------------------------------------------------
 
 
@@ -276,7 +278,9 @@ class MotionMeasurement:
     start_ns: int
     stamp_ns: int
     motion: FloatArray  # (3,)
-    cov: FloatArray  # (3, 3)
+    cov: FloatArray  # (3, 3) of what differs from step to step; what is always the same is in `depends_on`
+    # by parameter of the installation: derivative (3,) of the motion (right perturbation), and the value it has in it
+    depends_on: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +301,12 @@ class CornerMeasurement:
     corners_px: FloatArray  # (4, 2)
     sigma_px: float
     camera: Camera  # plumb_bob, whose D explains corners_px
+    twist: FloatArray = field(
+        default_factory=lambda: _AT_REST
+    )  # (3,) of the base at the exposure: m/s, m/s, rad/s, in the keyframe's axes
+    offset_s: float = 0.0  # how late the stamp was taken to be when the sighting was moved to its keyframe
+    jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
+    motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -308,6 +318,8 @@ class RangeBearingMeasurement:
     range_m: float
     bearing_rad: float
     cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    offset_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,6 +330,8 @@ class MarkerPoseMeasurement:
     landmark_id: int
     pose: FloatArray  # (3,)
     cov: FloatArray  # (3, 3)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    offset_s: float = 0.0
 
 
 LandmarkMeasurement = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement

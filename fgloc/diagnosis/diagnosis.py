@@ -139,7 +139,7 @@ class Diagnosis:
         faults = self._faults.constant()
         notes = [*self._clocks(faults, source), *self._first_pose()]
         believable = bool((np.abs(faults.values) < _BELIEVABLE * PRIOR_SIGMAS).all())
-        if self._known is not None and believable and not self._config.landmarks.self_calibrating:
+        if self._known is not None and believable:
             notes += [*self._scales(faults), *self._mounting(faults)]
         return tuple(notes)
 

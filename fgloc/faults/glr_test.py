@@ -42,7 +42,7 @@ class Disagreement:
     def __init__(self, config: WeightsConfig) -> None:
         self._config = config
         self.flagged = False
-        self._steps: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, difference, covariance
+        self._steps: deque[tuple[float, FloatArray, FloatArray, FloatArray]] = deque()  # dt, value, cov, derivative
         self._length_s = 0.0
         self._calm_s = 0.0
 
@@ -52,7 +52,14 @@ class Disagreement:
         self._steps.clear()
         self._length_s = self._calm_s = 0.0
 
-    def judge(self, dt: float, difference: FloatArray, cov: FloatArray) -> Verdict:
+    def judge(
+        self,
+        dt: float,
+        difference: FloatArray,
+        cov: FloatArray,
+        by_installation: FloatArray | None = None,
+        installation_cov: FloatArray | None = None,
+    ) -> Verdict:
         """Take in one step.
 
         Args:
@@ -60,8 +67,12 @@ class Disagreement:
             difference: ``(3,)`` in the body frame. Summed as it is: over a window the body hardly moves by more than a
                 metre, and the position error of a yaw difference over so short a way is small beside the yaw's own.
             cov: ``(3, 3)`` of it if both sources are right.
+            by_installation: ``(3, p)`` its derivative by what is wrong in the same way all the time.
+            installation_cov: ``(p, p)`` of that.
         """
-        self._steps.append((dt, difference, cov))
+        D = np.zeros((3, 0)) if by_installation is None else by_installation
+        self._installation_cov = np.zeros((0, 0)) if installation_cov is None else installation_cov
+        self._steps.append((dt, difference, cov, D))
         self._length_s += dt
         while len(self._steps) > 1 and self._length_s - self._steps[0][0] >= self._config.window_s:
             self._length_s -= self._steps.popleft()[0]
@@ -80,8 +91,10 @@ class Disagreement:
 
     def _worst(self) -> tuple[float, int]:
         """NIS of the least likely window that ends now, and the number of its steps."""
-        differences = np.cumsum([d for _, d, _ in reversed(self._steps)], axis=0)
-        covs = np.cumsum([S for _, _, S in reversed(self._steps)], axis=0)
+        differences = np.cumsum([d for _, d, _, _ in reversed(self._steps)], axis=0)
+        covs = np.cumsum([S for _, _, S, _ in reversed(self._steps)], axis=0)
+        D = np.cumsum([D for _, _, _, D in reversed(self._steps)], axis=0)
+        covs = covs + D @ self._installation_cov @ D.transpose(0, 2, 1)
         nis = np.einsum("ni,ni->n", differences, np.linalg.solve(covs, differences[:, :, None])[:, :, 0])
         worst = int(np.argmax(nis))
         return float(nis[worst]), worst + 1
@@ -89,8 +102,9 @@ class Disagreement:
     def _newest_nis(self) -> float:
         """NIS of the newest steps, as many as the release takes."""
         d, S, length = np.zeros(3), np.zeros((3, 3)), 0.0
-        for dt, difference, cov in reversed(self._steps):
-            d, S, length = d + difference, S + cov, length + dt
+        D = np.zeros_like(self._steps[-1][3])
+        for dt, difference, cov, derivative in reversed(self._steps):
+            d, S, D, length = d + difference, S + cov, D + derivative, length + dt
             if length >= self._config.release_s:
                 break
-        return float(d @ np.linalg.solve(S, d))
+        return float(d @ np.linalg.solve(S + D @ self._installation_cov @ D.T, d))

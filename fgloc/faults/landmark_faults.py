@@ -9,11 +9,11 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.estimator import Estimator, fuse
+from fgloc.graph.estimator import Estimator
 from fgloc.graph.gating import Weights
+from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.moved_landmark_glr import Accusation, Suspects
-from fgloc.sensors.sighting_calibration import Calibration, Calibrator
 from fgloc.types import Decision, FloatArray, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 _MOST_BEACONS = 500  # one filter each: with more of them a step takes too long
@@ -26,32 +26,20 @@ class Suspicion:
     Beacons are landmarks without a size. A marker's corners or pose are precise enough for the gate to refuse a moved
     one: see `fgloc.graph.moved_landmark_votes`.
 
-    Attributes:
-        calibrator: of range scale and bearing offset; None if they are not estimated.
     """
 
     def __init__(
         self, config: Config, landmark_map: LandmarkMap | None, estimator: Estimator, weights: Weights
     ) -> None:
-        self.calibrator: Calibrator | None = None
         self._suspects: Suspects | None = None
-        if landmark_map is not None and config.landmarks.self_calibrating:
-            self.calibrator = Calibrator(config.landmarks, landmark_map)
         landmarks = () if landmark_map is None else landmark_map.landmarks.values()
         beacons = not any(m.size_m for m in landmarks) and len(landmarks) <= _MOST_BEACONS
         if landmark_map is not None and beacons and config.weights.adaptive:
             self._suspects = Suspects(landmark_map, config.landmarks.repeat_s)
         self._estimator, self._weights = estimator, weights
 
-    @property
-    def calibration(self) -> Calibration | None:
-        """What is known of the sensor's errors now."""
-        return None if self.calibrator is None else self.calibrator.calibration
-
     def start(self, prior: Belief, believed: Sequence[Sighting]) -> None:
         """A first pose, and the sightings at it."""
-        if self.calibrator is not None:
-            self.calibrator.start(prior.pose, prior.cov)
         self._begin(prior)
         if self._suspects is not None:
             self._suspects.step(np.zeros(3), np.zeros((3, 3)), self._beacons(believed))
@@ -69,8 +57,6 @@ class Suspicion:
         The accused goes to quarantine, and the estimate to where it is without it.
         """
         motion, cov = fuse(motions)
-        if self.calibrator is not None:
-            self.calibrator.step(motion, cov, [s.raw for s in believed])
         if self._suspects is None:
             return []
         beacons = self._beacons([*believed, *refused])
@@ -95,9 +81,10 @@ class Suspicion:
             return
         value, cov = np.zeros(2), np.zeros((5, 5))
         cov[:3, :3] = belief.cov
-        if self.calibrator is not None:
-            known = self.calibrator.calibration
-            value, cov[3:, 3:] = known.value, known.cov
+        installation, known = self._estimator.installation, self._estimator.installed
+        if "sightings" in installation.blocks:
+            first = installation.blocks["sightings"][0]
+            value, cov[3:, 3:] = known.mean[first : first + 2], known.cov[first : first + 2, first : first + 2]
         self._suspects.start(belief.pose, value, cov)
 
     def _astray(self, belief: Belief) -> bool:
@@ -110,8 +97,6 @@ class Suspicion:
         assert self._suspects is not None
         self._weights.quarantine.accuse(accused.landmark_id, accused.displacement)
         self._estimator.correct(Belief(accused.pose, accused.cov[:3, :3]), accused.landmark_id)
-        if self.calibrator is not None:
-            self.calibrator.take(accused.pose, accused.calibration, accused.cov)
         self._suspects.start(accused.pose, accused.calibration, accused.cov)
         nis = accused.evidence
         return Decision(k, stamp_ns, "place", accused.landmark_id, math.sqrt(nis), nis, 2, 1.0, "landmark_moved")

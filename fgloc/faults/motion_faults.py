@@ -88,7 +88,9 @@ class SourceTrust:
         if difference is None:
             return self._unwitnessed(step.dt, readings, off)
         self._unwitnessed_s = 0.0
-        verdict = self._disagreement.judge(step.dt, *difference)
+        verdict = self._disagreement.judge(
+            step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
+        )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
             self._arbiter.reset()

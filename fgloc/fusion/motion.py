@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Belief, Keyframe
 from fgloc.graph.slip_noise import Footing
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro import Gyro, Turn
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import FloatArray, MotionMeasurement, Readings, Step
 
@@ -23,6 +23,33 @@ _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motio
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
+
+
+_OF_MOTION = (
+    "wheels.radius",
+    "wheels.track",
+    "wheels.yaw_per_m",
+    "learned.scale",
+    "gyro.scale",
+    "gyro.time_offset_s",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Difference:
+    """Of two motion sources over a step, in the body frame.
+
+    Attributes:
+        value: ``(3,)``.
+        cov: ``(3, 3)`` if both are right, of what differs from step to step.
+        by_installation: ``(3, p)`` derivative by the parameters of the sources, whose error is always the same ...
+        installation_cov: ... and their covariance ``(p, p)``.
+    """
+
+    value: FloatArray
+    cov: FloatArray
+    by_installation: FloatArray
+    installation_cov: FloatArray
 
 
 class MotionSources:
@@ -35,6 +62,7 @@ class MotionSources:
         learned: LearnedMotion | None = None,
         joint: JointCalibration | None = None,
         gyro: Gyro | None = None,
+        factors: LandmarkFactors | None = None,
     ) -> None:
         """Take the sources.
 
@@ -44,14 +72,16 @@ class MotionSources:
             learned: the learned motion, if any.
             joint: its correlation with the wheels; None: the two are taken as independent.
             gyro: the gyro, if any.
+            factors: hold what is known of the installation; None: motions are taken as they are reported.
         """
         self._config = config
+        self._factors = LandmarkFactors(None) if factors is None else factors
         self._wheels = wheels
         self._learned = learned
         self._joint = joint
         self.gyro = gyro
+        self._turn: Turn | None = None  # what the gyro says of the step that was read last
         self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
-        self._way_m = self._turn_rad = 0.0  # what the wheels have told since the last fix
 
     @property
     def gyro_is_read(self) -> bool:
@@ -68,32 +98,45 @@ class MotionSources:
         """
         if step.dt <= 0.0:
             return Readings()
-        wheels = self._with_systematic_error(self._wheels.measure(step))
+        wheels = self._installed(self._wheels.measure(step))
         motion = np.zeros(3) if wheels is None else wheels.motion
-        gyro = None
+        gyro = self._turn = None
         if self.gyro is not None:
             turn = self.gyro.measure(step, None if wheels is None or _told_to_move(step) else motion, blind_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
+                gyro = self._installed(gyro, turn)
+                self._turn = turn
         readings = Readings(wheels, self._measure_learned(step, velocity), gyro)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
 
-    def _with_systematic_error(self, m: MotionMeasurement | None) -> MotionMeasurement | None:
-        """Add what a wrong radius or track adds: the same error all along, so that its sigma grows with the way.
+    def _installed(self, m: MotionMeasurement | None, turn: Turn | None = None) -> MotionMeasurement | None:
+        """The motion with the installation as it is known now, and its derivatives by it.
 
-        As with the bias of the gyro, a step gets the growth of the variance since the last fix.
+        Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
+        extrinsics using pre-integration" (differential drive); the right Jacobian of SE(2) to first order.
         """
         if m is None:
             return None
-        config = self._config.wheels
-        way, turn = math.hypot(m.motion[0], m.motion[1]), abs(float(m.motion[2]))
-        forth = (self._way_m + way) ** 2 - self._way_m**2
-        around = (self._turn_rad + turn) ** 2 - self._turn_rad**2
-        yaw = config.yaw_per_m_sigma**2 * forth + config.turn_scale_sigma**2 * around
-        return replace(m, cov=m.cov + np.diag([config.scale_sigma**2 * forth, 0.0, yaw]))
+        rho_x, rho_y, phi = se2.log(m.motion)
+        by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
+        derivatives: dict[str, FloatArray] = {}
+        if m.source == "wheels":
+            derivatives["wheels.radius"] = np.array([rho_x, rho_y, phi])
+            derivatives["wheels.track"] = -phi * by_turn
+            derivatives["wheels.yaw_per_m"] = rho_x * by_turn
+        if m.source == "learned":
+            derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
+        if turn is not None:
+            derivatives["gyro.scale"] = phi * by_turn
+            derivatives["gyro.time_offset_s"] = turn.change * by_turn
+        index, mean = self._factors.installation.index, self._factors.believed.mean
+        kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
+        correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
+        return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
 
     def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -102,7 +145,8 @@ class MotionSources:
     def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
         if self._learned is None:
             return None
-        return self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        m = self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        return self._installed(m, self._turn if self.gyro_is_read else None)
 
     def combine(
         self, readings: Readings, off: Mapping[str, str] | None = None, footing: Footing | None = None
@@ -148,26 +192,39 @@ class MotionSources:
         made = self.combine(readings or frame.readings, frame.off, frame.footing)
         return [worsened(m, frame.scale, frame.doubt) for m in made]
 
-    def disagreement(self, readings: Readings) -> tuple[FloatArray, FloatArray] | None:
+    def disagreement(self, readings: Readings) -> Difference | None:
         """How far the wheels and the sources that witness their slip are apart over the step.
 
         Returns:
-            Difference ``(3,)`` in the body frame and the covariance ``(3, 3)`` that it has if both are right; None
-            where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand in
-            for wheels.
+            None where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand
+            in for wheels.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
         if wheels is None or self._wheels.stands_in:
             return None
         if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
             d = se2.log(se2.between(wheels.motion, learned.motion))
-            if self._joint is None:
-                return d, wheels.cov + learned.cov
-            return d, self._joint.difference_cov(wheels.cov, learned.cov)
+            cov = wheels.cov + learned.cov
+            if self._joint is not None:
+                cov = self._joint.difference_cov(wheels.cov, learned.cov)
+            return Difference(d, cov, *self._systematic(wheels, learned))
         if gyro is None:
             return None
         d = np.array([0.0, 0.0, se2.wrap(float(gyro.motion[2] - wheels.motion[2]))])
-        return d, np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
+        cov = np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
+        return Difference(d, cov, *self._systematic(wheels, gyro))
+
+    def _systematic(self, a: MotionMeasurement, b: MotionMeasurement) -> tuple[FloatArray, FloatArray]:
+        """Derivative ``(3, p)`` of ``b`` less ``a`` by the parameters of the sources, and their covariance."""
+        index = self._factors.installation.index
+        names = [name for name in _OF_MOTION if name in index]
+        D = np.zeros((3, len(names)))
+        for i, name in enumerate(names):
+            for m, sign in ((a, -1.0), (b, 1.0)):
+                if name in m.depends_on:
+                    D[:, i] += sign * m.depends_on[name][0]
+        rows = [index[name] for name in names]
+        return D, self._factors.believed.cov[np.ix_(rows, rows)]
 
     def unknown(self, step: Step) -> MotionMeasurement:
         """Nothing spoke: sigma grows with the time of silence, however many steps it is cut into."""
@@ -185,10 +242,7 @@ class MotionSources:
             fix: where sightings have it now; None if there were none.
         """
         if fix is not None:
-            self._silent_s = self._way_m = self._turn_rad = 0.0
-        elif readings.wheels is not None:
-            self._way_m += math.hypot(*readings.wheels.motion[:2])
-            self._turn_rad += abs(float(readings.wheels.motion[2]))
+            self._silent_s = 0.0
         if self.gyro is None:
             return
         if readings.gyro is None:
@@ -201,7 +255,7 @@ class MotionSources:
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
-        self._silent_s = self._way_m = self._turn_rad = 0.0
+        self._silent_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import TypeVar
 
 import gtsam
@@ -15,16 +16,23 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
-from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
+from fgloc.graph.factors import (
+    INSTALLATION,
+    LandmarkFactors,
+    installed_motion_factor,
+    landmark_key,
+    pose_key,
+    prior_factor,
+    sighting_factors,
+)
 from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
+from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.pose_fit import chi2_bound
+from fgloc.graph.pose_fit import chi2_bound, robust_weight
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
-    LandmarkMeasurement,
     MarkerPoseMeasurement,
     MotionMeasurement,
     RangeBearingMeasurement,
@@ -32,6 +40,10 @@ from fgloc.types import (
 
 _T = TypeVar("_T")
 _DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
+_LINEARIZATIONS = 6
+_STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
+_STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
+_DECISIONS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,8 +61,8 @@ class Smoothed:
 class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
-    The first solution holds every sighting, also those the online gate refused, under its robust kernel; then those
-    that the smoothed trajectory finds less likely than ``1 - gate_probability`` are left out. With ``config.robust``
+    The first solution holds what was believed online; then every sighting is looked at again, and those that the
+    smoothed trajectory finds less likely than ``1 - gate_probability`` are left out. With ``config.robust``
     graduated non-convexity decides instead, over sightings and motions at once.
 
     Attributes:
@@ -77,32 +89,67 @@ class BatchSmoother:
             raise EstimatorError("nothing to smooth: no keyframe was made; see the notes and the rejections of the run")
         self._factors = factors
         self._config = config
-        self.believed: dict[int, tuple[Sighting, ...]] = {}
+        self._probability = gate_probability
+        self._moved = moved
         self.outliers: dict[int, frozenset[str]] = {}
-        seen = {
-            frame.k: tuple(s for s in _of_others((*frame.sightings, *frame.refused), moved) if self._in_front(s, frame))
-            for frame in self.frames
-        }
-        try:
-            self._begin(seen, gate_probability)
-        except RuntimeError:  # a trial step took the camera past a marker that the online gate had refused, rightly
-            self._begin({frame.k: _of_others(frame.sightings, moved) for frame in self.frames}, gate_probability)
-
-    def _begin(self, sightings: dict[int, tuple[Sighting, ...]], probability: float) -> None:
-        """Solve with all of these, decide which of them are believed, and solve again."""
-        self.believed = sightings
+        self.believed = {frame.k: _of_others(frame.sightings, moved) for frame in self.frames}
         self._values = _initial(self.frames, self.believed, self._factors)
-        self._graph = self._optimize()
-        if self._config.robust == "none":
-            self.believed = {
-                k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(probability, _dof(s)))
-                for k, held in self.believed.items()
-            }
+        self._optimize()
+        if self._config.robust != "none":
+            self._graduate()
+            self._optimize()
+        elif factors.known:
+            self._decide()
         else:
-            self._graduate(probability)
-        self._graph = self._optimize()
+            self._leave_out_unlikely()
 
-    def _graduate(self, probability: float) -> None:
+    def _decide(self) -> None:
+        """Look again at every sighting, the refused ones too, from the smoothed trajectory, until nothing changes."""
+        for _ in range(_DECISIONS):
+            before = {k: {id(s.measurement) for s in held} for k, held in self.believed.items()}
+            self.believed = self._judged()
+            changed = {k for k, held in self.believed.items() if {id(s.measurement) for s in held} != before[k]}
+            self._optimize()
+            if not changed:
+                break
+
+    def _judged(self) -> dict[int, tuple[Sighting, ...]]:
+        """All sightings that the solution finds likely enough, with their robust weights."""
+        seen = [
+            (frame.k, pose, s)
+            for frame, pose in zip(self.frames, self.poses(), strict=True)
+            for s in _of_others((*frame.sightings, *frame.refused), self._moved)
+        ]
+        kept: dict[int, tuple[Sighting, ...]] = {frame.k: () for frame in self.frames}
+        if not seen:
+            return kept
+        observed = self._factors.observe([s.measurement for _, _, s in seen])
+        lines = observed.linearize(np.array([pose for _, pose, _ in seen]), self._theta())
+        held = {id(s.measurement) for sightings in self.believed.values() for s in sightings}
+        marginals = None
+        for (k, _, s), one in zip(seen, lines, strict=True):
+            if one.behind:
+                continue
+            cov, dof = one.noise(), len(one.residual)
+            bound = chi2_bound(self._probability, dof)
+            nis = float(one.residual @ np.linalg.solve(cov, one.residual))
+            if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
+                marginals = marginals or _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+                cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
+                nis = float(one.residual @ np.linalg.solve(cov, one.residual))
+            if nis <= bound:
+                kept[k] = (*kept[k], replace(s, weight=robust_weight(nis, dof)))
+        return kept
+
+    def _leave_out_unlikely(self) -> None:
+        """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""
+        self.believed = {
+            k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(self._probability, _dof(s)))
+            for k, held in self.believed.items()
+        }
+        self._optimize()
+
+    def _graduate(self) -> None:
         """Decide by graduated non-convexity which sightings and motions are believed.
 
         The online estimator's own doubts stay: a source that it switched off is not in the log's motions.
@@ -112,20 +159,24 @@ class BatchSmoother:
         motions: list[tuple[int, str]] = []
         sightings: list[tuple[int, Sighting]] = []
         candidates: list[Candidate] = []
-        for frame in self.frames:
-            if frame.prior is not None:
-                inliers.add(prior_factor(frame.k, frame.prior.pose, frame.prior.cov))
+        for factor in self._priors():
+            inliers.add(factor)
+        poses = self.poses()
+        for i, frame in enumerate(self.frames):
             for m in frame.motions:
+                factor = installed_motion_factor(frame.k, m, poses[i - 1], self._factors.installation)
                 if sources is not None and m.source not in sources:
-                    inliers.add(motion_factor(frame.k, m))
+                    inliers.add(factor)
                     continue
                 motions.append((frame.k, m.source))
-                candidates.append(Candidate((motion_factor(frame.k, m),), chi2_bound(probability, 3)))
-        for k, held in self.believed.items():
-            for sighting in held:
-                factors = tuple(self._factors.make(k, sighting.measurement, None))
-                sightings.append((k, sighting))
-                candidates.append(Candidate(factors, chi2_bound(probability, _dof(sighting))))
+                candidates.append(Candidate((factor,), chi2_bound(self._probability, 3)))
+        for frame, pose in zip(self.frames, poses, strict=True):
+            for s in _of_others((*frame.sightings, *frame.refused), self._moved):
+                made = tuple(self._sighting_factors([(frame.k, pose, s)]))
+                if made:
+                    sightings.append((frame.k, s))
+                    dof = sum(factor.dim() for factor in made)
+                    candidates.append(Candidate(made, chi2_bound(self._probability, dof)))
         weights, self._values = graduate(inliers, candidates, self._values, self._solve)
         trusted = (weights >= 0.5).tolist()
         doubted = [key for key, good in zip(motions, trusted, strict=False) if not good]
@@ -134,10 +185,6 @@ class BatchSmoother:
         for (k, sighting), good in zip(sightings, trusted[len(motions) :], strict=True):
             if good:
                 self.believed[k] = (*self.believed[k], sighting)
-
-    def _in_front(self, sighting: Sighting, frame: Keyframe) -> bool:
-        m = sighting.measurement
-        return not isinstance(m, CornerMeasurement) or self._factors.depth(m, frame.belief.pose) > MIN_DEPTH_M
 
     def stamps_ns(self) -> IntArray:
         """Times of the keyframes ``(n,)``."""
@@ -152,15 +199,15 @@ class BatchSmoother:
         for frame in self.frames:
             frame.motions = motions.get(frame.k, frame.motions)
         self.outliers = {k: held for k, held in self.outliers.items() if k not in motions}
-        self._graph = self._optimize()
+        self._optimize()
 
-    def replace_sightings(self, change: Callable[[LandmarkMeasurement], LandmarkMeasurement]) -> None:
-        """Derive every believed sighting anew from its raw one, and solve again from the last solution."""
-        self.believed = {
-            k: tuple(self._factors.sighting(k, change(s.raw), s.cauchy_k, s.raw) for s in sightings)
-            for k, sightings in self.believed.items()
-        }
-        self._graph = self._optimize()
+    def installed(self) -> InstallationBelief:
+        """The installation that the last solution has found."""
+        n = len(self._factors.installation)
+        if not n:
+            return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
+        marginals = _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+        return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.
@@ -186,13 +233,63 @@ class BatchSmoother:
             error=self._graph.error(self._values),
         )
 
-    def _optimize(self) -> gtsam.NonlinearFactorGraph:
-        graph = _graph(self.frames, self.believed, self.outliers)
-        values = self._solve(graph, _without_orphans(self._values, graph))
-        if not np.isfinite(graph.error(values)):
-            raise EstimatorError("the batch optimum is not finite; look at steps.csv for the sighting that broke it")
-        self._values = values
+    def _theta(self) -> FloatArray:
+        n = len(self._factors.installation)
+        return np.asarray(self._values.atVector(INSTALLATION)) if n else np.zeros(0)
+
+    def _optimize(self) -> None:
+        """Linearize the sightings anew and solve, until poses and installation stay where they are."""
+        for _ in range(_LINEARIZATIONS):
+            poses, theta = self.poses(), self._theta()
+            graph = self._linearized()
+            values = self._solve(graph, _without_orphans(self._values, graph))
+            if not np.isfinite(graph.error(values)):
+                raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
+            self._values, self._graph = values, graph
+            moved = np.abs(self.poses() - poses)
+            moved[:, 2] = np.abs(se2.wrap_array(moved[:, 2]))
+            still = bool((moved < _STILL).all())
+            if still and (np.abs(self._theta() - theta) < _STILL_SIGMAS * self._factors.installation.sigmas).all():
+                break
+
+    def _linearized(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self._priors():
+            graph.add(factor)
+        poses = self.poses()
+        seen = []
+        for i, frame in enumerate(self.frames):
+            for motion in frame.motions:
+                if motion.source in self.outliers.get(frame.k, ()):
+                    motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
+                graph.add(installed_motion_factor(frame.k, motion, poses[i - 1], self._factors.installation))
+            seen += [(frame.k, poses[i], s) for s in self.believed[frame.k]]
+        for factor in self._sighting_factors(seen):
+            graph.add(factor)
         return graph
+
+    def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
+        installation = self._factors.installation
+        if len(installation):
+            prior = installation.prior()
+            yield gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))
+        for frame in self.frames:
+            if frame.prior is not None:
+                yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
+
+    def _sighting_factors(self, seen: Sequence[tuple[int, FloatArray, Sighting]]) -> Iterator[gtsam.NonlinearFactor]:
+        """Of sightings with their keyframes and poses, keyframes in order."""
+        if not self._factors.known or not seen:
+            for _, _, s in seen:
+                yield from s.factors
+            return
+        theta = self._theta()
+        observed = self._factors.observe([s.measurement for _, _, s in seen])
+        lines = observed.linearize(np.array([pose for _, pose, _ in seen]), theta)
+        for k, group in groupby(zip(seen, lines, strict=True), key=lambda item: item[0][0]):
+            kept = [(pose, s, one) for (_, pose, s), one in group if not one.behind]
+            if kept:
+                yield from sighting_factors(k, [s for _, s, _ in kept], [one for _, _, one in kept], kept[0][0], theta)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         params = gtsam.LevenbergMarquardtParams()
@@ -230,29 +327,14 @@ def _dof(sighting: Sighting) -> int:
     return sum(factor.dim() for factor in sighting.factors)
 
 
-def _graph(
-    frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]], outliers: Mapping[int, frozenset[str]]
-) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for frame in frames:
-        if frame.prior is not None:
-            graph.add(prior_factor(frame.k, frame.prior.pose, frame.prior.cov))
-        for motion in frame.motions:
-            if motion.source in outliers.get(frame.k, ()):
-                motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
-            graph.add(motion_factor(frame.k, motion))
-        for sighting in believed[frame.k]:
-            for factor in sighting.factors:
-                graph.add(factor)
-    return graph
-
-
 def _initial(
     frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
     values = gtsam.Values()
     for frame in frames:
         values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
+    if len(factors.installation):
+        values.insert(INSTALLATION, factors.believed.mean)
     if factors.known:
         return values
     seen: dict[int, list[FloatArray]] = {}

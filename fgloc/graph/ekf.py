@@ -1,27 +1,24 @@
-"""The extended Kalman filter, to compare with: the pose alone, one linear update a step, nothing ever revised."""
+"""The extended Kalman filter, to compare with: pose and installation alone, nothing ever revised."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
-import numpy as np
-
-from fgloc import se2
 from fgloc.config import EstimatorConfig
 from fgloc.errors import ConfigError
 from fgloc.graph.estimator import Estimator
-from fgloc.graph.factors import LandmarkFactors, pose_key, whitened
-from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import correct
+from fgloc.graph.measurement_log import Keyframe
 
 
 class ExtendedKalmanFilter(Estimator):
-    """Predicts by the fused motion and corrects by all believed sightings at once, linearized at the prediction.
+    """Predicts by the fused motion and corrects by all believed sightings at once.
 
     It is given the measurements of the fixed-lag smoother, after the same χ² gates. What a filter lacks remains: no
-    relinearization, no robust kernels, and no sighting changes an older pose. Its log serves the batch smoother.
+    sighting changes an older pose. Its log serves the batch smoother.
 
-    Source: Thrun, Burgard, Fox, Probabilistic Robotics, table 7.2; on SE(2) with a right perturbation.
+    Source: Thrun, Burgard, Fox, Probabilistic Robotics, table 7.2; on SE(2) with a right perturbation, iterated.
     """
 
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
@@ -38,21 +35,14 @@ class ExtendedKalmanFilter(Estimator):
         super().__init__(config, factors, keep_all)
 
     def _solve(self, frame: Keyframe) -> None:
-        if not frame.sightings:
-            return
-        # 1. Linearize
-        values = gtsam.Values()
-        values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
-        rows = [whitened(s.factors, values, s.cauchy_k) for s in frame.sightings]
-        residual, H = np.concatenate([r for r, _ in rows]), np.vstack([J for _, J in rows])
-        # 2. Correct; residuals are whitened: their noise is the identity
-        P = frame.belief.cov
-        S = H @ P @ H.T + np.eye(len(residual))
-        K = np.linalg.solve(S, H @ P).T
-        pose = se2.compose(frame.belief.pose, se2.exp(-K @ residual))
-        # 3. Joseph's form stays positive definite
-        left = np.eye(3) - K @ H
-        frame.belief = Belief(pose, left @ P @ left.T + K @ K.T)
+        known = frame.belief.installation or self.installed
+        if frame.sightings:
+            measurements = [s.measurement for s in frame.sightings]
+            corrected = correct(frame.belief, known, measurements, self._factors, [s.weight for s in frame.sightings])
+            if corrected is not None:
+                frame.belief = corrected[0]
+        if frame.belief.installation is None:
+            frame.belief.installation = known
 
     def _begin_at(self, newest: Keyframe) -> None:
         """A filter holds nothing else."""

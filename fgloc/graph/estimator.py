@@ -6,14 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from fgloc import se2
 from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.joint import predict, widened
 from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
-from fgloc.types import FloatArray, MotionMeasurement
+from fgloc.types import MotionMeasurement
 
 
 class Estimator(ABC):
@@ -28,7 +27,7 @@ class Estimator(ABC):
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
         self._config = config
         self._factors = factors
-        self.log = MeasurementLog(None if keep_all or config.kind == "isam2" else config.lag_s)
+        self.log = MeasurementLog(config.lag_s, keep_all or config.kind == "isam2")
         self.rebuilt = 0
         self.belief: Belief | None = None
         self._k = -1
@@ -39,6 +38,16 @@ class Estimator(ABC):
     def elapsed_s(self) -> float:
         """The estimator's own time: runs on through clock jumps."""
         return self._elapsed_s
+
+    @property
+    def installation(self) -> Installation:
+        """The parameters beside the pose."""
+        return self._factors.installation
+
+    @property
+    def installed(self) -> InstallationBelief:
+        """What is known of the installation now."""
+        return self._factors.believed
 
     @property
     def k(self) -> int:
@@ -60,8 +69,7 @@ class Estimator(ABC):
         """
         if self.belief is None or not motions:
             raise EstimatorError("predict needs a started estimator and at least one motion measurement")
-        motion, cov = fuse(motions)
-        return Belief(se2.compose(self.belief.pose, motion), se2.compose_cov(self.belief.cov, motion, cov))
+        return predict(self.belief, self.installed, self._factors.installation, motions)
 
     def update(
         self,
@@ -99,7 +107,7 @@ class Estimator(ABC):
             self.log.keyframes[k].motions = tuple(changed)
         if motions and self.belief is not None:
             self._solve_again(sorted(motions))
-            self.belief = self.log.keyframes[self._k].belief
+            self._adopt(self.log.keyframes[self._k].belief)
 
     def inflate(self, since_s: float, scale: float) -> None:
         """Scale the covariances of all motions that ended after a time, and of the beliefs they led to.
@@ -113,9 +121,9 @@ class Estimator(ABC):
             frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
             frame.scale *= scale
             frame.doubt = None if frame.doubt is None else frame.doubt * scale
-            frame.belief = Belief(frame.belief.pose, frame.belief.cov * scale)
+            frame.belief = widened(frame.belief, scale)
         self._build_again([frame.k for frame in inside])
-        self.belief = self.log.keyframes[self._k].belief
+        self._adopt(self.log.keyframes[self._k].belief)
 
     def correct(self, belief: Belief, landmark_id: int) -> None:
         """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
@@ -127,7 +135,7 @@ class Estimator(ABC):
         newest = self.log.keyframes[self._k]
         newest.belief, self._corrected = belief, self._k
         self._begin_at(newest)
-        self.belief = newest.belief
+        self._adopt(newest.belief)
 
     @abstractmethod
     def _begin_at(self, newest: Keyframe) -> None:
@@ -140,8 +148,13 @@ class Estimator(ABC):
     def _take(self, frame: Keyframe) -> Belief:
         self._solve(frame)
         self.log.append(frame)
-        self.belief = frame.belief
+        self._adopt(frame.belief)
         return frame.belief
+
+    def _adopt(self, belief: Belief) -> None:
+        self.belief = belief
+        if belief.installation is not None:
+            self._factors.believed = belief.installation
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
@@ -149,29 +162,10 @@ class Estimator(ABC):
             before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
             if before is None or frame.prior is not None:
                 continue
-            motion, cov = fuse(frame.motions)
-            pose = se2.compose(before.belief.pose, motion)
-            frame.belief = Belief(pose, se2.compose_cov(before.belief.cov, motion, cov))
+            known = before.belief.installation or self.installed
+            frame.belief = predict(before.belief, known, self._factors.installation, frame.motions)
             self._solve(frame)
 
     @abstractmethod
     def _solve(self, frame: Keyframe) -> None:
         """Replace the belief of a keyframe, which is its prior or its prediction, by the filtered one."""
-
-
-def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
-    """One motion ``(3,)`` and covariance ``(3, 3)`` out of independent ones over the same interval.
-
-    First order: the mean of the logarithms about the first motion, weighted by information.
-    """
-    first = motions[0]
-    if len(motions) == 1:
-        return first.motion, first.cov
-    information = np.linalg.inv(first.cov)
-    pull = np.zeros(3)
-    for m in motions[1:]:
-        weight = np.linalg.inv(m.cov)
-        information = information + weight
-        pull += weight @ se2.log(se2.between(first.motion, m.motion))
-    cov = np.linalg.inv(information)
-    return se2.compose(first.motion, se2.exp(cov @ pull)), 0.5 * (cov + cov.T)

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
-from fgloc.graph.measurement_log import Sighting
+from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations
 from fgloc.types import (
-    Camera,
     CornerMeasurement,
     FloatArray,
     Landmark,
@@ -36,7 +39,6 @@ _KERNELS = {
 }
 _MOST_LOOKALIKES = 10
 _LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
-MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
 def pose_key(k: int) -> int:
@@ -68,6 +70,113 @@ def robust(noise: gtsam.noiseModel.Base, cauchy_k: float | None) -> gtsam.noiseM
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_k), noise)
 
 
+INSTALLATION = int(gtsam.symbol("i", 0))
+"""Key of the installation state: one vector."""
+
+
+def installed_motion_factor(
+    k: int, m: MotionMeasurement, before: FloatArray, installation: Installation
+) -> gtsam.NonlinearFactor:
+    """Between-factor from keyframe k - 1 to k and the parameters that the motion depends on.
+
+    Linear about a pose ``before`` (3,) of keyframe k - 1 and the one that the motion leads to. Of two perturbations
+    that move both poses alike the residual sees nothing, so that it holds far from there.
+    """
+    W = _whitening(m.cov)
+    values = gtsam.Values()
+    values.insert(pose_key(k - 1), gtsam.Pose2(*before))
+    values.insert(pose_key(k), gtsam.Pose2(*se2.compose(before, m.motion)))
+    blocks = {pose_key(k - 1): -W @ se2.adjoint(se2.inverse(m.motion)), pose_key(k): W}
+    columns = {installation.index[name]: c for name, c in m.depends_on.items() if name in installation.index}
+    residual = np.zeros(3)
+    if columns:
+        values.insert(INSTALLATION, np.zeros(len(installation)))
+        H = np.zeros((3, len(installation)))
+        for i, (derivative, assumed) in columns.items():
+            H[:, i] = -W @ derivative
+            residual -= H[:, i] * assumed
+        blocks[INSTALLATION] = H
+    return linear_factor(blocks, residual, values)
+
+
+def installed_prior_factor(k: int, prior: Belief, belief: InstallationBelief) -> list[gtsam.NonlinearFactor]:
+    """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone."""
+    known = prior.installation or belief
+    values = gtsam.Values()
+    values.insert(pose_key(k), gtsam.Pose2(*prior.pose))
+    values.insert(INSTALLATION, known.mean)
+    n = len(known.mean)
+    cov = np.zeros((3 + n, 3 + n))
+    cov[:3, :3], cov[3:, 3:] = prior.cov, known.cov
+    if prior.cross is not None:
+        cov[:3, 3:], cov[3:, :3] = prior.cross, prior.cross.T
+    W = _whitening(cov)
+    return [linear_factor({pose_key(k): W[:, :3], INSTALLATION: W[:, 3:]}, np.zeros(3 + n), values)]
+
+
+def sighting_factors(
+    k: int, sightings: Sequence[Sighting], lines: Sequence[Linearized], pose: FloatArray, theta: FloatArray
+) -> list[gtsam.NonlinearFactor]:
+    """One factor for all sightings of one image, linear about a pose and an installation.
+
+    Args:
+        k: keyframe.
+        sightings: with their robust weights.
+        lines: the same, linearized there.
+        pose: ``(3,)``.
+        theta: ``(n,)``.
+    """
+    values = gtsam.Values()
+    values.insert(pose_key(k), gtsam.Pose2(*pose))
+    if len(theta):
+        values.insert(INSTALLATION, theta)
+    images: dict[int, list[int]] = {}
+    for i, sighting in enumerate(sightings):
+        images.setdefault(sighting.measurement.stamp_ns, []).append(i)
+    made = []
+    for members in images.values():
+        r, J, H, cov = stacked([lines[i] for i in members], len(theta), [sightings[i].weight for i in members])
+        W = _whitening(cov)
+        blocks = {pose_key(k): W @ J}
+        if len(theta):
+            blocks[INSTALLATION] = W @ H
+        made.append(linear_factor(blocks, W @ r, values))
+    return made
+
+
+def stacked(
+    lines: Sequence[Linearized], n: int, weights: Sequence[float] | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residual ``(d,)``, Jacobians ``(d, 3)`` and ``(d, n)``, noise covariance ``(d, d)`` of sightings of one image."""
+    r = np.concatenate([one.residual for one in lines])
+    J = np.vstack([one.J for one in lines])
+    H, spread = np.zeros((len(r), n)), np.ones(len(r))
+    row, most = 0, max(one.shared.shape[1] for one in lines)
+    shared = np.zeros((len(r), most))
+    for i, one in enumerate(lines):
+        d = len(one.residual)
+        H[row : row + d, one.columns] = one.H
+        shared[row : row + d, : one.shared.shape[1]] = one.shared
+        if weights is not None:
+            spread[row : row + d] = 1.0 / weights[i]
+        row += d
+    return r, J, H, np.diag(spread) + shared @ shared.T
+
+
+def _whitening(cov: FloatArray) -> FloatArray:
+    """W with ``Wᵀ W`` the inverse of a covariance.
+
+    Raises:
+        CovarianceError: it is none.
+    """
+    try:
+        if not np.isfinite(cov).all():
+            raise np.linalg.LinAlgError("not finite")
+        return np.asarray(solve_triangular(np.linalg.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False))
+    except np.linalg.LinAlgError as error:
+        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
+
+
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
     """Between-factor from keyframe k - 1 to k; a kernel other than "none" is put on the wheels' alone."""
     noise = gaussian(m.cov)
@@ -82,60 +191,57 @@ def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFa
 
 
 class LandmarkFactors:
-    """Makes factors of landmark sightings, against a known map or against variables.
+    """What sightings say: of a known map as residuals by pose and installation, of an unknown one as factors.
 
-    Cameras and landmark corners are converted once and kept.
+    Attributes:
+        installation: the parameters beside the pose.
+        believed: what is known of them now.
     """
 
-    def __init__(self, landmark_map: LandmarkMap | None) -> None:
+    def __init__(self, landmark_map: LandmarkMap | None, installation: Installation | None = None) -> None:
         self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
         self._corners: dict[int, FloatArray] = {}
-        self._cameras: dict[int, tuple[Camera, gtsam.Pose3, gtsam.Cal3DS2]] = {}
-        self._corner_noises: dict[tuple[float, float | None], gtsam.noiseModel.Base] = {}
+        self.installation = Installation({}) if installation is None else installation
+        self.believed = self.installation.prior()
 
     @property
     def known(self) -> bool:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None
 
-    def map_cov(self, landmark_id: int) -> FloatArray | None:
-        """Covariance ``(2, 2)`` of a known landmark's x, y; None if the map does not give it."""
-        landmark = None if self._known is None else self._known.get(landmark_id)
-        return None if landmark is None else landmark.cov
-
     def sighting(
-        self,
-        k: int,
-        m: LandmarkMeasurement,
-        cauchy_k: float | None,
-        raw: LandmarkMeasurement | None = None,
-        alone: LandmarkMeasurement | None = None,
+        self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, alone: LandmarkMeasurement | None = None
     ) -> Sighting:
-        """The measurement with its factors at keyframe k (and what it was before, see `Sighting`); raises as `make`."""
-        return Sighting(m, raw or m, alone or raw or m, cauchy_k, tuple(self.make(k, m, cauchy_k)))
-
-    def make(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> list[gtsam.NonlinearFactor]:
-        """Factors of one sighting at keyframe k.
+        """The measurement as the graph takes it at keyframe k.
 
         Raises:
             EstimatorError: the landmark is not in the known map, or corners were given for an unknown map.
             CovarianceError: the measurement's covariance is not one.
         """
         if self._known is None:
-            return [self._unknown(k, m, cauchy_k)]
-        landmark = self._known.get(m.landmark_id)
-        if landmark is None:
+            return Sighting(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
+        if m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
-        if isinstance(m, CornerMeasurement):
-            return self._corner_factors(k, m, landmark, cauchy_k)
-        if isinstance(m, RangeBearingMeasurement):
-            point, cov = cartesian(m)
-            noise = robust(gaussian(cov), cauchy_k)
-            return [gtsam.KnownLandmarkFactorPose2(pose_key(k), landmark.position[:2], point, noise)]
-        pose = se2.compose(landmark.planar, se2.inverse(m.pose))
-        ad = se2.adjoint(m.pose)  # perturbation of T_base_marker, moved to the robot's side
-        noise = robust(gaussian(_symmetric(ad @ m.cov @ ad.T)), cauchy_k)
-        return [gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), noise)]
+        if not isinstance(m, CornerMeasurement) and (problem := _covariance_problem(m.cov)):
+            raise CovarianceError(
+                f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
+            )
+        return Sighting(m, alone or m, cauchy_k)
+
+    def observe(self, measurements: Sequence[LandmarkMeasurement]) -> Observations:
+        """Sightings of the known map, prepared for being linearized."""
+        if self._known is None:
+            raise EstimatorError("sightings are linearized against a known map only")
+        return Observations(measurements, self._known, self.installation)
+
+    def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> list[Linearized]:
+        """Each sighting at a pose and the installation as it is known now."""
+        return self.observe(measurements).linearize(pose, self.believed.mean)
+
+    def whitening(self, one: Linearized) -> FloatArray:
+        """``(d, d)`` that makes the residual white, installation included as if it were noise."""
+        cov = one.noise() + one.H @ self.believed.cov[np.ix_(one.columns, one.columns)] @ one.H.T
+        return _whitening(cov)
 
     def near(self, landmark_id: int, displacement: FloatArray, within_m: float) -> list[int]:
         """Other known landmarks this near to where one would stand if it were displaced so ``(2,)`` in the map."""
@@ -200,64 +306,19 @@ class LandmarkFactors:
             return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), measured, noise)
         raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
 
-    def _corner_factors(
-        self, k: int, m: CornerMeasurement, landmark: Landmark, cauchy_k: float | None
-    ) -> list[gtsam.NonlinearFactor]:
-        corners = self._landmark_corners(landmark)
-        bTc, calibration = self._camera(m.camera)
-        noise_key = (m.sigma_px, cauchy_k)
-        if noise_key not in self._corner_noises:
-            self._corner_noises[noise_key] = robust(gtsam.noiseModel.Isotropic.Sigma(2, m.sigma_px), cauchy_k)
-        noise, key = self._corner_noises[noise_key], pose_key(k)
-        return [
-            gtsam.PlanarProjectionFactor1(key, corners[i], m.corners_px[i], bTc, calibration, noise) for i in range(4)
-        ]
-
     def _landmark_corners(self, landmark: Landmark) -> FloatArray:
         if landmark.landmark_id not in self._corners:
             self._corners[landmark.landmark_id] = landmark.corners()
         return self._corners[landmark.landmark_id]
 
-    def _camera(self, camera: Camera) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
-        held = self._cameras.get(id(camera))
-        if held is None or held[0] is not camera:
-            if len(self._cameras) > 64:  # cameras moved to a keyframe (late images) come and go
-                self._cameras.clear()
-            K, D = camera.K, np.concatenate([camera.D, np.zeros(4)])[:4]
-            calibration = gtsam.Cal3DS2(K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *D)
-            held = (camera, gtsam.Pose3(camera.T_base_cam), calibration)
-            self._cameras[id(camera)] = held
-        return held[1], held[2]
 
-
-def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
-    """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
-
-    The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
-    bearing's sigma, which is exact enough below 0.2 rad.
-    """
-    c, s = math.cos(m.bearing_rad), math.sin(m.bearing_rad)
-    r = m.range_m
-    J = np.array([[-r * s, c], [r * c, s]])  # columns: bearing, range
-    return np.array([r * c, r * s]), _symmetric(J @ m.cov @ J.T)
-
-
-def whitened(
-    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, cauchy_k: float | None
-) -> tuple[FloatArray, FloatArray]:
-    """Whitened residual ``(d,)`` and Jacobian ``(d, 3)`` of unary pose factors, without their robust weights.
-
-    A robust factor linearises to its Gaussian one times √w, w = 1 / (1 + r²/k²), so that w = 1 - |√w r|²/k².
-    """
-    residuals, jacobians = [], []
-    for factor in factors:
-        A, b = factor.linearize(values).jacobian()
-        scale = -1.0
-        if cauchy_k is not None:
-            scale /= math.sqrt(max(1.0 - float(b @ b) / cauchy_k**2, 1e-12))
-        jacobians.append(A * -scale)
-        residuals.append(b * scale)
-    return np.concatenate(residuals), np.vstack(jacobians)
+def linear_factor(
+    blocks: Mapping[int, FloatArray], residual: FloatArray, values: gtsam.Values
+) -> gtsam.NonlinearFactor:
+    """A factor of whitened residual ``(d,)``, linear about these values; up to three keys with their Jacobians."""
+    pairs: list[Any] = [part for key, A in blocks.items() for part in (key, A)]
+    noise = gtsam.noiseModel.Unit.Create(len(residual))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*pairs, -residual, noise), values)  # type: ignore[call-overload]
 
 
 def _covariance_problem(cov: FloatArray) -> str:

@@ -7,16 +7,13 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-import gtsam
-import numpy as np
-
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, whitened
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import correct, innovation, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.moved_landmark_votes import Quarantine
-from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, joint_nis, values_at
-from fgloc.sensors.sighting_calibration import Calibration
+from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, robust_weight
 from fgloc.types import (
     CornerMeasurement,
     Decision,
@@ -28,6 +25,7 @@ from fgloc.types import (
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 _LATELY_NS = 20_000_000_000
+_LINEAR_M, _LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -59,26 +57,22 @@ class Weights:
         stamp_ns: int,
         measurements: Sequence[LandmarkMeasurement],
         predicted: Belief,
-        calibration: Calibration | None = None,
     ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
         """Sort sightings into believed and refused, with the decision on each.
 
-        The NIS is that of the prediction; where it fails the χ² gate it is taken again at the pose that best explains
-        prediction and sighting together (Gauss–Newton), because after dead reckoning the linear one is far too large.
+        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
+        the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
+        because after dead reckoning the linear one is far too large.
         """
         believed, refused, decisions = [], [], []
         fitting, gated = [], []
-        values = values_at(k, predicted.pose)
-        for given in measurements:
-            alone = self._with_map_error(given, predicted)
-            raw, weight = self._share_information(alone)
-            m = raw if calibration is None else calibration.apply(raw)
-            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), raw, alone)
-            judged = sighting
-            if weight < 1.0:
-                c = alone if calibration is None else calibration.apply(alone)
-                judged = self._factors.sighting(k, c, cauchy_k(c, self._config), alone)
-            nis, dof, reason = self._judge(k, judged, predicted, values)
+        shared = [self._share_information(m) for m in measurements]
+        for alone, (m, weight), (nis, dof, reason) in zip(
+            measurements, shared, self._judge(measurements, predicted), strict=True
+        ):
+            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
+            if dof and not reason:
+                sighting = dataclasses.replace(sighting, weight=robust_weight(nis, dof))
             if not reason:
                 fitting.append(sighting)
             elif reason == "gate":
@@ -109,7 +103,7 @@ class Weights:
         if believed:
             self.forget_refusals()
             self._believed_ns = stamp_ns
-            for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted, values):
+            for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
                 refused.remove(misread)
                 believed.append(sighting)
@@ -130,7 +124,6 @@ class Weights:
         refused: Sequence[Sighting],
         decisions: list[Decision],
         predicted: Belief,
-        values: gtsam.Values,
     ) -> list[tuple[Sighting, Sighting, Decision]]:
         """Refused markers whose code was misread: what was refused, what it was, and the decision on that.
 
@@ -152,7 +145,7 @@ class Weights:
                     continue
                 again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
-                nis, dof, reason = self._judge(k, sighting, predicted, values)
+                nis, dof, reason = self._judge([again], predicted)[0]
                 if not reason:
                     fits.append((sighting, nis, dof))
             if len(fits) != 1:
@@ -201,24 +194,31 @@ class Weights:
         self.refused_in_a_row -= sum(d.reason != "quarantined" for d in decisions)
         return fit
 
-    def _judge(self, k: int, sighting: Sighting, predicted: Belief, values: gtsam.Values) -> tuple[float, int, str]:
-        """NIS, its degrees of freedom, and why the sighting is refused ("" if it is believed)."""
-        m = sighting.measurement
+    def _judge(self, measurements: Sequence[LandmarkMeasurement], predicted: Belief) -> list[tuple[float, int, str]]:
+        """Of each: NIS, its degrees of freedom, and why it is refused ("" if it is believed)."""
         if not self._factors.known:
-            self._seen[m.landmark_id] += 1
-            few = self._seen[m.landmark_id] < self._config.landmarks.min_sightings
-            return math.nan, 0, "seen_too_seldom" if few else ""
-        if isinstance(m, CornerMeasurement) and self._factors.depth(m, predicted.pose) < MIN_DEPTH_M:
-            return math.nan, 8, "behind_camera"
-        residual, J = whitened(sighting.factors, values, sighting.cauchy_k)
-        dof = len(residual)
-        bound = chi2_bound(self._config.estimator.gate_probability, dof)
-        S = J @ predicted.cov @ J.T
-        S[np.diag_indices(dof)] += 1.0
-        nis = float(residual @ np.linalg.solve(S, residual))
-        if nis > bound:
-            nis = min(nis, joint_nis(k, sighting, predicted, self._factors, residual, J))
-        return nis, dof, "gate" if nis > bound else ""
+            return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
+        if not measurements:
+            return []
+        lines = self._factors.linearize(measurements, predicted.pose)
+        known = predicted.installation or self._factors.believed
+        found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
+        uncertain = max(predicted.cov[0, 0], predicted.cov[1, 1]) > _LINEAR_M**2 or predicted.cov[2, 2] > _LINEAR_RAD**2
+        judged = []
+        for m, one, nis in zip(measurements, lines, found, strict=True):
+            dof = len(one.residual)
+            if one.behind:
+                judged.append((math.nan, dof, "behind_camera"))
+                continue
+            bound = chi2_bound(self._config.estimator.gate_probability, dof)
+            if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
+                nis = min(nis, corrected[1])
+            judged.append((nis, dof, "gate" if nis > bound else ""))
+        return judged
+
+    def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
+        self._seen[m.landmark_id] += 1
+        return "seen_too_seldom" if self._seen[m.landmark_id] < self._config.landmarks.min_sightings else ""
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
@@ -229,16 +229,6 @@ class Weights:
         apart = max((m.stamp_ns - last) * 1e-9, 0.01)
         scale = max(1.0, correlation_s / apart)
         return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
-
-    def _with_map_error(self, m: LandmarkMeasurement, predicted: Belief) -> LandmarkMeasurement:
-        """Add the uncertainty of where the landmark is, if the map gives it (a surveyed map does)."""
-        cov = self._factors.map_cov(m.landmark_id)
-        if cov is None or not isinstance(m, RangeBearingMeasurement):
-            return m
-        direction = float(predicted.pose[2]) + m.bearing_rad
-        c, s = math.cos(direction), math.sin(direction)
-        J = np.array([[-s / m.range_m, c / m.range_m], [c, s]])  # bearing, range by the landmark's place
-        return dataclasses.replace(m, cov=m.cov + J @ cov @ J.T)
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""

@@ -17,9 +17,20 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import EstimatorConfig
 from fgloc.graph.estimator import Estimator
-from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key, prior_factor
+from fgloc.graph.factors import (
+    INSTALLATION,
+    LandmarkFactors,
+    installed_motion_factor,
+    installed_prior_factor,
+    landmark_key,
+    motion_factor,
+    pose_key,
+    prior_factor,
+    sighting_factors,
+)
+from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.joint import correct
 from fgloc.graph.measurement_log import Belief, Keyframe
-from fgloc.graph.pose_fit import likeliest
 from fgloc.types import (
     FloatArray,
     LandmarkMeasurement,
@@ -28,39 +39,45 @@ from fgloc.types import (
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
+_NEVER = 1e9
 _MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
 
 
 class _Backend(Protocol):
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
         """Add a keyframe; the slots of its factors, in their order."""
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         """Put factors in the place of those in these slots; their own slots."""
 
-    def pose(self, k: int) -> FloatArray: ...
-    def covariance(self, k: int) -> FloatArray: ...
+    def belief(self, k: int, n: int) -> Belief:
+        """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance."""
 
 
 class _FixedLag:
-    """``IncrementalFixedLagSmoother`` over poses."""
+    """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
 
-    def __init__(self, config: EstimatorConfig) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config))
+    def __init__(self, config: EstimatorConfig, linear: bool) -> None:
+        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, linear))
+        self._installed = False
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
-        self._smoother.update(graph, values, dict.fromkeys(values.keys(), elapsed_s))
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
+        stamps = dict.fromkeys(values.keys(), elapsed_s)
+        self._installed |= INSTALLATION in stamps
+        if self._installed:
+            stamps[INSTALLATION] = elapsed_s
+        self._smoother.update(graph, values, stamps)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         self._smoother.update(graph, gtsam.Values(), {}, slots)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
-    def pose(self, k: int) -> FloatArray:
-        return _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
-
-    def covariance(self, k: int) -> FloatArray:
-        return np.asarray(self._smoother.marginalCovariance(pose_key(k)))
+    def belief(self, k: int, n: int) -> Belief:
+        pose = _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
+        if not n:
+            return Belief(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
+        return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
 
 
 class _Full:
@@ -69,17 +86,24 @@ class _Full:
     def __init__(self, config: EstimatorConfig) -> None:
         self._isam2 = gtsam.ISAM2(isam2_params(config))
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, elapsed_s: float) -> list[int]:
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
         return list(self._isam2.update(graph, values).getNewFactorsIndices())
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
 
-    def pose(self, k: int) -> FloatArray:
-        return _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
+    def belief(self, k: int, n: int) -> Belief:
+        pose = _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
+        if not n:
+            return Belief(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
+        return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
 
-    def covariance(self, k: int) -> FloatArray:
-        return np.asarray(self._isam2.marginalCovariance(pose_key(k)))
+
+def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> Belief:
+    x = pose_key(k)
+    found = isam2.jointMarginalCovariance([x, INSTALLATION])
+    known = InstallationBelief(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
+    return Belief(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
 
 
 class IncrementalEstimator(Estimator):
@@ -89,23 +113,40 @@ class IncrementalEstimator(Estimator):
         super().__init__(config, factors, keep_all)
         self._backend: _Backend | None = None
         self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
+        self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, tuple[float, list[int]]] = {}  # keyframe -> elapsed_s, slots of its motion factors
 
     def _solve(self, frame: Keyframe) -> None:
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
             self._backend = self._new_backend()
             self._slots.clear()
-        backend = self._backend
-        initial = likeliest(frame.k, frame.belief, frame.sightings, self._factors)
+        initial = self._linearization(frame)
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
-            self._keep_slots(frame, backend.update(graph, values, frame.k, frame.elapsed_s))
-            belief = Belief(backend.pose(frame.k), backend.covariance(frame.k))
-            if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
-                raise ValueError("estimate is not finite")
-            frame.belief = belief
+            self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
+            frame.belief = self._newest(frame.k)
         except _GTSAM_ERRORS:
             self._rebuild(frame, initial)
+
+    def _linearization(self, frame: Keyframe) -> Belief:
+        """Where to linearize first: at what prediction and believed sightings make likeliest together.
+
+        At a prediction that is far off, robust kernels would take sound sightings for outliers.
+        """
+        if not frame.sightings or not self._factors.known:
+            return frame.belief
+        known = frame.belief.installation or self.installed
+        measurements = [s.measurement for s in frame.sightings]
+        weights = [s.weight for s in frame.sightings]
+        corrected = correct(frame.belief, known, measurements, self._factors, weights)
+        return frame.belief if corrected is None else corrected[0]
+
+    def _newest(self, k: int) -> Belief:
+        assert self._backend is not None
+        belief = self._backend.belief(k, len(self._factors.installation))
+        if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
+            raise ValueError("estimate is not finite")
+        return belief
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""
@@ -117,11 +158,11 @@ class IncrementalEstimator(Estimator):
         graph, slots = gtsam.NonlinearFactorGraph(), []
         for frame in frames:
             slots += self._slots[frame.k][1]
-            for motion in frame.motions:
-                graph.add(motion_factor(frame.k, motion, self._config.motion_kernel))
+            for factor in self._motion_factors(frame):
+                graph.add(factor)
         try:
             new = backend.swap(graph, slots) if frames else []
-            newest.belief = Belief(backend.pose(newest.k), backend.covariance(newest.k))
+            newest.belief = self._newest(newest.k)
         except _GTSAM_ERRORS:
             self.rebuilt += 1
             self._build_again(changed)
@@ -132,13 +173,13 @@ class IncrementalEstimator(Estimator):
 
     def _begin_at(self, newest: Keyframe) -> None:
         if self._config.kind == "fixed_lag":
-            newest.belief = self._replayed([newest], newest.belief.pose)
+            newest.belief = self._replayed([newest], newest.belief)
         else:
             self._build_again([newest.k])
 
     def _build_again(self, changed: Sequence[int]) -> None:
         newest = self.log.keyframes[self._k]
-        initial = newest.belief.pose
+        initial = newest.belief
         try:
             newest.belief = self._replayed(self._window(newest) or [newest], initial)
         except _GTSAM_ERRORS:  # what the window knew is in the belief
@@ -170,20 +211,44 @@ class IncrementalEstimator(Estimator):
         starts = [i for i, f in enumerate(frames) if f.prior is not None]
         return frames[starts[-1] :] if starts else frames
 
+    def _motion_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
+        """Of a keyframe, linear about the pose before it; a kernel on the wheels needs factors that are not."""
+        before = self.log.keyframes.get(frame.k - 1)
+        installed = self._config.motion_kernel == "none" and before is not None
+        return [
+            installed_motion_factor(frame.k, m, before.belief.pose, self._factors.installation)
+            if installed and before is not None
+            else motion_factor(frame.k, m, self._config.motion_kernel)
+            for m in frame.motions
+        ]
+
     def _graph_of(
-        self, frame: Keyframe, initial: FloatArray, prior: Belief | None
+        self, frame: Keyframe, initial: Belief, prior: Belief | None
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Factors and first values of a keyframe; of the first one in a new backend, also of the installation."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(pose_key(frame.k), gtsam.Pose2(*initial))
-        if prior is not None:
-            graph.add(prior_factor(frame.k, prior.pose, prior.cov))
+        values.insert(pose_key(frame.k), gtsam.Pose2(*initial.pose))
+        known = initial.installation or self.installed
+        if self._fresh and len(known.mean):
+            values.insert(INSTALLATION, known.mean)
+        if prior is None:
+            made = self._motion_factors(frame)
+        elif len(known.mean) and self._fresh:
+            made = installed_prior_factor(frame.k, prior, self.installed)
         else:
-            for motion in frame.motions:
-                graph.add(motion_factor(frame.k, motion, self._config.motion_kernel))
+            made = [prior_factor(frame.k, prior.pose, prior.cov)]
+        self._fresh = False
+        if self._factors.known and frame.sightings:
+            lines = self._factors.observe([s.measurement for s in frame.sightings]).linearize(initial.pose, known.mean)
+            kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
+            if kept:
+                sightings, lines = zip(*kept, strict=True)
+                made += sighting_factors(frame.k, sightings, lines, initial.pose, known.mean)
         for sighting in frame.sightings:
-            self._introduce(sighting.measurement, initial, values)
-            for factor in sighting.factors:
-                graph.add(factor)
+            self._introduce(sighting.measurement, initial.pose, values)
+            made += sighting.factors
+        for factor in made:
+            graph.add(factor)
         return graph, values
 
     def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
@@ -203,7 +268,7 @@ class IncrementalEstimator(Estimator):
             return
         self._landmarks[m.landmark_id] = initial
 
-    def _rebuild(self, frame: Keyframe, initial: FloatArray) -> None:
+    def _rebuild(self, frame: Keyframe, initial: Belief) -> None:
         """Build the window again from the log, without the sightings of the offending step."""
         self.rebuilt += 1
         frame.refused = (*frame.refused, *frame.sightings)
@@ -213,7 +278,7 @@ class IncrementalEstimator(Estimator):
         except _GTSAM_ERRORS:  # an older sighting is at fault; what the window knew is in the prediction
             frame.belief = self._replayed([frame], initial)
 
-    def _replayed(self, frames: Sequence[Keyframe], initial: FloatArray) -> Belief:
+    def _replayed(self, frames: Sequence[Keyframe], initial: Belief) -> Belief:
         """Give these keyframes to a new backend; the belief of the last, whose pose starts at ``initial``."""
         self._backend = backend = self._new_backend()
         self._landmarks.clear()
@@ -223,19 +288,27 @@ class IncrementalEstimator(Estimator):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
-            graph, values = self._graph_of(held, initial if held.k == newest else held.belief.pose, prior)
-            self._keep_slots(held, backend.update(graph, values, held.k, held.elapsed_s), prior)
-        return Belief(backend.pose(newest), backend.covariance(newest))
+            graph, values = self._graph_of(held, initial if held.k == newest else held.belief, prior)
+            self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
+        return self._newest(newest)
 
     def _new_backend(self) -> _Backend:
-        return _FixedLag(self._config) if self._config.kind == "fixed_lag" else _Full(self._config)
+        self._fresh = True
+        linear = self._factors.known and self._config.motion_kernel == "none"
+        return _FixedLag(self._config, linear) if self._config.kind == "fixed_lag" else _Full(self._config)
 
 
-def isam2_params(config: EstimatorConfig) -> gtsam.ISAM2Params:
-    """iSAM2 settings that every backend shares; see gtsam's defaults for the rest."""
+def isam2_params(config: EstimatorConfig, linear: bool = False) -> gtsam.ISAM2Params:
+    """iSAM2 settings that every backend shares; see gtsam's defaults for the rest.
+
+    Args:
+        config: for the threshold.
+        linear: all factors are linear: relinearizing them would give the same.
+    """
     params = gtsam.ISAM2Params()
-    params.setFactorization("QR")  # Cholesky fails on long stretches without fixes
-    params.setRelinearizeThreshold(config.relinearize_threshold)
+    # Cholesky takes a third of QR's time; where it fails, after minutes without a fix, the window is built again.
+    params.setFactorization("CHOLESKY")
+    params.setRelinearizeThreshold(_NEVER if linear else config.relinearize_threshold)
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
     return params

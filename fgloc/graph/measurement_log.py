@@ -7,16 +7,22 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 
+from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.slip_noise import Footing
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 
 @dataclass(slots=True, eq=False)
 class Belief:
-    """A pose ``(3,)`` with the covariance ``(3, 3)`` of its right perturbation (the body frame)."""
+    """A pose ``(3,)`` with the covariance ``(3, 3)`` of its right perturbation (the body frame).
+
+    With the installation at that time, and the covariance ``(3, n)`` of the two; None: nothing connects them.
+    """
 
     pose: FloatArray
     cov: FloatArray
+    cross: FloatArray | None = None
+    installation: InstallationBelief | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,10 +33,10 @@ class Sighting:
     """
 
     measurement: LandmarkMeasurement
-    raw: LandmarkMeasurement  # before self-calibration
-    alone: LandmarkMeasurement  # before that, and before sightings near in time shared their information
+    alone: LandmarkMeasurement  # before sightings near in time shared their information
     cauchy_k: float | None
-    factors: tuple[gtsam.NonlinearFactor, ...]
+    weight: float = 1.0  # of the robust kernel, on the information
+    factors: tuple[gtsam.NonlinearFactor, ...] = ()  # of a landmark that is a variable
 
 
 @dataclass(slots=True, eq=False)
@@ -56,17 +62,26 @@ class Keyframe:
 
 @dataclass(slots=True)
 class MeasurementLog:
-    """Keyframes in order. ``window_s`` bounds it; None keeps all (batch)."""
+    """Keyframes in order. ``window_s`` bounds it, unless ``keep_all`` (batch).
 
-    window_s: float | None = None
+    Older keyframes that are kept lose what they say of the installation: it is large, and needed in the window only.
+    """
+
+    window_s: float
+    keep_all: bool = False
+    _whole: int = 0  # the first keyframe that still has all
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
 
     def append(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; forget those that the window has left behind."""
         self.keyframes[keyframe.k] = keyframe
-        if self.window_s is None:
-            return
         horizon = keyframe.elapsed_s - self.window_s
+        if self.keep_all:
+            while self._whole < keyframe.k and self.keyframes[self._whole].elapsed_s < horizon:
+                old = self.keyframes[self._whole]
+                old.belief = Belief(old.belief.pose, old.belief.cov)
+                self._whole += 1
+            return
         while self.keyframes:
             oldest = next(iter(self.keyframes))
             if self.keyframes[oldest].elapsed_s >= horizon:

@@ -7,12 +7,11 @@ from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
-from fgloc.graph.factors import MIN_DEPTH_M, LandmarkFactors, pose_key, whitened
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Sighting
-from fgloc.types import CornerMeasurement, FloatArray
+from fgloc.types import FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark
 _AGREE_M, _AGREE_SHARE = 0.25, 0.15  # how far they may lie from their median: at least, and of the displacement
@@ -82,7 +81,7 @@ class Quarantine:
             return
         if case.held:
             # One that is seen too badly to be refused is no sign that it is back in its place.
-            place, moved = displacement(sighting, k, pose, factors), np.median(case.places, axis=0)
+            place, moved = displacement(sighting, pose, factors), np.median(case.places, axis=0)
             back = place is not None and math.hypot(*place) < math.hypot(*(place - moved))
             case.fitted = case.fitted + 1 if back else 0
             if case.fitted > 2 * self._after:
@@ -111,7 +110,7 @@ class Quarantine:
                 continue
             case.score += 1.0
             case.refused += 1
-            place = displacement(sighting, k, pose, factors)
+            place = displacement(sighting, pose, factors)
             if place is not None:
                 case.places.append(place)
                 case.distances.append(factors.distance(landmark_id, pose))
@@ -137,7 +136,7 @@ class Quarantine:
         return bool(np.quantile(apart, 0.8) < max(_AGREE_M, _AGREE_SHARE * moved) and moved > np.median(apart))
 
 
-def displacement(sighting: Sighting, k: int, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:
+def displacement(sighting: Sighting, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:
     """How far ``(2,)`` [m] the landmark must have been moved on the map, unturned, to be seen so from this pose.
 
     Gauss-Newton: moving the landmark one way is moving the robot the other.
@@ -145,15 +144,14 @@ def displacement(sighting: Sighting, k: int, pose: FloatArray, factors: Landmark
     c, s = math.cos(pose[2]), math.sin(pose[2])
     R = np.array([[c, -s], [s, c]])
     moved = np.zeros(2)
+    observed, theta = factors.observe([sighting.measurement]), factors.believed.mean
+    W: FloatArray | None = None
     for _ in range(_ITERATIONS):
         x, y = pose[:2] - moved
-        seen_from = np.array([x, y, pose[2]])
-        m = sighting.measurement
-        if isinstance(m, CornerMeasurement) and factors.depth(m, seen_from) < MIN_DEPTH_M:
+        one = observed.linearize(np.array([x, y, pose[2]]), theta)[0]
+        if one.behind:
             return None
-        values = gtsam.Values()
-        values.insert(pose_key(k), gtsam.Pose2(*seen_from))
-        residual, J = whitened(sighting.factors, values, sighting.cauchy_k)
-        step = np.linalg.lstsq(J[:, :2] @ R.T, residual, rcond=None)[0]
+        W = factors.whitening(one) if W is None else W
+        step = np.linalg.lstsq(W @ one.J[:, :2] @ R.T, W @ one.residual, rcond=None)[0]
         moved = moved + step
     return moved if np.isfinite(moved).all() else None

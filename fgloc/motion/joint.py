@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -74,7 +76,14 @@ class JointCalibration:
         difference = se2.log(se2.between(wheels.motion, learned.motion))
         motion = se2.compose(wheels.motion, se2.exp(inverse @ difference))
         cov = inverse @ (learned.cov - K @ wheels.cov @ K.T) @ inverse.T
-        return MotionMeasurement(learned.source, learned.start_ns, learned.stamp_ns, motion, 0.5 * (cov + cov.T))
+        depends = {}
+        for name in {**wheels.depends_on, **learned.depends_on}:
+            by_wheels, assumed = wheels.depends_on.get(name, (np.zeros(3), None))
+            by_learned, also = learned.depends_on.get(name, (np.zeros(3), None))
+            value = assumed if assumed is not None else also
+            assert value is not None
+            depends[name] = by_wheels + inverse @ (by_learned - by_wheels), value
+        return replace(learned, motion=motion, cov=0.5 * (cov + cov.T), depends_on=depends)
 
     def _gain(self, L_w: FloatArray, L_n: FloatArray) -> FloatArray:
         scaled = np.linalg.solve(L_w, L_n @ self.correlation)  # K as the wheels' sigmas see it

@@ -10,10 +10,10 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.estimator import fuse
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief
-from fgloc.graph.pose_fit import Fit, joint_fit, sighting_cost
+from fgloc.graph.pose_fit import Fit, joint_fit, sighting_costs
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -189,7 +189,7 @@ class Initializer:
         agreeing = list(sightings)
         for _ in range(_TRIMS):
             before = agreeing
-            agreeing = [m for m in sightings if self._explains(fit.pose, m)]
+            agreeing = self._explained(fit.pose, sightings)
             if len(agreeing) == len(before):
                 break
             trimmed = self._fit(fit.pose, agreeing, _ITERATIONS) if agreeing else None
@@ -215,9 +215,13 @@ class Initializer:
             frozenset((m.stamp_ns, m.landmark_id) for m in contrary),
         )
 
-    def _explains(self, pose: FloatArray, m: LandmarkMeasurement) -> bool:
-        cost = sighting_cost(pose, m, self._factors, self._config)
-        return cost is not None and cost[0] < MAX_COST_PER_DOF * cost[1]
+    def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
+        costs = sighting_costs(pose, sightings, self._factors, self._config)
+        return [
+            m
+            for m, cost in zip(sightings, costs, strict=True)
+            if cost is not None and cost[0] < MAX_COST_PER_DOF * cost[1]
+        ]
 
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
         return joint_fit(start, sightings, self._factors, self._config, iterations)
@@ -243,8 +247,7 @@ class Initializer:
         for index in range(len(self._steps) - 1, -1, -1):
             collected = self._steps[index]
             for m in collected.sightings:
-                size_m = self._map.landmarks[m.landmark_id].size_m if self._map is not None else 0.0
-                yield carry(m, motion, cov, size_m, len(collected.sightings))
+                yield carry(m, motion, cov)
             if collected.motions and index > 0:
                 step, step_cov = fuse(collected.motions)
                 back = se2.inverse(step)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fgloc.config import GyroConfig
-from fgloc.types import ImuEvent, Step
+from fgloc.types import FloatArray, ImuEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
@@ -29,10 +29,12 @@ class Turn:
     Attributes:
         yaw: [rad], rid of the bias.
         variance: [rad²], of the noise and of what the bias may be off.
+        change: [rad/s] of the rate from the step's start to its end.
     """
 
     yaw: float
     variance: float
+    change: float = 0.0
 
 
 class Gyro:
@@ -88,8 +90,16 @@ class Gyro:
         self._watch_rest(raw / dt, dt, wheels)
         yaw = raw - self.bias * dt
         drift = self.bias_variance * ((blind_s + dt) ** 2 - blind_s**2)
-        noise = self._config.yaw_per_sqrt_s**2 * dt + self._config.scale_sigma**2 * abs(yaw)
-        return Turn(yaw, noise + drift)
+        noise = self._config.yaw_per_sqrt_s**2 * dt
+        ends = self.rates_at(step.imu, (step.start_ns, step.stamp_ns))
+        return Turn(yaw, noise + drift, float(ends[1] - ends[0]))
+
+    def rates_at(self, events: tuple[ImuEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
+        """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
+        times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
+        rates = np.array([event.angular_velocity for event in events]) @ self._up
+        at = np.array([(stamp - stamps_ns[0]) * 1e-9 for stamp in stamps_ns])
+        return np.asarray(np.interp(at, times, rates) - self.bias)
 
     def turned(self, yaw: float, seconds: float) -> None:
         """The robot went on by a step over which `measure` gave this turn [rad]."""

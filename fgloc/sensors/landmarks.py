@@ -71,6 +71,11 @@ class LandmarkSensor:
         self._T_base_sensor = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
         self.rejections: Counter[str] = Counter()
 
+    @property
+    def sees_corners(self) -> bool:
+        """Whether sightings are corners in images."""
+        return self._camera is not None
+
     def measure(self, event: SightingsEvent) -> tuple[LandmarkMeasurement, ...]:
         """What one message says of the landmarks.
 

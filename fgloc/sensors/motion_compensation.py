@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from fgloc import se2
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import (
@@ -19,37 +19,35 @@ from fgloc.types import (
     Step,
 )
 
+_HALF_NS = 20_000_000  # the speed at an exposure is the mean over this long before and after
+_SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
 
-def carry(
-    m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray, size_m: float = 0.0, together: int = 1
-) -> LandmarkMeasurement:
+
+def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
     """Move a sighting to the keyframe.
 
     Args:
         m: the sighting, as made from the base at its own time.
         motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
         cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
-        size_m: side of the marker whose corners were seen.
-        together: markers carried by the same motion, which share its error; only corners, which have one sigma for
-            all, take account of it.
     """
+    ad = se2.adjoint(motion)
     if isinstance(m, CornerMeasurement):
         x, y, yaw = motion
         T = np.eye(4)
         T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
         T[:2, 3] = x, y
         camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
-        spread = _corner_variance(m, cov, size_m) * 4 * together  # four corners share it: taken for independent later
-        return dataclasses.replace(m, camera=camera, sigma_px=math.sqrt(m.sigma_px**2 + spread))
+        spread = cov if m.motion_cov is None else cov + m.motion_cov
+        return dataclasses.replace(m, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ m.twist)
     if isinstance(m, MarkerPoseMeasurement):
         pose = se2.compose(motion, m.pose)
-        return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov))
+        return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
     x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
     px, py, _ = se2.compose(motion, (x, y, 0.0))
     r, bearing = math.hypot(px, py), math.atan2(py, px)
-    return dataclasses.replace(
-        m, range_m=r, bearing_rad=bearing, cov=m.cov + _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
-    )
+    added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
+    return dataclasses.replace(m, range_m=r, bearing_rad=bearing, cov=m.cov + added, twist=ad @ m.twist)
 
 
 def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
@@ -63,24 +61,44 @@ def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r
     return np.asarray(J @ cov @ J.T)
 
 
-def _corner_variance(m: CornerMeasurement, cov: FloatArray, size_m: float) -> float:
-    """Variance [px²] that an uncertain motion adds to a corner: by its yaw, and by its translation at the depth."""
-    focal = max(m.camera.K[0, 0], m.camera.K[1, 1])
-    sides = m.corners_px - np.roll(m.corners_px, 1, axis=0)
-    longest_px = math.sqrt(float((sides**2).sum(axis=1).max()))  # the least foreshortened: focal * size / depth
-    by_translation = 0.0 if size_m <= 0.0 else (longest_px / size_m) ** 2 * max(cov[0, 0], cov[1, 1])
-    return float(focal**2 * cov[2, 2] + by_translation)
+class MotionCompensation:
+    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is heard, the gyro's turn."""
 
+    def __init__(self, landmarks: LandmarkSensor, wheels: WheelMotion, gyro: Gyro | None, jitter_s: float) -> None:
+        """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
+        self._landmarks, self._wheels, self._gyro, self._jitter_s = landmarks, wheels, gyro, jitter_s
 
-def measure_carried(
-    step: Step, landmarks: LandmarkSensor, wheels: WheelMotion, sizes_m: Mapping[int, float]
-) -> list[LandmarkMeasurement]:
-    """All sightings of a step, as if made at its end: the wheels carry those that were made before it."""
-    measured: list[LandmarkMeasurement] = []
-    for event in step.sightings:
-        found = landmarks.measure(event)
-        if found and event.stamp_ns != step.stamp_ns:
-            motion, cov = wheels.carry(step, step.stamp_ns, event.stamp_ns)
-            found = tuple(carry(m, motion, cov, sizes_m.get(m.landmark_id, 0.0), len(found)) for m in found)
-        measured.extend(found)
-    return measured
+    def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
+        """All sightings of a step as if made at its end.
+
+        Args:
+            step: the newest one.
+            offset_s: how late stamps of sightings are, as far as is known; what is left of it, the residual sees with
+                the speed at the exposure.
+        """
+        measured: list[LandmarkMeasurement] = []
+        for event in step.sightings:
+            found = self._landmarks.measure(event)
+            if not found:
+                continue
+            exposure_ns = event.stamp_ns - round(offset_s * 1e9)
+            twist = self._twist(step, exposure_ns)
+            late = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
+            late = [
+                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, CornerMeasurement) else m for m in late
+            ]
+            if exposure_ns != step.stamp_ns:
+                motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)
+                if self._gyro is not None and step.imu and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
+                    motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
+                late = [carry(m, motion, cov) for m in late]
+            measured.extend(late)
+        return measured
+
+    def _twist(self, step: Step, at_ns: int) -> FloatArray:
+        """Of the base at a time near the step's end."""
+        motion, _ = self._wheels.carry(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
+        twist = se2.log(motion) / (2e-9 * _HALF_NS)
+        if self._gyro is not None and step.imu:
+            twist[2] = self._gyro.rates_at(step.imu, (at_ns,))[0]
+        return twist

@@ -1,0 +1,131 @@
+"""The installation as a state: what map, camera, clocks, wheels and gyro are off by, estimated beside the poses.
+
+The state θ ``(n,)`` holds deviations from what map and configuration say. Each has a prior sigma; one of sigma 0 is
+taken as exact and is no state. What can't be observed stays at its prior, and its sigma reaches the pose's covariance through
+the joint covariance of pose and θ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.types import FloatArray, Landmark, LandmarkMap
+
+CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
+SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
+MARKER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+POINT = ("x_m", "y_m")
+TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its block
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstallationBelief:
+    """Mean ``(n,)`` and covariance ``(n, n)`` of the installation state."""
+
+    mean: FloatArray
+    cov: FloatArray
+
+
+class Installation:
+    """Names, priors and places of all parameters in the state.
+
+    Camera translation and rotation are right perturbations in the optical frame (x right, y down, z forward); a
+    marker's translation is in the map frame, its rotation in its own.
+
+    Attributes:
+        names: ``section.parameter``, of markers ``map.ID.parameter``.
+        sigmas: ``(n,)`` of the prior.
+        blocks: rows ``(first, count)`` of "camera" and "sightings", where there are such.
+        landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
+    """
+
+    def __init__(self, parameters: Mapping[str, float], landmark_cov: Mapping[int, FloatArray] | None = None) -> None:
+        """Take prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
+
+        Args:
+            parameters: prior sigmas; inside a block a sigma may be 0 (a state that is held), elsewhere it is left out.
+            landmark_cov: covariance of x, y ``(2, 2)`` of landmarks for which the map gives it.
+        """
+        kept = {
+            name: s for name, s in parameters.items() if s > 0.0 or name.split(".")[0] in ("camera", "sightings", "map")
+        }
+        self.names = tuple(kept)
+        self.sigmas = np.array(list(kept.values()))
+        self.index = {name: i for i, name in enumerate(self.names)}
+        self.blocks: dict[str, tuple[int, int]] = {}
+        self.landmarks: dict[int, tuple[int, int]] = {}
+        for i, name in enumerate(self.names):
+            section, *rest = name.split(".")
+            if section == "map":
+                first, count = self.landmarks.get(int(rest[0]), (i, 0))
+                self.landmarks[int(rest[0])] = (first, count + 1)
+            elif section in TIME_OFFSET:
+                first, count = self.blocks.get(section, (i, 0))
+                self.blocks[section] = (first, count + 1)
+        self._prior_cov = np.diag(np.maximum(self.sigmas, _HELD) ** 2)
+        for landmark_id, cov in (landmark_cov or {}).items():
+            if landmark_id in self.landmarks:
+                first = self.landmarks[landmark_id][0]
+                self._prior_cov[first : first + 2, first : first + 2] = cov
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def prior(self) -> InstallationBelief:
+        """Before anything was measured."""
+        return InstallationBelief(np.zeros(len(self)), self._prior_cov.copy())
+
+    def time_offset(self, belief: InstallationBelief) -> float:
+        """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
+        for section, row in TIME_OFFSET.items():
+            if section in self.blocks:
+                return float(belief.mean[self.blocks[section][0] + row])
+        return 0.0
+
+
+_HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state
+MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but for noise, to bound the work of a step
+
+
+def installation_of(config: Config, landmark_map: LandmarkMap | None, corners: bool) -> Installation:
+    """The parameters of a run, with their priors.
+
+    Args:
+        config: the prior sigmas.
+        landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
+        corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
+    """
+    wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
+    sigmas = {
+        "wheels.radius": wheels.scale_sigma,
+        "wheels.track": wheels.turn_scale_sigma,
+        "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
+        "gyro.scale": gyro.scale_sigma,
+        "gyro.time_offset_s": gyro.time_offset_sigma_s,
+        "learned.scale": config.motion.scale_sigma,
+    }
+    if landmark_map is None:
+        return Installation(sigmas)
+    if corners:
+        m, r = camera.position_sigma_m, camera.rotation_sigma_rad
+        focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
+        values = (m, m, m, r, r, r, focal, pp, pp, k, k, camera.time_offset_sigma_s)
+        sigmas |= {f"camera.{name}": v for name, v in zip(CAMERA, values, strict=True)}
+    else:
+        sensor = (rb.range_scale_sigma, rb.bearing_bias_sigma_rad, rb.time_offset_sigma_s)
+        sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}
+    if len(landmark_map) <= MOST_LANDMARKS:
+        for i, landmark in sorted(landmark_map.landmarks.items()):
+            sigmas |= _landmark_sigmas(i, landmark, config, corners)
+    return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None})
+
+
+def _landmark_sigmas(i: int, landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:
+    m, r = config.map.position_sigma_m, config.map.rotation_sigma_rad
+    if corners and landmark.size_m > 0.0:
+        return {f"map.{i}.{name}": v for name, v in zip(MARKER, (m, m, m, r, r, r), strict=True)}
+    return {f"map.{i}.{name}": m for name in POINT}

@@ -1,0 +1,160 @@
+"""Pose and installation together: prediction, innovation and correction of their joint Gaussian.
+
+Sources: Thrun, Burgard, Fox, Probabilistic Robotics, chapter 7, with the state augmented by the installation; Bell and
+Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from fgloc import se2
+from fgloc.graph.factors import LandmarkFactors, stacked
+from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.measurement_log import Belief
+from fgloc.graph.observation import Linearized
+from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
+
+_MOST_STEPS = 6
+_STILL = 1e-3  # sigmas: a step of Gauss-Newton this small is the last one
+
+
+def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
+    """One motion ``(3,)`` and covariance ``(3, 3)`` out of independent ones over the same interval.
+
+    First order: the mean of the logarithms about the first motion, weighted by information.
+    """
+    motion, cov, _ = fuse_installed(motions)
+    return motion, cov
+
+
+def fuse_installed(
+    motions: Sequence[MotionMeasurement],
+) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, float]]]:
+    """As `fuse`, with what the fused motion depends on."""
+    first = motions[0]
+    if len(motions) == 1:
+        return first.motion, first.cov, dict(first.depends_on)
+    weights = [np.linalg.inv(m.cov) for m in motions]
+    cov = np.linalg.inv(np.sum(weights, axis=0))
+    cov = 0.5 * (cov + cov.T)
+    pull = np.zeros(3)
+    depends: dict[str, tuple[FloatArray, float]] = {}
+    for m, weight in zip(motions, weights, strict=True):
+        share = cov @ weight
+        pull += share @ se2.log(se2.between(first.motion, m.motion))
+        for name, (derivative, assumed) in m.depends_on.items():
+            before = depends.get(name, (np.zeros(3), assumed))[0]
+            depends[name] = before + share @ derivative, assumed
+    return se2.compose(first.motion, se2.exp(pull)), cov, depends
+
+
+def predict(
+    belief: Belief, known: InstallationBelief, installation: Installation, motions: Sequence[MotionMeasurement]
+) -> Belief:
+    """Pose and installation after the motions of one step."""
+    motion, cov, depends = fuse_installed(motions)
+    D = np.zeros((3, len(installation)))
+    for name, (derivative, assumed) in depends.items():
+        if name in installation.index:
+            i = installation.index[name]
+            D[:, i] = derivative
+            motion = se2.compose(motion, se2.exp(derivative * (known.mean[i] - assumed)))
+    A = se2.adjoint(se2.inverse(motion))
+    cross = np.zeros_like(D) if belief.cross is None else belief.cross
+    across = A @ cross
+    after = A @ belief.cov @ A.T + across @ D.T + D @ across.T + D @ known.cov @ D.T + cov
+    return Belief(se2.compose(belief.pose, motion), 0.5 * (after + after.T), across + D @ known.cov, known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """What sightings of one step say against a belief.
+
+    Attributes:
+        residual: ``(d,)`` predicted minus measured.
+        H: ``(d, 3 + n)`` by pose and installation.
+        noise: ``(d, d)`` of the sightings alone.
+        cov: ``(d, d)`` of the residual.
+    """
+
+    residual: FloatArray
+    H: FloatArray
+    noise: FloatArray
+    cov: FloatArray
+
+
+def joint_cov(belief: Belief, known: InstallationBelief) -> FloatArray:
+    """Covariance ``(3 + n, 3 + n)`` of pose and installation."""
+    n = len(known.mean)
+    P = np.zeros((3 + n, 3 + n))
+    P[:3, :3], P[3:, 3:] = belief.cov, known.cov
+    if belief.cross is not None:
+        P[:3, 3:], P[3:, :3] = belief.cross, belief.cross.T
+    return P
+
+
+def innovation(P: FloatArray, lines: Sequence[Linearized], weights: Sequence[float] | None = None) -> Innovation:
+    """The innovation of sightings, linearized at the belief whose joint covariance ``P`` is."""
+    residual, J, H, noise = stacked(lines, len(P) - 3, weights)
+    both = np.hstack([J, H])
+    return Innovation(residual, both, noise, both @ P @ both.T + noise)
+
+
+def nis_of_each(found: Innovation, lines: Sequence[Linearized]) -> list[float]:
+    """Squared Mahalanobis distance of each sighting by itself."""
+    out, row = [], 0
+    for one in lines:
+        part = slice(row, row + len(one.residual))
+        r = found.residual[part]
+        out.append(float(r @ np.linalg.solve(found.cov[part, part], r)))
+        row += len(one.residual)
+    return out
+
+
+def correct(
+    belief: Belief,
+    known: InstallationBelief,
+    measurements: Sequence[LandmarkMeasurement],
+    factors: LandmarkFactors,
+    weights: Sequence[float] | None = None,
+) -> tuple[Belief, float] | None:
+    """Pose and installation that prediction and sightings make likeliest, by Gauss-Newton.
+
+    Returns:
+        The corrected belief, and the least squared Mahalanobis distance of sightings and prediction together (χ² of as
+        many degrees of freedom as there are residuals); None where it does not converge.
+    """
+    observed = factors.observe(measurements)
+    P = joint_cov(belief, known)
+    n = len(known.mean)
+    x = np.zeros(3 + n)  # tangent of the belief
+    pose, theta = belief.pose, known.mean
+    for _ in range(_MOST_STEPS):
+        lines = observed.linearize(pose, theta)
+        if any(one.behind for one in lines):
+            return None
+        found = innovation(P, lines, weights)
+        factor = cho_factor(found.cov, check_finite=False)
+        gap = found.residual - found.H @ x
+        after = -P @ found.H.T @ cho_solve(factor, gap, check_finite=False)
+        cost = float(gap @ cho_solve(factor, gap, check_finite=False))
+        step, x = after - x, after
+        pose, theta = se2.compose(belief.pose, se2.exp(x[:3])), known.mean + x[3:]
+        if (np.abs(step) < _STILL * np.sqrt(np.diag(P))).all():
+            break
+    gain = P @ found.H.T
+    after_cov = P - gain @ cho_solve(factor, gain.T, check_finite=False)
+    after_cov = 0.5 * (after_cov + after_cov.T)
+    corrected = Belief(pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationBelief(theta, after_cov[3:, 3:]))
+    return corrected, cost
+
+
+def widened(belief: Belief, scale: float) -> Belief:
+    """The belief with its pose's covariance scaled."""
+    cross = None if belief.cross is None else belief.cross * np.sqrt(scale)
+    return replace(belief, cov=belief.cov * scale, cross=cross)
