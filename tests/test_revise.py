@@ -90,7 +90,7 @@ def test_revised_motions_are_as_if_they_had_been_given_at_first(kind):
     revised.revise({k: drive.later[k] for k in range(12, 20)})
     expected = follow(told, drive, range(1, 20), drive.first | {k: drive.later[k] for k in range(12, 20)})
     assert np.abs(se2.between(revised.belief.pose, expected.pose)).max() < 2e-3  # one iteration each
-    assert_same(settled(revised), settled(told))
+    assert_same(settled(revised), settled(told), 1e-3)  # sightings are linearized once, where they were predicted
     assert revised.log.keyframes[19].belief is revised.belief
     assert revised.rebuilt == 0
     unchanged = follow(estimator(kind), drive, range(1, 20), drive.first)
@@ -117,7 +117,7 @@ def test_many_revisions_as_poses_leave_the_window(kind):
             revised.revise(again)
             believed |= again
     follow(told, drive, range(1, 150), believed)
-    assert_same(settled(revised), settled(told), 1e-5)
+    assert_same(settled(revised), settled(told), 1e-3)
     assert revised.rebuilt == told.rebuilt == 0
     assert_same(
         follow(revised, drive, range(150, 155), drive.first), follow(told, drive, range(150, 155), drive.first), 1e-5

@@ -12,7 +12,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
@@ -79,23 +78,24 @@ def installed_motion_factor(
 ) -> gtsam.NonlinearFactor:
     """Between-factor from keyframe k - 1 to k and the parameters that the motion depends on.
 
-    Linear about a pose ``before`` (3,) of keyframe k - 1 and the one that the motion leads to. Of two perturbations
-    that move both poses alike the residual sees nothing, so that it holds far from there.
+    Linear about a pose ``before`` (3,) of keyframe k - 1 and the one that the motion leads to: good to half the squared
+    angle, as a share of the motion, by which the poses are turned from there.
     """
+    columns = {installation.index[name]: c for name, c in m.depends_on.items() if name in installation.index}
+    if not columns:
+        return motion_factor(k, m)
     W = _whitening(m.cov)
     values = gtsam.Values()
     values.insert(pose_key(k - 1), gtsam.Pose2(*before))
     values.insert(pose_key(k), gtsam.Pose2(*se2.compose(before, m.motion)))
     blocks = {pose_key(k - 1): -W @ se2.adjoint(se2.inverse(m.motion)), pose_key(k): W}
-    columns = {installation.index[name]: c for name, c in m.depends_on.items() if name in installation.index}
     residual = np.zeros(3)
-    if columns:
-        values.insert(INSTALLATION, np.zeros(len(installation)))
-        H = np.zeros((3, len(installation)))
-        for i, (derivative, assumed) in columns.items():
-            H[:, i] = -W @ derivative
-            residual -= H[:, i] * assumed
-        blocks[INSTALLATION] = H
+    values.insert(INSTALLATION, np.zeros(len(installation)))
+    H = np.zeros((3, len(installation)))
+    for i, (derivative, assumed) in columns.items():
+        H[:, i] = -W @ derivative
+        residual -= H[:, i] * assumed
+    blocks[INSTALLATION] = H
     return linear_factor(blocks, residual, values)
 
 
@@ -172,7 +172,7 @@ def _whitening(cov: FloatArray) -> FloatArray:
     try:
         if not np.isfinite(cov).all():
             raise np.linalg.LinAlgError("not finite")
-        return np.asarray(solve_triangular(np.linalg.cholesky(cov), np.eye(len(cov)), lower=True, check_finite=False))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
     except np.linalg.LinAlgError as error:
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
 
@@ -195,14 +195,24 @@ class LandmarkFactors:
 
     Attributes:
         installation: the parameters beside the pose.
-        believed: what is known of them now.
     """
 
     def __init__(self, landmark_map: LandmarkMap | None, installation: Installation | None = None) -> None:
         self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
         self._corners: dict[int, FloatArray] = {}
         self.installation = Installation({}) if installation is None else installation
-        self.believed = self.installation.prior()
+        self._believed = self.installation.prior()
+        self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
+
+    @property
+    def believed(self) -> InstallationBelief:
+        """What is known of the installation now."""
+        return self._believed
+
+    @believed.setter
+    def believed(self, belief: InstallationBelief) -> None:
+        self._believed = belief
+        self._remembered = np.zeros(3), {}
 
     @property
     def known(self) -> bool:
@@ -235,8 +245,16 @@ class LandmarkFactors:
         return Observations(measurements, self._known, self.installation)
 
     def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> list[Linearized]:
-        """Each sighting at a pose and the installation as it is known now."""
-        return self.observe(measurements).linearize(pose, self.believed.mean)
+        """Each sighting at a pose and the installation as it is known now.
+
+        Asked again of some of the same sightings at the same pose, as a step does, the answer is remembered.
+        """
+        at, held = self._remembered
+        if at is pose and all(id(m) in held for m in measurements):
+            return [held[id(m)][1] for m in measurements]
+        lines = self.observe(measurements).linearize(pose, self.believed.mean)
+        self._remembered = pose, {id(m): (m, one) for m, one in zip(measurements, lines, strict=True)}
+        return lines
 
     def whitening(self, one: Linearized) -> FloatArray:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import correct, innovation, joint_cov, nis_of_each
+from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.moved_landmark_votes import Quarantine
 from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, robust_weight
@@ -25,7 +25,6 @@ from fgloc.types import (
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 _LATELY_NS = 20_000_000_000
-_LINEAR_M, _LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -203,7 +202,7 @@ class Weights:
         lines = self._factors.linearize(measurements, predicted.pose)
         known = predicted.installation or self._factors.believed
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
-        uncertain = max(predicted.cov[0, 0], predicted.cov[1, 1]) > _LINEAR_M**2 or predicted.cov[2, 2] > _LINEAR_RAD**2
+        uncertain = not is_linear(predicted)
         judged = []
         for m, one, nis in zip(measurements, lines, found, strict=True):
             dof = len(one.residual)

@@ -29,7 +29,7 @@ from fgloc.graph.factors import (
     sighting_factors,
 )
 from fgloc.graph.installation import InstallationBelief
-from fgloc.graph.joint import correct
+from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Belief, Keyframe
 from fgloc.types import (
     FloatArray,
@@ -40,6 +40,7 @@ from fgloc.types import (
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
 _NEVER = 1e9
+_TURNED_RAD = 0.02  # a correction of the yaw from which on linear motion factors are made anew
 _MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
 
 
@@ -50,6 +51,11 @@ class _Backend(Protocol):
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         """Put factors in the place of those in these slots; their own slots."""
 
+    def holds(self, k: int) -> bool:
+        """Whether a keyframe is in the window."""
+
+    def pose(self, k: int) -> FloatArray: ...
+
     def belief(self, k: int, n: int) -> Belief:
         """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance."""
 
@@ -57,8 +63,8 @@ class _Backend(Protocol):
 class _FixedLag:
     """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
 
-    def __init__(self, config: EstimatorConfig, linear: bool) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, linear))
+    def __init__(self, config: EstimatorConfig, installed: int) -> None:
+        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed))
         self._installed = False
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
@@ -66,15 +72,21 @@ class _FixedLag:
         self._installed |= INSTALLATION in stamps
         if self._installed:
             stamps[INSTALLATION] = elapsed_s
-        self._smoother.update(graph, values, stamps)
+        self._smoother.update(graph, values, stamps)  # type: ignore[arg-type]
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         self._smoother.update(graph, gtsam.Values(), {}, slots)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
+    def holds(self, k: int) -> bool:
+        return bool(self._smoother.getISAM2().valueExists(pose_key(k)))
+
+    def pose(self, k: int) -> FloatArray:
+        return _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
+
     def belief(self, k: int, n: int) -> Belief:
-        pose = _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
+        pose = self.pose(k)
         if not n:
             return Belief(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
         return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
@@ -92,8 +104,14 @@ class _Full:
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
 
+    def holds(self, k: int) -> bool:
+        return bool(self._isam2.valueExists(pose_key(k)))
+
+    def pose(self, k: int) -> FloatArray:
+        return _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
+
     def belief(self, k: int, n: int) -> Belief:
-        pose = _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
+        pose = self.pose(k)
         if not n:
             return Belief(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
         return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
@@ -124,16 +142,24 @@ class IncrementalEstimator(Estimator):
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
             self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
-            frame.belief = self._newest(frame.k)
+            predicted, frame.belief = frame.belief, self._newest(frame.k)
+            if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > _TURNED_RAD and frame.prior is None:
+                self._relinearize(frame)
         except _GTSAM_ERRORS:
             self._rebuild(frame, initial)
 
-    def _linearization(self, frame: Keyframe) -> Belief:
-        """Where to linearize first: at what prediction and believed sightings make likeliest together.
+    def _relinearize(self, newest: Keyframe) -> None:
+        """The window was turned by much, as after dead reckoning: build it again at where its poses are now."""
+        window = self._window(newest)
+        poses = {f.k: self._backend.pose(f.k) for f in window if self._backend is not None and self._backend.holds(f.k)}
+        for frame in window:
+            frame.linearized_at = poses.get(frame.k)
+        newest.linearized_at = newest.belief.pose
+        newest.belief = self._replayed([*window, newest], newest.belief)
 
-        At a prediction that is far off, robust kernels would take sound sightings for outliers.
-        """
-        if not frame.sightings or not self._factors.known:
+    def _linearization(self, frame: Keyframe) -> Belief:
+        """Where to linearize: at the prediction or, far from linear, at what it and the sightings make likeliest."""
+        if not frame.sightings or not self._factors.known or is_linear(frame.belief):
             return frame.belief
         known = frame.belief.installation or self.installed
         measurements = [s.measurement for s in frame.sightings]
@@ -216,7 +242,7 @@ class IncrementalEstimator(Estimator):
         before = self.log.keyframes.get(frame.k - 1)
         installed = self._config.motion_kernel == "none" and before is not None
         return [
-            installed_motion_factor(frame.k, m, before.belief.pose, self._factors.installation)
+            installed_motion_factor(frame.k, m, before.at, self._factors.installation)
             if installed and before is not None
             else motion_factor(frame.k, m, self._config.motion_kernel)
             for m in frame.motions
@@ -239,11 +265,15 @@ class IncrementalEstimator(Estimator):
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
         self._fresh = False
         if self._factors.known and frame.sightings:
-            lines = self._factors.observe([s.measurement for s in frame.sightings]).linearize(initial.pose, known.mean)
+            measurements = [s.measurement for s in frame.sightings]
+            if known is self._factors.believed:
+                lines = self._factors.linearize(measurements, initial.pose)
+            else:
+                lines = self._factors.observe(measurements).linearize(initial.pose, known.mean)
             kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
             if kept:
-                sightings, lines = zip(*kept, strict=True)
-                made += sighting_factors(frame.k, sightings, lines, initial.pose, known.mean)
+                sightings, ahead = zip(*kept, strict=True)
+                made += sighting_factors(frame.k, sightings, ahead, initial.pose, known.mean)
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial.pose, values)
             made += sighting.factors
@@ -288,27 +318,34 @@ class IncrementalEstimator(Estimator):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
-            graph, values = self._graph_of(held, initial if held.k == newest else held.belief, prior)
+            start = initial if held.k == newest else Belief(held.at, held.belief.cov)
+            graph, values = self._graph_of(held, start, prior)
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
         return self._newest(newest)
 
     def _new_backend(self) -> _Backend:
         self._fresh = True
-        linear = self._factors.known and self._config.motion_kernel == "none"
-        return _FixedLag(self._config, linear) if self._config.kind == "fixed_lag" else _Full(self._config)
+        installed = len(self._factors.installation) if self._factors.known else 0
+        return _FixedLag(self._config, installed) if self._config.kind == "fixed_lag" else _Full(self._config)
 
 
-def isam2_params(config: EstimatorConfig, linear: bool = False) -> gtsam.ISAM2Params:
+def isam2_params(config: EstimatorConfig, installed: int = 0) -> gtsam.ISAM2Params:
     """iSAM2 settings that every backend shares; see gtsam's defaults for the rest.
 
     Args:
         config: for the threshold.
-        linear: all factors are linear: relinearizing them would give the same.
+        installed: parameters of the installation, in which all factors are linear: relinearizing gives the same.
     """
     params = gtsam.ISAM2Params()
     # Cholesky takes a third of QR's time; where it fails, after minutes without a fix, the window is built again.
     params.setFactorization("CHOLESKY")
-    params.setRelinearizeThreshold(_NEVER if linear else config.relinearize_threshold)
+    if installed:
+        thresholds = gtsam.ISAM2ThresholdMap()
+        thresholds.insert(("x", np.full(3, config.relinearize_threshold)))
+        thresholds.insert(("i", np.full(installed, _NEVER)))
+        params.setRelinearizeThreshold(thresholds)
+    else:
+        params.setRelinearizeThreshold(config.relinearize_threshold)
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
     return params

@@ -20,6 +20,7 @@ from fgloc.graph.observation import Linearized
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 _MOST_STEPS = 6
+_LINEAR_M, _LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
 _STILL = 1e-3  # sigmas: a step of Gauss-Newton this small is the last one
 
 
@@ -152,6 +153,12 @@ def correct(
     after_cov = 0.5 * (after_cov + after_cov.T)
     corrected = Belief(pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationBelief(theta, after_cov[3:, 3:]))
     return corrected, cost
+
+
+def is_linear(belief: Belief) -> bool:
+    """Whether sightings are as good as linear over what the pose may be."""
+    cov = belief.cov
+    return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < _LINEAR_RAD**2)
 
 
 def widened(belief: Belief, scale: float) -> Belief:

@@ -58,6 +58,12 @@ class Keyframe:
     footing: Footing = field(default_factory=Footing)  # at the start of the step
     scale: float = 1.0  # on the covariances of the motions that these make ...
     doubt: FloatArray | None = None  # ... and what was added to them
+    linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
+
+    @property
+    def at(self) -> FloatArray:
+        """Pose ``(3,)`` about which factors are linear."""
+        return self.belief.pose if self.linearized_at is None else self.linearized_at
 
 
 @dataclass(slots=True)

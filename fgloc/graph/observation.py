@@ -123,8 +123,8 @@ class CornerBatch:
             if first >= 0:
                 marker[i] = theta[first : first + 6]
         # 1. Corners in the map, in the base frame, at the exposure, in the camera
-        turned = np.cross(marker[:, None, 3:], self._local)
-        local = self._local + turned + 0.5 * np.cross(marker[:, None, 3:], turned)
+        turned = _cross(marker[:, None, 3:], self._local)
+        local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
         P = (self._position + marker[:, :3])[:, None] + local @ self._rotation.transpose(0, 2, 1)
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         Rz = np.zeros((n, 3, 3))  # R_map_base
@@ -136,7 +136,7 @@ class CornerBatch:
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
         q = q + (camera[11] - self._offset)[:, None, None] * flow
         X = (q - self._t[:, None]) @ self._R
-        X = X - camera[:3] - np.cross(camera[3:6], X)
+        X = X - camera[:3] - _cross(camera[3:6], X)
         depth = X[:, :, 2]
         behind = (depth < MIN_DEPTH_M).any(axis=1)
         Z = np.maximum(depth, MIN_DEPTH_M)
@@ -164,8 +164,8 @@ class CornerBatch:
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
         B = A @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame
         scale = 1.0 / self._sigma
-        J = np.stack([-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1)
-        H = np.empty((n, 4, 2, 18))
+        J: FloatArray = np.stack([-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1)
+        H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
         H[..., 3:6] = _crossed(A, X)  # -A (φ x X) by φ
         H[..., 6] = f * image / (1.0 + camera[6])
@@ -286,7 +286,16 @@ def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
 
 def _crossed(A: FloatArray, X: FloatArray) -> FloatArray:
     """``A [X]×``, rows of A ``(..., 2, 3)`` and points X ``(..., 3)``: derivative of ``-A (φ × X)`` by φ."""
-    return np.asarray(np.cross(A, X[..., None, :]))
+    return _cross(A, X[..., None, :])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product along the last axis; a third of numpy's time for few points."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
 
 
 def _root(cov: FloatArray) -> FloatArray:

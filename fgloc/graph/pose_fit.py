@@ -94,7 +94,7 @@ class PoseFit:
             if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
                 break
             previous = cost
-            pose = se2.compose(pose, se2.exp(np.linalg.solve(normal, -pull)))
+            pose = se2.compose(pose, se2.exp(np.asarray(np.linalg.solve(normal, -pull), dtype=np.float64)))
         cov = np.linalg.inv(normal)
         return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
 
