@@ -105,9 +105,10 @@ def _slip_contrast(quick: bool) -> Row:
     ratios = []
     for job in jobs(load_suite(BUNDLED), 20.0 if quick else None):
         if job.scenario.name == "patches" and (not quick or job.split == "test"):
-            log = simulate(make_scene(job.scenario, job.seed))
-            slips = slipping(log, job.scenario.robot)
-            error = np.abs(base_twist(log)[:, 0] - wheel_twist(log, job.scenario.robot)[:, 0])
+            scene = make_scene(job.scenario, job.seed)
+            log, robot = simulate(scene), scene.scenario.robot
+            slips = slipping(log, robot)
+            error = np.abs(base_twist(log)[:, 0] - wheel_twist(log, robot)[:, 0])
             ratios.append(error[slips].mean() / error[~slips].mean())
     return Row("physics.slip_contrast", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
 

@@ -26,8 +26,8 @@ from datasets.sim.scenario import (
     Robot,
     Scenario,
     World,
-    channel_rng,
 )
+from datasets.sim.section import channel_rng
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.errors import ConfigError, RecordingError
 

@@ -33,15 +33,19 @@ def record(
             help="a scenario of the bundled suite by name, 'suite' for all of it, or a YAML file with either",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder: bag/, map.yaml, robot.yaml, scenario.yaml; a suite: one for each")],
+    out: Annotated[Path, typer.Option(help="folder of bag/, map.yaml and so on; a suite: one for each")],
     seed: Annotated[int, typer.Option(min=0, help="of a scenario; a suite brings its own")] = 1,
     camera: Annotated[bool, typer.Option(help="render images")] = True,
+    perfect: Annotated[
+        bool, typer.Option("--perfect", help="all is as written, whatever the scenario installs")
+    ] = False,
     jobs_: Annotated[int, typer.Option("--jobs", min=1, help="processes, for a suite")] = 1,
     longest: Annotated[float | None, typer.Option(min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
     """Record one run of a scenario, or all that is missing of a suite."""
     from_file = Path(what).suffix in (".yaml", ".yml")
     suite = load_suite(Path(what) if from_file else BUNDLED)
+    suite = suite.perfect() if perfect else suite
     todo = jobs(suite, longest)
     if (from_file and todo) or what == "suite":
         count = record_suite(todo, out, camera, jobs_)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from datasets.sim.mjcf import intrinsics, render_size
 from datasets.sim.physics import TICK_S, Log, Scene
-from datasets.sim.scenario import Camera, LightStep, channel_rng
+from datasets.sim.scenario import Camera, LightStep
+from datasets.sim.section import channel_rng
 from fgloc.errors import FglocError
 from fgloc.types import FloatArray
 

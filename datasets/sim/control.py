@@ -10,7 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from datasets.sim.scenario import Control, ControlKind, Robot, Scenario, channel_rng
+from datasets.sim.scenario import Control, ControlKind, Robot, Scenario
+from datasets.sim.section import channel_rng
 
 Command = tuple[float, float]  # v [m/s], ω [rad/s]
 Function = Callable[[float], Command]  # of the time within the segment [s]

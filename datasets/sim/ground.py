@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.sim.scenario import Humps, Patch, Ramp, RandomPatches, World, channel_rng
+from datasets.sim.scenario import Humps, Patch, Ramp, RandomPatches, World
+from datasets.sim.section import channel_rng
 
 FloatArray = NDArray[np.float64]
 FRICTION_CELL_M = 0.02

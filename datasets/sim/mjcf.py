@@ -29,7 +29,12 @@ def wheel_names(robot: Robot) -> tuple[str, ...]:
 
 def camera_rotation(camera: Camera) -> FloatArray:
     """``(3, 3)`` R_base_cam of the optical frame."""
-    return np.asarray(rpy_matrix(*np.radians(camera.rpy_deg)) @ _OPTICAL)
+    return optical_rotation(np.radians(camera.rpy_deg))
+
+
+def optical_rotation(rpy: Sequence[float] | FloatArray) -> FloatArray:
+    """``(3, 3)`` rotation of the optical frame whose forward looking body axes are turned by roll, pitch, yaw [rad]."""
+    return np.asarray(rpy_matrix(*rpy) @ _OPTICAL)
 
 
 def render_size(camera: Camera) -> tuple[int, int, float]:

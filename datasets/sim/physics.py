@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from datasets.sim.control import Driver
 from datasets.sim.ground import Ground, make_ground
+from datasets.sim.installed import Installed, install, survey, true_robot
 from datasets.sim.mjcf import build_model, wheel_names
 from datasets.sim.room import make_map
 from datasets.sim.scenario import Robot, Scenario
@@ -46,20 +47,26 @@ class Log:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a scenario and a seed make: model, ground and marker map."""
+    """What a scenario and a seed make: model, ground, markers, and how all was installed."""
 
-    scenario: Scenario
+    scenario: Scenario  # its robot with the radii and track that it really has
     seed: int
     ground: Ground
-    landmarks: LandmarkMap
+    landmarks: LandmarkMap  # where the markers hang
+    surveyed: LandmarkMap  # where the map says that they hang
+    installed: Installed
     model: mujoco.MjModel
 
 
 def make_scene(scenario: Scenario, seed: int) -> Scene:
-    """Lay out the room and compile the model."""
+    """Lay out the room, install robot and markers, and compile the model."""
     ground = make_ground(scenario.world, seed)
     landmarks = make_map(scenario.world, seed)
-    return Scene(scenario, seed, ground, landmarks, build_model(scenario, ground, landmarks))
+    surveyed = survey(scenario.installation, seed, landmarks)
+    installed = install(scenario, seed, landmarks)
+    if scenario.installation is not None:
+        scenario = scenario.model_copy(update={"robot": true_robot(scenario.robot, installed.wheels)})
+    return Scene(scenario, seed, ground, landmarks, surveyed, installed, build_model(scenario, ground, landmarks))
 
 
 def simulate(scene: Scene) -> Log:

@@ -1,4 +1,4 @@
-"""Recording: a scenario and a seed in; a bag, a map, a robot file and the resolved scenario out."""
+"""Recording: a scenario and a seed in; a bag, a map, a robot file, the truth and the resolved scenario out."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from datasets.bag import BagWriter
 from datasets.convert import write_robot
+from datasets.sim.installed import INSTALLED, write_installed
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import make_scene, simulate
 from datasets.sim.scenario import Scenario
@@ -24,11 +25,11 @@ from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # written last: a folder that holds it is complete
 _SCRATCH = ".recording-"
-_FILES = ("bag", "map.yaml", "robot.yaml", DONE)
+_FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
 
 
 def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progress: bool = False) -> Path:
-    """Record one run into ``out``: ``bag/``, ``map.yaml``, ``robot.yaml``, ``scenario.yaml``.
+    """Record one run into ``out``: ``bag/``, ``map.yaml``, ``robot.yaml``, ``installed.yaml``, ``scenario.yaml``.
 
     Nothing appears in ``out`` before the run is complete; an earlier recording there is replaced.
 
@@ -57,7 +58,8 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
             merged = heapq.merge(*streams(scene, log, bag, camera), key=itemgetter(0))
             for _, write in tqdm(merged, unit="msg", disable=None if progress else True, leave=False):
                 write()
-        write_map(scene.landmarks, stage / "map.yaml")
+        write_map(scene.surveyed, stage / "map.yaml")
+        write_installed(scene.installed, stage / INSTALLED)
         write_robot(stage / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
         (stage / DONE).write_text(describe(scenario, seed, camera), encoding="utf-8")
         (out / DONE).unlink(missing_ok=True)
@@ -71,7 +73,9 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
 def is_recorded(scenario: Scenario, seed: int, out: Path, camera: bool) -> bool:
     """Whether ``out`` holds exactly this run, complete."""
     done = out / DONE
-    return done.is_file() and done.read_text(encoding="utf-8") == describe(scenario, seed, camera)
+    return all((out / name).exists() for name in _FILES) and done.read_text(encoding="utf-8") == describe(
+        scenario, seed, camera
+    )
 
 
 def describe(scenario: Scenario, seed: int, camera: bool) -> str:

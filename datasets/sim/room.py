@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets.sim.scenario import World, channel_rng
+from datasets.sim.scenario import World
+from datasets.sim.section import channel_rng
 from fgloc.types import Landmark, LandmarkMap
 
 _FROM_CORNER_M = 0.35

@@ -6,22 +6,13 @@ by friction where the floor is not.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import cv2
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-
-
-class Section(BaseModel):
-    """A part of a scenario: unknown keys are errors, values are immutable."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+from datasets.sim.installation import NamedInstallation
+from datasets.sim.section import Positive, Section, Vector2, Vector3
 
 # --- Robot ------------------------------------------------------------------------------------------------------------
 
@@ -275,8 +266,4 @@ class Scenario(Section):
     rates: Rates = Rates()
     latency: Latency = Latency()
     control: Control = Control()
-
-
-def channel_rng(seed: int, channel: str) -> np.random.Generator:
-    """A generator of its own for each use, so that adding one draw does not change the others."""
-    return np.random.default_rng([seed, *channel.encode()])
+    installation: NamedInstallation = None  # perfect: all is exactly as written

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from datasets.bag import BagWriter
 from datasets.convert import Message
 from datasets.sim.camera import frames, light_level
-from datasets.sim.mjcf import camera_rotation, intrinsics, wheel_names
+from datasets.sim.installed import camera_jitter_s
+from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
-from datasets.sim.scenario import Robot, channel_rng
+from datasets.sim.scenario import Robot
+from datasets.sim.section import channel_rng
 from fgloc import se2
-from fgloc.frames import quaternion_matrix
+from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, IntArray
 
 EPOCH_NS = 1_760_000_000_000_000_000  # time 0 of every run
@@ -85,15 +87,15 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     effort = _mean_over(log.torques, every) + rng.normal(0, robot.motor.effort_noise_nm, angles.shape)
     names = wheel_names(robot)
     twist_cov = np.diag([_ODOMETRY_VARIANCE[0], 1e-6, 1e-6, 1e-6, 1e-6, _ODOMETRY_VARIANCE[1]])
-    stamps = _stamps(log.stamps_s[::every])
+    stamps, late = _stamps(log.stamps_s[::every]), round(1e9 * scene.installed.wheels.time_offset_s)
     for i, received in enumerate(_received(scene, "odometry", stamps)):
-        stamp = stamps[i]
+        stamp = stamps[i] + late
         yield _message(bag.odometry, received, "/odom", stamp, poses[i], twists[i], twist_cov=twist_cov)
         yield _message(bag.joints, received, "/joint_states", stamp, names, angles[i], rates[i], effort[i])
 
 
 def _imu(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
-    imu = scene.scenario.imu
+    imu, installed = scene.scenario.imu, scene.installed.imu
     every = round(1.0 / scene.scenario.rates.imu / TICK_S)
     rng = channel_rng(scene.seed, "imu")
     rates = _mean_over(log.rates, every)
@@ -103,15 +105,17 @@ def _imu(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     dt = every * TICK_S
     force = np.einsum("nji,nj->ni", rotation, np.diff(speeds, axis=0, prepend=speeds[:1]) / dt + _GRAVITY)
     walk = rng.normal(0, imu.gyro_walk * math.sqrt(dt), rates.shape).cumsum(axis=0)
+    R_base_imu = rpy_matrix(*installed.rpy)
+    rates, force = installed.gyro_scale * rates @ R_base_imu, force @ R_base_imu
     gyro = rates + rng.normal(0, imu.gyro_bias, 3) + walk + rng.normal(0, imu.gyro_noise, rates.shape)
     accel = force + rng.normal(0, imu.accel_bias, 3) + rng.normal(0, imu.accel_noise, force.shape)
-    stamps = _stamps(log.stamps_s[::every])
+    stamps, late = _stamps(log.stamps_s[::every]), round(1e9 * installed.time_offset_s)
     for i, received in enumerate(_received(scene, "imu", stamps)):
         yield _message(
             bag.imu,
             received,
             "/imu",
-            stamps[i],
+            stamps[i] + late,
             gyro[i],
             accel[i],
             angular_velocity_variance=imu.gyro_noise**2,
@@ -143,9 +147,9 @@ def _light(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
 
 def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
-    camera = scene.scenario.camera
+    """What the installer believes of where camera and IMU are: the IMU is level."""
+    camera = scene.installed.believed.camera
     assert camera is not None
-    quaternion = quaternion_of(camera_rotation(camera))
     yield _message(
         bag.static_transform,
         EPOCH_NS,
@@ -153,7 +157,7 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
         "base_link",
         "camera_optical",
         camera.position,
-        quaternion,
+        quaternion_of(camera.rotation),
     )
     yield _message(
         bag.static_transform, EPOCH_NS, EPOCH_NS, "base_link", "imu_link", scene.scenario.imu.position, (0, 0, 0, 1)
@@ -161,16 +165,20 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
 
 
 def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
-    camera = scene.scenario.camera
+    """Images and what is believed of their lens, received in order; the clock of the stamps may be late."""
+    camera, believed, installed = scene.scenario.camera, scene.installed.believed.camera, scene.installed.camera
     assert camera is not None
+    assert believed is not None
+    assert installed is not None
     rng = channel_rng(scene.seed, "latency of camera")
+    jitter = camera_jitter_s(scene.scenario.installation, scene.seed, round(log.stamps_s[-1] * camera.rate_hz) + 1)
     least, mean = scene.scenario.latency.camera
-    last = 0
-    K = intrinsics(camera)
+    last = last_stamp = 0
     quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    for frame in frames(scene, log):
-        stamp = stamp_ns(frame.stamp_s)
-        received = stamp + round(1e9 * (0.5 * frame.exposure_s + least + rng.exponential(mean)))
+    for frame, extra_s in zip(frames(scene, log), jitter, strict=False):
+        taken = stamp_ns(frame.stamp_s)
+        stamp = last_stamp = max(taken + round(1e9 * (installed.time_offset_s + extra_s)), last_stamp + 1)
+        received = taken + round(1e9 * (0.5 * frame.exposure_s + least + rng.exponential(mean)))
         received = last = max(received, last)
         data = cv2.imencode(".jpg", frame.image, quality)[1].tobytes()
         yield _message(
@@ -180,8 +188,8 @@ def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
             stamp,
             camera.width,
             camera.height,
-            K,
-            camera.distortion,
+            believed.matrix,
+            believed.distortion,
         )
         yield _message(bag.compressed_image, received, "/camera/image/compressed", stamp, data)
 

@@ -17,7 +17,8 @@ from tqdm import tqdm
 
 from datasets.sim.physics import SimulationError
 from datasets.sim.record import is_recorded, record
-from datasets.sim.scenario import Control, Scenario, Section
+from datasets.sim.scenario import Control, Scenario
+from datasets.sim.section import Section
 from fgloc.errors import ConfigError, FglocError
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
@@ -55,6 +56,14 @@ class Suite(Section):
                 return entry.scenario
         names = ", ".join(e.scenario.name for e in self.entries)
         raise ConfigError(f"scenario '{name}' is not in the suite; it has {names}; or give a YAML file")
+
+    def perfect(self) -> Suite:
+        """The same scenarios where all is exactly as written."""
+        entries = (
+            entry.model_copy(update={"scenario": entry.scenario.model_copy(update={"installation": None})})
+            for entry in self.entries
+        )
+        return Suite(entries=tuple(entries))
 
 
 @dataclass(frozen=True, slots=True)
