@@ -2,8 +2,9 @@
 
 They lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by the hash
 of scenario, seed and versions; what was detected is named by the hash of the detector. After a change of the
-simulator's code remove the folder. Floors are those of the simulated suite with the control functions of the split, all exactly as written;
-test and validation use seeds of their own, which neither the suite's training nor the tuning of any setting has seen.
+simulator's code remove the folder. Floors are those of the simulated suite with the control functions of the split, and
+everything is exactly as written; test and validation use seeds of their own, which neither the suite's training nor the
+tuning of any setting has seen.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recordings of `benchmarks.installed`: drives of the simulated suite by a robot that is not quite what is written of it.
+"""Recordings of `benchmarks.installed`: drives of the simulated suite by robots that are not quite as written.
 
 They are kept as those of `benchmarks.adaptive_recordings` are, whose floors and control functions they take, with seeds
 of their own that no setting was chosen on. In an ``installed`` recording every error of a careful installation is drawn

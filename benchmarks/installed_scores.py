@@ -130,8 +130,8 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
     """What is true of an installation, by the names that a run says it under.
 
     - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
-      ``camera.focal_scale``: true over believed; ``camera.cx_px``, ``.cy_px``; ``camera.k1``, ``.k2``, ``.p1``, ``.p2``;
-    - ``camera.time_offset_s``, ``imu.time_offset_s``: how much later than the wheels' the stamps are, for the same time;
+      ``camera.focal_scale``: true over believed; ``camera.cx_px``, ``.cy_px``, ``.k1``, ``.k2``, ``.p1``, ``.p2``;
+    - ``camera.time_offset_s``, ``imu.time_offset_s``: how much later than the wheels' their stamps are;
     - ``wheels.left_scale``, ``.right_scale``, ``.radius_scale`` (of the mean), ``.track_scale``: true over believed;
       ``wheels.radius_ratio``: left over right, true over believed;
     - ``imu.roll``, ``.pitch``, ``.yaw`` [rad], ``gyro.scale``: reported over true;
@@ -165,12 +165,23 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(value) for name, value in out.items()}
 
 
-def found_errors(found: Found, truth: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+def found_by(result: RunResult) -> Found | None:
+    """What a run says of the installation; None if it says nothing."""
+    told = getattr(result, "installation", None)
+    return None if told is None else {name: (float(value), float(sigma)) for name, (value, sigma) in told.items()}
+
+
+def found_errors(found: Found, installed: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Error and sigma of each value that a run found.
+
+    Args:
+        found: what it found.
+        installed: content of ``installed.yaml``.
 
     Raises:
         ValueError: a name that the truth does not know.
     """
+    truth = truth_values(installed)
     unknown = sorted(set(found) - set(truth))
     if unknown:
         raise ValueError(f"{', '.join(unknown)}: not in installed.yaml, which has {', '.join(sorted(truth))}")
