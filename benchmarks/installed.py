@@ -173,16 +173,13 @@ def best_over_fgloc(row_id: str, scores: Sequence[Scores]) -> Row:
 
 def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[list[float], Row | None]:
     """The figure of each seed; and a row that says why there is none, if one is missing."""
-    failed = [s.failed for s in scores if s.failed]
-    values = [figure(s) for s in scores if not s.failed]
+    values = [None if s.failed else figure(s) for s in scores]
     known = [v for v in values if v is not None and math.isfinite(v)]
-    if failed:
-        reason = f"{len(failed)} of {len(scores)} runs failed: {failed[0]}"
-    elif len(known) < len(values):
-        reason = f"{len(values) - len(known)} of {len(values)} runs say nothing of it"
-    else:
+    if len(known) == len(scores):
         return known, None
-    return known, Row(row_id, None, n=len(scores), reason=reason)
+    missing = [s for s, v in zip(scores, values, strict=True) if v is None or not math.isfinite(v)]
+    why = next((said for s in missing if (said := s.failed or s.batch_failed)), "the run says nothing of it")
+    return known, Row(row_id, None, n=len(scores), reason=f"in {len(missing)} of {len(scores)} runs: {why}")
 
 
 if __name__ == "__main__":

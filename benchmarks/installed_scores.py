@@ -47,6 +47,7 @@ class Scores:
         map_over_survey: error of the markers' places over that of the survey.
         textbook_mm: mean distance from the truth of each textbook pipeline, by name.
         failed: why there are no figures.
+        batch_failed: why the run could not be smoothed.
     """
 
     online: Errors | None = None
@@ -58,6 +59,7 @@ class Scores:
     map_over_survey: float | None = None
     textbook_mm: dict[str, float] = field(default_factory=dict)
     failed: str = ""
+    batch_failed: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """What `from_json` reads."""

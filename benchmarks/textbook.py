@@ -9,9 +9,10 @@ gyro's turn at constant noise, and take the map, the camera and ``robot.yaml`` a
   step; a new start from the markers after a few images of which none was accepted.
 
 The constants are the best of a small grid on validation recordings with perfect installation (seeds 41 and 42: without
-failure, on patches, with 30 s of darkness, with 30 % of the ids wrong, with a moved marker, with one dead encoder; least
-geometric mean of the ATE); no other recording was looked at. At the start robots stand, which tells the gyro's bias. Steps are those that fgloc
-cuts, so that all give their poses at the same times; the pipelines share its reading of wheel angles and no other part.
+failure, on patches, with 30 s of darkness, with 30 % of wrong ids, with a moved marker, with a dead encoder; the least
+geometric mean of the ATE); no other recording was looked at. Robots stand at the start, which tells the gyro's bias.
+Steps are those that fgloc cuts, so that all give their poses at the same times; the pipelines share its reading of wheel
+angles and its poses from single markers, and no other part.
 """
 
 from __future__ import annotations

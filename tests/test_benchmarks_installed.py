@@ -199,9 +199,12 @@ def test_rows_are_means_percentiles_and_root_mean_squares():
 
 
 def test_a_row_says_why_it_has_no_value():
-    assert row("found.track_percent", [scores(), scores()]).reason == "2 of 2 runs say nothing of it"
+    assert row("found.track_percent", [scores(), scores()]).reason == "in 2 of 2 runs: the run says nothing of it"
     failed = [scores(), Scores(failed="no pose was ever found")]
-    assert row("none.online.ate_mm", failed).reason == "1 of 2 runs failed: no pose was ever found"
+    assert row("none.online.ate_mm", failed).reason == "in 1 of 2 runs: no pose was ever found"
+    unsmoothed = [scores(), replace(scores(), batch=None, batch_failed="EstimatorError: no")]
+    assert row("none.batch.ate_mm", unsmoothed).reason == "in 1 of 2 runs: EstimatorError: no"
+    assert row("none.online.ate_mm", unsmoothed).value == 1.0
 
 
 def test_the_best_pipeline_of_the_textbook_is_that_with_the_least_mean():
