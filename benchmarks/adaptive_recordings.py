@@ -2,16 +2,16 @@
 
 They lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by the hash
 of scenario, seed and versions; what was detected is named by the hash of the detector. After a change of the
-simulator's code remove the folder. Floors are those of the simulated suite, as installed unless a scenario says
-otherwise, with the control functions of the split; test and validation use seeds of their own, which neither the
-suite's training nor the tuning of any setting has seen.
+simulator's code remove the folder. Floors are those of the simulated suite with the control functions of the split, and
+everything is exactly as written; test and validation use seeds of their own, which neither the suite's training nor the
+tuning of any setting has seen.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
@@ -26,16 +27,29 @@ from datasets.sim.record import describe, is_recorded, robot_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 from fgloc.config import Config, MarkersConfig
-from fgloc.frames import quaternion_yaw
+from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.outputs import atomic_file
-from fgloc.recording.reader import open_recording
+from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.images import ImageError
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
-from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent, LandmarkMap, MarkerCorners, TruthEvent
+from fgloc.types import (
+    Camera,
+    CameraInfoEvent,
+    CornersEvent,
+    Event,
+    FloatArray,
+    ImageEvent,
+    LandmarkMap,
+    MarkerCorners,
+    TruthEvent,
+)
 
 Split = Literal["train", "validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]
+Change = Callable[[Scenario], Scenario]
+"""Of a floor's scenario, by another benchmark: a function of a module, so that recordings can be told apart."""
 SEEDS: dict[Split, tuple[int, ...]] = {
     "train": (13, 14),
     "validation": (22, 23, 24),
@@ -64,6 +78,8 @@ class Recorded:
     slip: FloatArray  # (n, 3) true minus wheels' twist: forward, sideways [m/s], turn [rad/s]
     truth: FloatArray  # (m, 4) seconds from the start, x, y, yaw
     duration_s: float
+    camera: Camera | None = None  # as the recording says
+    installed: Mapping[str, Any] | None = None  # where it is not what is written: the truth
 
     @property
     def path_m(self) -> float:
@@ -77,7 +93,12 @@ def cache_folder() -> Path:
     return Path(os.environ.get("FGLOC_BENCHMARK_CACHE", Path(user) / "fgloc" / "benchmarks"))
 
 
-def scenario(floor: Floor, split: Split) -> Scenario:
+def unchanged(made: Scenario) -> Scenario:
+    """The scenario as it is."""
+    return made
+
+
+def scenario(floor: Floor, split: Split, change: Change = unchanged) -> Scenario:
     """The suite's scenario of this name with the control functions of the split."""
     entry = next(e for e in load_suite(BUNDLED).entries if e.scenario.name == floor)
     control = next(run.control for run in entry.runs if run.split == split)
@@ -88,35 +109,51 @@ def scenario(floor: Floor, split: Split) -> Scenario:
         "control": control,
         "duration_s": DURATION_S,
         "camera": camera.model_copy(update={"rate_hz": _CAMERA_HZ}),
+        "installation": None,
     }
-    return entry.scenario.model_copy(update=changes)
+    return change(entry.scenario.model_copy(update=changes))
 
 
-def prepare(floors: Sequence[Floor], split: Split, seeds: Sequence[int]) -> None:
+def prepare(floors: Sequence[Floor], split: Split, seeds: Sequence[int], change: Change = unchanged) -> None:
     """Record what is not yet there, in as many processes as there are cores.
 
     Raises:
         RenderError: there is no OpenGL.
         SimulationError: a run failed.
     """
-    todo = [Job(scenario(f, split), seed, _name(f, split, seed), split) for f in floors for seed in seeds]
-    if any(not is_recorded(job.scenario, job.seed, cache_folder() / job.folder, True) for job in todo):
+    todo = [job(floor, split, seed, change) for floor in floors for seed in seeds]
+    record_missing(todo)
+
+
+def job(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> Job:
+    """What is to be recorded, and in which folder of the cache."""
+    made = scenario(floor, split, change)
+    key = hashlib.sha256(describe(made, seed, True).encode()).hexdigest()[:12]
+    return Job(made, seed, f"{floor}_{split}_{seed}_{key}", split)
+
+
+def record_missing(todo: list[Job]) -> None:
+    """Record what is not yet there; raises as `prepare`."""
+    if any(not is_recorded(j.scenario, j.seed, cache_folder() / j.folder, True) for j in todo):
         record_suite(todo, cache_folder(), camera=True, workers=os.cpu_count() or 1)
 
 
 @lru_cache(maxsize=6)
-def load(floor: Floor, split: Split, seed: int) -> Recorded:
+def load(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> Recorded:
     """One recording, made first if it is not there."""
-    prepare([floor], split, [seed])
-    made = scenario(floor, split)
-    folder = cache_folder() / _name(floor, split, seed)
-    config = Config.model_validate(robot_settings(made))
+    made = job(floor, split, seed, change)
+    record_missing([made])
+    folder = cache_folder() / made.folder
+    config = Config.model_validate(robot_settings(made.scenario))
     landmarks = load_map(folder / "map.yaml")
     with open_recording(folder / "bag", config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
         found = _sightings(folder, landmarks.dictionary, recording.events())
         events = tuple(_replaced(recording.events(), found))
+        camera = _camera(recording, events)
     slip_s, slip, slipping = _slip(folder / "bag", start_ns)
+    truth_path = folder / "installed.yaml"
+    installed = yaml.safe_load(truth_path.read_text(encoding="utf-8")) if truth_path.is_file() else None
     truth = [
         ((e.stamp_ns - start_ns) * 1e-9, e.position[0], e.position[1], quaternion_yaw(e.orientation))
         for e in events
@@ -135,6 +172,8 @@ def load(floor: Floor, split: Split, seed: int) -> Recorded:
         slip=slip,
         truth=np.array(truth),
         duration_s=duration_s,
+        camera=camera,
+        installed=installed,
     )
 
 
@@ -164,9 +203,10 @@ def moved_interval(recorded: Recorded, start_s: float, distance_m: float) -> tup
     raise ValueError(f"{recorded.name}: from {start_s} s on never {distance_m} m away from any of its places")
 
 
-def _name(floor: Floor, split: Split, seed: int) -> str:
-    made = hashlib.sha256(describe(scenario(floor, split), seed, True).encode())
-    return f"{floor}_{split}_{seed}_{made.hexdigest()[:12]}"
+def _camera(recording: Recording, events: Sequence[Event]) -> Camera:
+    info = next(e for e in events if isinstance(e, CameraInfoEvent))
+    base = next(name for name in BASE_NAMES if name in recording.frames)
+    return camera_from_info(info, recording.frames.lookup(base, info.frame_id))
 
 
 @cache

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,22 @@ from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import CornersEvent, Estimate, Event, RangeBearingEvent, Step, Trajectory
+from fgloc.types import (
+    CornersEvent,
+    Estimate,
+    Event,
+    LandmarkMap,
+    RangeBearingEvent,
+    RunResult,
+    Step,
+    Trajectory,
+)
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]
 
 FAILED_S = (30.0, 50.0)  # when encoders fail
-KIDNAPPED_S, KIDNAPPED_M = 30.0, 3.0
+KIDNAPPED_S, KIDNAPPED_M = 30.0, (3.0, 2.5, 2.0, 1.5, 1.0)  # the farthest that the drive allows
 MOVED_M = 0.5
 _FAILURE = TypeAdapter(AnyFailure)
 
@@ -79,9 +89,7 @@ CASES: dict[str, Case] = {
     "onewheel": _encoders({"kind": "encoder_dead", "wheel": "left"}),
     "kidnap": Case(
         "unequal_radii",
-        lambda recorded: [
-            {"kind": "kidnap", "when": {"intervals": [moved_interval(recorded, KIDNAPPED_S, KIDNAPPED_M)]}}
-        ],
+        lambda recorded: [{"kind": "kidnap", "when": {"intervals": [carried_interval(recorded)]}}],
     ),
 }
 
@@ -117,8 +125,39 @@ def cell(
     return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Replayed:
+    """What came of one run of a recording with failures.
+
+    Attributes:
+        online: the estimates as they were made, with all decisions.
+        batch: the smoothed run, if it was asked for.
+        chain: the failures.
+        given: the images' corners that the localizer was given.
+        steps: that it was given.
+        landmarks: the map that it was given.
+    """
+
+    online: RunResult
+    batch: RunResult | None
+    chain: Sequence[Failure]
+    given: Sequence[Event]
+    steps: Sequence[Step]
+    landmarks: LandmarkMap
+
+
 def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Figures:
-    """One run of a recording with failures.
+    """Figures of one run of a recording with failures.
+
+    Raises:
+        FglocError: the configuration does not fit the recording.
+    """
+    made = replayed(recorded, config, chain, seed, batch)
+    return lost(seed) if made is None else score(recorded, seed, config, made.online, made.batch, chain, made.given)
+
+
+def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Replayed | None:
+    """One run of a recording with failures; None if no pose was ever found.
 
     Raises:
         FglocError: the configuration does not fit the recording.
@@ -126,9 +165,11 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
     ids = tuple(sorted(recorded.landmarks.landmarks))
     scenes = [Scene(recorded.start_ns, recorded.duration_s, config, ids, rng) for rng in generators(len(chain), seed)]
     estimates: list[Estimate] = []
+    steps: list[Step] = []
     given: list[Event] = []
 
-    def note(_: Step, estimate: Estimate | None) -> None:
+    def note(step: Step, estimate: Estimate | None) -> None:
+        steps.append(step)
         if estimate is not None:
             estimates.append(estimate)
 
@@ -158,7 +199,7 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
         except EstimatorError:
             if estimates:
                 raise
-            return lost(seed)
+            return None
     online = replace(
         result,
         trajectory=Trajectory(
@@ -168,7 +209,7 @@ def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: i
         ),
         modes=tuple(e.mode for e in estimates),
     )
-    return score(recorded, seed, config, online, result if batch else None, chain, given)
+    return Replayed(online, result if batch else None, chain, given, steps, landmarks)
 
 
 def changed(config: Config, changes: Changes) -> Config:
@@ -188,6 +229,18 @@ def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:
 def failure(described: dict[str, Any]) -> Failure:
     """A failure as a suite of ablations describes it."""
     return _FAILURE.validate_python(described)
+
+
+def carried_interval(recorded: Recorded) -> Interval:
+    """What is cut out of a drive so that the robot is carried away [s].
+
+    Raises:
+        ValueError: the robot stays too near to where it is.
+    """
+    for distance_m in KIDNAPPED_M[:-1]:
+        with suppress(ValueError):
+            return moved_interval(recorded, KIDNAPPED_S, distance_m)
+    return moved_interval(recorded, KIDNAPPED_S, KIDNAPPED_M[-1])
 
 
 def moved_id(recorded: Recorded) -> int:
