@@ -133,7 +133,7 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
 
     - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
       ``camera.focal_scale``: true over believed; ``camera.cx_px``, ``.cy_px``, ``.k1``, ``.k2``, ``.p1``, ``.p2``;
-    - ``camera.time_offset_s``, ``imu.time_offset_s``: how much later than the wheels' their stamps are;
+    - ``camera.time_offset_s``, ``wheels.time_offset_s``: how much later than the IMU's their stamps are;
     - ``wheels.left_scale``, ``.right_scale``, ``.radius_scale`` (of the mean), ``.track_scale``: true over believed;
       ``wheels.radius_ratio``: left over right, true over believed;
     - ``imu.roll``, ``.pitch``, ``.yaw`` [rad], ``gyro.scale``: reported over true;
@@ -152,8 +152,8 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
     out |= dict(zip((f"imu.{axis}" for axis in axes[3:]), imu["rpy"], strict=True))
     out |= {
         "camera.focal_scale": float(np.mean(camera["focal_px"]) / np.mean(believed["camera"]["focal_px"])),
-        "camera.time_offset_s": camera["time_offset_s"] - wheels["time_offset_s"],
-        "imu.time_offset_s": imu["time_offset_s"] - wheels["time_offset_s"],
+        "camera.time_offset_s": camera["time_offset_s"] - imu["time_offset_s"],
+        "wheels.time_offset_s": wheels["time_offset_s"] - imu["time_offset_s"],
         "wheels.left_scale": left,
         "wheels.right_scale": right,
         "wheels.radius_scale": 0.5 * (left + right),

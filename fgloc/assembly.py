@@ -56,6 +56,7 @@ class Assembly:
     stepper: Stepper
     wheels: WheelMotion
     landmarks: LandmarkSensor
+    camera: Camera | None
     learned: LearnedMotion | None
     localizer: Localizer
     diagnosis: Diagnosis
@@ -115,6 +116,7 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         stepper=Stepper(config.keyframes, config.gate, config.estimator.lag_s),
         wheels=wheels,
         landmarks=landmarks,
+        camera=camera,
         learned=learned,
         localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro),
         diagnosis=Diagnosis(config, landmark_map, camera, T_base_sensor, seen_by, imu_up),

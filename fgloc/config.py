@@ -43,7 +43,7 @@ class RecordingConfig(Section):
         0.003,
         ge=0,
         le=1.0,
-        description="s: how far the stamps of the wheels, to which all others are compared, may be off",
+        description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
     )
     stamp_offset_s: dict[Role, float] = Field({}, description="added to a role's stamps [s]: a known clock offset")
     base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
@@ -132,6 +132,9 @@ class WheelsConfig(Section):
         description="how far the radii of both wheels may be off alike; estimated, as all sigmas here",
     )
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
+    time_offset_sigma_s: float = Field(
+        0.01, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
+    )
     yaw_per_m_sigma: float = Field(
         0.015,
         ge=0,
@@ -146,9 +149,6 @@ class GyroConfig(Section):
     use: bool = True
     yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
-    time_offset_sigma_s: float = Field(
-        0.005, ge=0, le=1.0, description="s: how far its clock may be off that of the wheels; estimated"
-    )
     bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
     bias_walk: float = Field(0.0003, ge=0, description="rad/s/√s")
 
@@ -166,7 +166,10 @@ class CameraConfig(Section):
     principal_sigma_px: float = Field(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
     distortion_sigma: float = Field(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
     time_offset_sigma_s: float = Field(
-        0.012, ge=0, le=1.0, description="s: how far its clock may be off that of the wheels; estimated"
+        0.012,
+        ge=0,
+        le=1.0,
+        description="s: how far its clock may be off that of the gyro (without one: of the wheels); estimated",
     )
     time_jitter_s: float = Field(0.002, ge=0, le=0.1, description="s: what each stamp is off by on its own")
 
@@ -200,7 +203,7 @@ class LandmarksConfig(Section):
         0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
     )
     time_offset_sigma_s: float = Field(
-        0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of the wheels; estimated"
+        0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
     )
     yaw_sigma_rad: float | None = Field(
         None, gt=0, description="of a marker pose's yaw; None: marker poses are used as range and bearing only"

@@ -35,6 +35,7 @@ from fgloc.timing import Stopwatch
 from fgloc.types import (
     Decision,
     Estimate,
+    FloatArray,
     LandmarkMap,
     LandmarkMeasurement,
     MotionMeasurement,
@@ -78,7 +79,9 @@ class Localizer:
             gyro: the gyro, if any.
         """
         self.config = config
-        self.factors = LandmarkFactors(landmark_map, installation_of(config, landmark_map, landmarks.sees_corners))
+        self.factors = LandmarkFactors(
+            landmark_map, installation_of(config, landmark_map, landmarks.sees_corners, gyro is not None)
+        )
         kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
         self.estimator: Estimator = kind(config.estimator, self.factors, keep_all)
         self.weights = Weights(config, self.factors)
@@ -285,8 +288,14 @@ class Localizer:
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._whereabouts.mode
-        cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+        frame.clock_cov = self._by_clock(step)
+        cov = se2.rotate_cov(belief.cov + frame.clock_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
+
+    def _by_clock(self, step: Step) -> FloatArray:
+        """Covariance ``(3, 3)`` of the pose that comes from the clock to which the others are compared."""
+        twist = self._compensation.twist(step, step.stamp_ns)
+        return np.asarray(np.outer(twist, twist) * self.config.recording.clock_sigma_s**2)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
+from fgloc.calibration.found import found_values
 from fgloc.config import Config, Role
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
@@ -112,12 +113,14 @@ def run(
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
     wheels: WheelCalibration | None = None
+    installed = parts.localizer.estimator.installed
     if mode == "batch":
         try:
             smoothed = smooth_run(parts)
         except EstimatorError as error:
             raise EstimatorError(" ".join([_sentence(str(error)), *hints])) from error
         estimates, landmarks, wheels = smoothed.estimates, smoothed.landmarks, smoothed.wheels
+        installed = smoothed.installation
         notes = (*notes, *smoothed.notes)
     if again := len(estimates) - len(last_pass(estimates)):
         notes = (
@@ -139,6 +142,9 @@ def run(
         spans=replay.spans(),
         source=recording_path,
         wheels=wheels,
+        installation=found_values(
+            parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
+        ),
     )
 
 

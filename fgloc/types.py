@@ -429,3 +429,4 @@ class RunResult:
     spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None
     wheels: WheelCalibration | None = None  # if it was asked for
+    installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name

@@ -31,7 +31,7 @@ _OF_MOTION = (
     "wheels.yaw_per_m",
     "learned.scale",
     "gyro.scale",
-    "gyro.time_offset_s",
+    "wheels.time_offset_s",
 )
 
 
@@ -98,7 +98,13 @@ class MotionSources:
         """
         if step.dt <= 0.0:
             return Readings()
-        wheels = self._installed(self._wheels.measure(step))
+        wheels = self._wheels.measure(step)
+        if wheels is not None:
+            change = None
+            if "wheels.time_offset_s" in self._factors.installation.index:
+                start, end = self._wheels.twist(step, step.start_ns), self._wheels.twist(step, step.stamp_ns)
+                change = end - se2.adjoint(se2.inverse(wheels.motion)) @ start
+            wheels = self._installed(wheels, change=change)
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
@@ -113,14 +119,19 @@ class MotionSources:
             self._silent_s = 0.0
         return readings
 
-    def _installed(self, m: MotionMeasurement | None, turn: Turn | None = None) -> MotionMeasurement | None:
+    def _installed(
+        self, m: MotionMeasurement, turn: Turn | None = None, change: FloatArray | None = None
+    ) -> MotionMeasurement:
         """The motion with the installation as it is known now, and its derivatives by it.
+
+        Args:
+            m: as it is reported.
+            turn: what the gyro says, if the motion is made of it.
+            change: ``(3,)`` of the wheels' twist over the step: by it a wrong clock shows.
 
         Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
         extrinsics using pre-integration" (differential drive); the right Jacobian of SE(2) to first order.
         """
-        if m is None:
-            return None
         rho_x, rho_y, phi = se2.log(m.motion)
         by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
         derivatives: dict[str, FloatArray] = {}
@@ -128,11 +139,12 @@ class MotionSources:
             derivatives["wheels.radius"] = np.array([rho_x, rho_y, phi])
             derivatives["wheels.track"] = -phi * by_turn
             derivatives["wheels.yaw_per_m"] = rho_x * by_turn
+            if change is not None:
+                derivatives["wheels.time_offset_s"] = change
         if m.source == "learned":
             derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
         if turn is not None:
             derivatives["gyro.scale"] = phi * by_turn
-            derivatives["gyro.time_offset_s"] = turn.change * by_turn
         index, mean = self._factors.installation.index, self._factors.believed.mean
         kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
@@ -146,7 +158,7 @@ class MotionSources:
         if self._learned is None:
             return None
         m = self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
-        return self._installed(m, self._turn if self.gyro_is_read else None)
+        return None if m is None else self._installed(m, self._turn if self.gyro_is_read else None)
 
     def combine(
         self, readings: Readings, off: Mapping[str, str] | None = None, footing: Footing | None = None

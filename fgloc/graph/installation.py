@@ -1,8 +1,9 @@
 """The installation as a state: what map, camera, clocks, wheels and gyro are off by, estimated beside the poses.
 
+
 The state θ ``(n,)`` holds deviations from what map and configuration say. Each has a prior sigma; one of sigma 0 is
-taken as exact and is no state. What can't be observed stays at its prior, and its sigma reaches the pose's covariance through
-the joint covariance of pose and θ.
+taken as exact and is no state. What can't be observed stays at its prior, and its sigma reaches the pose's covariance
+through the joint covariance of pose and θ.
 """
 
 from __future__ import annotations
@@ -91,13 +92,19 @@ _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block i
 MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but for noise, to bound the work of a step
 
 
-def installation_of(config: Config, landmark_map: LandmarkMap | None, corners: bool) -> Installation:
+def installation_of(
+    config: Config, landmark_map: LandmarkMap | None, corners: bool, has_gyro: bool = False
+) -> Installation:
     """The parameters of a run, with their priors.
+
+    The clock of the gyro is what all others are compared to, as it alone sees how the robot itself moves; without a
+    gyro it is that of the wheels.
 
     Args:
         config: the prior sigmas.
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
+        has_gyro: whether there is a gyro.
     """
     wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
     sigmas = {
@@ -105,7 +112,7 @@ def installation_of(config: Config, landmark_map: LandmarkMap | None, corners: b
         "wheels.track": wheels.turn_scale_sigma,
         "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
         "gyro.scale": gyro.scale_sigma,
-        "gyro.time_offset_s": gyro.time_offset_sigma_s,
+        "wheels.time_offset_s": wheels.time_offset_sigma_s if has_gyro else 0.0,
         "learned.scale": config.motion.scale_sigma,
     }
     if landmark_map is None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import gtsam
+import numpy as np
 
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.slip_noise import Footing
@@ -58,6 +59,7 @@ class Keyframe:
     footing: Footing = field(default_factory=Footing)  # at the start of the step
     scale: float = 1.0  # on the covariances of the motions that these make ...
     doubt: FloatArray | None = None  # ... and what was added to them
+    clock_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose, by the clock of reference
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
 
     @property

@@ -164,7 +164,9 @@ class CornerBatch:
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
         B = A @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame
         scale = 1.0 / self._sigma
-        J: FloatArray = np.stack([-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1)
+        J: FloatArray = np.stack(
+            [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
+        )
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
         H[..., 3:6] = _crossed(A, X)  # -A (φ x X) by φ

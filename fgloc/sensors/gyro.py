@@ -29,12 +29,10 @@ class Turn:
     Attributes:
         yaw: [rad], rid of the bias.
         variance: [rad²], of the noise and of what the bias may be off.
-        change: [rad/s] of the rate from the step's start to its end.
     """
 
     yaw: float
     variance: float
-    change: float = 0.0
 
 
 class Gyro:
@@ -91,8 +89,7 @@ class Gyro:
         yaw = raw - self.bias * dt
         drift = self.bias_variance * ((blind_s + dt) ** 2 - blind_s**2)
         noise = self._config.yaw_per_sqrt_s**2 * dt
-        ends = self.rates_at(step.imu, (step.start_ns, step.stamp_ns))
-        return Turn(yaw, noise + drift, float(ends[1] - ends[0]))
+        return Turn(yaw, noise + drift)
 
     def rates_at(self, events: tuple[ImuEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
         """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""

@@ -19,7 +19,6 @@ from fgloc.types import (
     Step,
 )
 
-_HALF_NS = 20_000_000  # the speed at an exposure is the mean over this long before and after
 _SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
 
 
@@ -82,7 +81,7 @@ class MotionCompensation:
             if not found:
                 continue
             exposure_ns = event.stamp_ns - round(offset_s * 1e9)
-            twist = self._twist(step, exposure_ns)
+            twist = self.twist(step, exposure_ns)
             late = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
             late = [
                 dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, CornerMeasurement) else m for m in late
@@ -95,10 +94,9 @@ class MotionCompensation:
             measured.extend(late)
         return measured
 
-    def _twist(self, step: Step, at_ns: int) -> FloatArray:
+    def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Of the base at a time near the step's end."""
-        motion, _ = self._wheels.carry(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
-        twist = se2.log(motion) / (2e-9 * _HALF_NS)
+        twist = self._wheels.twist(step, at_ns)
         if self._gyro is not None and step.imu:
             twist[2] = self._gyro.rates_at(step.imu, (at_ns,))[0]
         return twist

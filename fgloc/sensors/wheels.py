@@ -22,6 +22,8 @@ _TRACKS: dict[str, type[Track]] = {
     "command": CommandTrack,
 }
 
+_HALF_NS = 20_000_000
+
 
 class WheelMotion:
     """Integrates the wheels' motion over a step, with covariance.
@@ -130,6 +132,11 @@ class WheelMotion:
             return motion, cov
         ad = se2.adjoint(motion)
         return se2.inverse(motion), np.asarray(ad @ cov @ ad.T)
+
+    def twist(self, step: Step, at_ns: int) -> FloatArray:
+        """Of the base ``(3,)`` [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
+        motion, _ = self.carry(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
+        return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
 
     def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
         return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)

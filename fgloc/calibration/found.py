@@ -1,0 +1,93 @@
+"""What a run has found of the installation, in the units and frames that a user gives it in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.types import Camera, FloatArray, LandmarkMap
+
+Found = Mapping[str, tuple[float, float]]
+"""Value and sigma by name."""
+
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # optical axes in body axes (REP 103)
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def found_values(
+    installation: Installation,
+    belief: InstallationBelief,
+    config: Config,
+    camera: Camera | None,
+    landmark_map: LandmarkMap | None,
+) -> Found:
+    """Values with their sigmas, by name.
+
+    - ``wheels.radius_scale``, ``.track_scale``, ``gyro.scale`` (reported over true), ``learned.scale``;
+      ``wheels.radius_ratio``: left over right, where the track is known, else ``wheels.yaw_per_m`` [rad/m];
+    - ``camera.time_offset_s``, ``wheels.time_offset_s``, ``sightings.time_offset_s``: how much later than the gyro's
+      (without a gyro: the wheels') their stamps are; ``sightings.range_scale``, ``.bearing_offset_rad``;
+    - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
+      ``camera.focal_scale``, ``.cx_px``, ``.cy_px``, ``.k1``, ``.k2``;
+    - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
+    """
+    out: dict[str, tuple[float, float]] = {}
+    sigma = np.sqrt(np.diag(belief.cov))
+
+    def add(name: str, source: str, at: float = 0.0, gain: float = 1.0) -> None:
+        if source in installation.index:
+            i = installation.index[source]
+            out[name] = (at + gain * float(belief.mean[i]), abs(gain) * float(sigma[i]))
+
+    add("wheels.radius_scale", "wheels.radius", 1.0)
+    add("wheels.track_scale", "wheels.track", 1.0)
+    track = config.wheels.track
+    if track is not None:
+        add("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -track)
+    else:
+        add("wheels.yaw_per_m", "wheels.yaw_per_m", config.wheels.yaw_per_m)
+    add("gyro.scale", "gyro.scale", 1.0, -1.0)
+    add("wheels.time_offset_s", "wheels.time_offset_s")
+    for name in ("range_scale", "bearing_offset_rad", "time_offset_s"):
+        add(f"sightings.{name}", f"sightings.{name}", 1.0 if name == "range_scale" else 0.0)
+    if camera is not None and "camera" in installation.blocks:
+        first = installation.blocks["camera"][0]
+        out |= _mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
+        D = np.concatenate([camera.D, np.zeros(2)])
+        add("camera.focal_scale", "camera.focal", 1.0)
+        add("camera.cx_px", "camera.cx_px", float(camera.K[0, 2]))
+        add("camera.cy_px", "camera.cy_px", float(camera.K[1, 2]))
+        add("camera.k1", "camera.k1", float(D[0]))
+        add("camera.k2", "camera.k2", float(D[1]))
+        add("camera.time_offset_s", "camera.time_offset_s")
+    for i in installation.landmarks if landmark_map is not None else ():
+        place = landmark_map.landmarks[i].position  # type: ignore[union-attr]
+        for axis, at in zip("xyz", place.tolist(), strict=True):
+            add(f"map.{i}.{axis}", f"map.{i}.{axis}_m", at)
+    return out
+
+
+def _mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
+    """Pose of the camera's body axes in the base frame; angles are small, so that sigmas are those about its axes."""
+    R = camera.T_base_cam[:3, :3]
+    T = camera.T_base_cam[:3, 3] + R @ mean[:3]
+    turned = R @ _rotation(mean[3:]) @ _OPTICAL.T
+    rpy = (
+        np.arctan2(turned[2, 1], turned[2, 2]),
+        -np.arcsin(np.clip(turned[2, 0], -1.0, 1.0)),
+        np.arctan2(turned[1, 0], turned[0, 0]),
+    )
+    to_base = np.kron(np.eye(2), R)
+    sigmas = np.sqrt(np.diag(to_base @ cov @ to_base.T))
+    return {
+        f"camera.{axis}": (float(value), float(s)) for axis, value, s in zip(_AXES, [*T, *rpy], sigmas, strict=True)
+    }
+
+
+def _rotation(vector: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
