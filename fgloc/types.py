@@ -330,6 +330,7 @@ class Mode(StrEnum):
     """How the estimate came about."""
 
     OK = "OK"
+    UNCONFIRMED = "UNCONFIRMED"  # by sightings that nothing checks yet: before the first pose is certain
     DEAD_RECKONING = "DEAD_RECKONING"
     LOST = "LOST"
 

@@ -36,11 +36,14 @@ class Whereabouts:
         defied: how far ``(3,)`` from the given first pose, in its frame, sightings put the robot; None: they did not.
     """
 
-    def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
+    def __init__(
+        self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors, keep_all: bool = False
+    ) -> None:
+        """Take the parts; ``keep_all``: the steps before the first pose are all kept for the replay."""
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
         self._known = factors.known
-        self._initializer = Initializer(config, landmark_map, factors)
+        self._initializer = Initializer(config, landmark_map, factors, keep_all)
         self.lost = False
         self.fix_elapsed_s = 0.0
         self.defied: FloatArray | None = None
@@ -48,10 +51,12 @@ class Whereabouts:
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._speaking_for = self._speaking_against = 0  # sightings
         self._jumps: list[FloatArray] = []
+        self._told = False  # whether a pose that is not confirmed has been told
+        self._never_found = False
 
     def begin_segment(self, last: Belief | None) -> Belief | None:
         """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
-        self.lost = self._given = False
+        self.lost = self._given = self._told = False
         self._initializer.reset()
         given = self._config.initial_pose
         if given is not None and last is None:
@@ -151,6 +156,27 @@ class Whereabouts:
     ) -> Start | None:
         """While waiting: add a step; the start once it is clear."""
         return self._initializer.collect(step, motions, sightings, readings)
+
+    def unconfirmed(self) -> Belief | None:
+        """Where the robot is by the sightings so far, before they are enough to check one another.
+
+        Told from when the pose is known well enough for a sighting to be judged by it.
+        """
+        belief = self._initializer.hypotheses.belief()
+        if belief is None or (not self._told and self.nowhere(belief)):
+            return None
+        self._told = True
+        return belief
+
+    def give_up(self) -> Start | None:
+        """The segment is over, and its first pose was not found: what is to be replayed, and from where."""
+        if not self.waiting or self.lost:
+            return None
+        start = self._initializer.give_up()
+        if start is not None and self.nowhere(start.newest):
+            self._never_found = True
+            self.get_lost()
+        return start
 
     def search(
         self,
