@@ -132,7 +132,7 @@ class Localizer:
             prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
             self._whereabouts.start_known()
             return self._start(step, prior, sightings)
-        motions = self.sources.combine(readings) or [self.sources.unknown(step)]
+        motions = self.sources.combine(readings) or [self.sources.unknown(step, readings)]
         started = self._whereabouts.collect(step, motions, sightings, readings)
         if started is None:
             return self._advance(step, readings, ()) if self._whereabouts.lost else self._unconfirmed(step)
@@ -159,14 +159,23 @@ class Localizer:
         estimates += [self._advance(later.step, later.readings, later.sightings) for later in rest]
         return estimates
 
-    def finish(self) -> list[Estimate]:
+    def finish(self, blind: bool = False) -> list[Estimate]:
         """The run (or a segment of it) is over: if its first pose was never found, start from the likeliest place.
+
+        Args:
+            blind: no sensor was there that could have seen a landmark: then the map's origin is as likely as any place.
 
         Returns:
             The estimates of its steps; none if there is nothing to make up for.
         """
-        started = self._whereabouts.give_up()
-        return [] if started is None else self._replay(started)
+        started = self._whereabouts.give_up(blind)
+        if started is None:
+            return []
+        first, mode = self.estimator.k + 1, Mode.LOST if self._whereabouts.lost else Mode.UNCONFIRMED
+        estimates = [dataclasses.replace(estimate, mode=mode) for estimate in self._replay(started)]
+        for k, frame in self.estimator.log.keyframes.items():
+            frame.mode = mode if k >= first else frame.mode
+        return estimates
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
@@ -188,7 +197,7 @@ class Localizer:
             footing = self.estimator.log.footing(k, self._whereabouts.blind_s > BLIND_S)
             motions = self.sources.combine(readings, trust.off, footing)
             if not motions:
-                motions = [self.sources.unknown(step)]
+                motions = [self.sources.unknown(step, readings)]
                 self.rejections["motion.silent"] += 1
             motions, scale, returned = self._return(k, step, motions, sightings)
             decisions += returned

@@ -87,10 +87,13 @@ def run(
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
-            replay.record(estimate, (time.perf_counter() - start) * 1e3)
+            replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
             parts.diagnosis.observe(step, parts.wheels.measure(step))
             if on_step is not None:
                 on_step(step, estimate)
+        blind = not {"image", "sightings"} & replay.attendance.heard
+        if mode == "batch" or not replay.estimates:
+            replay.make_up(parts.localizer.finish(blind))
         if isinstance(detector, RememberedDetections):
             detector.save()
         hints = (*parts.diagnosis.notes(parts.wheels.source), *replay.attendance.missing())
@@ -139,6 +142,7 @@ def run(
         spans=replay.spans(),
         source=recording_path,
         wheels=wheels,
+        first_pose_s=replay.first_pose_s,
     )
 
 
@@ -163,6 +167,8 @@ class _Replay:
         self._sightings = sightings if sightings is not None else iter
         self._image_rejections: Counter[str] = Counter()
         self._first_ns: int | None = None
+        self._first_step_ns: int | None = None
+        self.first_pose_s: float | None = None
         self.attendance = Attendance(roles)
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
@@ -181,12 +187,23 @@ class _Replay:
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
-    def record(self, estimate: Estimate | None, milliseconds: float) -> None:
+    def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note one step's outcome."""
         self.step_ms.append(milliseconds)
-        if estimate is not None:
-            self.estimates.append(estimate)
-            self.decisions.extend(estimate.decisions)
+        if self._first_step_ns is None:
+            self._first_step_ns = step.stamp_ns
+        if estimate is None:
+            return
+        if self.first_pose_s is None:
+            self.first_pose_s = (step.stamp_ns - self._first_step_ns) * 1e-9
+        self.estimates.append(estimate)
+        self.decisions.extend(estimate.decisions)
+
+    def make_up(self, estimates: list[Estimate]) -> None:
+        """Note what only the end of the run made possible; it replaces nothing that was told before."""
+        self.decisions.extend(d for estimate in estimates for d in estimate.decisions)
+        if not self.estimates:
+            self.estimates = estimates
 
     def rejections(self) -> Counter[str]:
         """Everything refused anywhere, by reason."""

@@ -416,3 +416,4 @@ class RunResult:
     spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None
     wheels: WheelCalibration | None = None  # if it was asked for
+    first_pose_s: float | None = None  # from the first step until a pose was known, as the run went

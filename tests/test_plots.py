@@ -37,6 +37,7 @@ FILES = {
 KEYS = [
     "duration_s",
     "keyframes",
+    "first_pose_s",
     "ate_mean_m",
     "ate_rmse_m",
     "yaw_mae_deg",

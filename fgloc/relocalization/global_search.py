@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from fgloc.types import (
 )
 
 _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
+ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
@@ -149,12 +151,15 @@ class Initializer:
     def give_up(self) -> Start | None:
         """The segment is over: all its steps, from the likeliest place; None if none are kept.
 
-        Without any sighting that is the map's origin.
+        Without any sighting the first pose is put at the map's origin, and the others are relative to it.
         """
         if not self._first or not self._steps:
             return None
         likeliest = self.hypotheses.likeliest()
-        return self._start(likeliest or Belief(np.zeros(3), _WEAK_PRIOR.copy()), frozenset())
+        if likeliest is not None:
+            return self._start(likeliest, frozenset())
+        origin = Belief(np.zeros(3), ORIGIN.copy())
+        return dataclasses.replace(self._start(origin, frozenset()), first=origin)
 
     def _start(self, newest: Belief, contrary: frozenset[SightingKey]) -> Start:
         self.waiting = False
