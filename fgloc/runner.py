@@ -29,6 +29,7 @@ from fgloc.types import (
     ImageEvent,
     LandmarkMap,
     RunResult,
+    SightingsEvent,
     Step,
     Trajectory,
     TruthEvent,
@@ -91,9 +92,8 @@ def run(
             parts.diagnosis.observe(step, parts.wheels.measure(step))
             if on_step is not None:
                 on_step(step, estimate)
-        blind = not {"image", "sightings"} & replay.attendance.heard
         if mode == "batch" or not replay.estimates:
-            replay.make_up(parts.localizer.finish(blind))
+            replay.make_up(parts.localizer.finish(replay.blind))
         if isinstance(detector, RememberedDetections):
             detector.save()
         hints = (*parts.diagnosis.notes(parts.wheels.source), *replay.attendance.missing())
@@ -169,6 +169,7 @@ class _Replay:
         self._first_ns: int | None = None
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
+        self.blind = True  # no image and no sighting was recorded, not even an unusable one
         self.attendance = Attendance(roles)
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
@@ -239,6 +240,7 @@ class _Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
+            self.blind = self.blind and not isinstance(event, ImageEvent | SightingsEvent)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ TRUTH = np.array([0.4, -0.3, 0.35])
 A, B, C = point(1, 3.0, 1.0), point(2, 1.0, 3.0), point(3, -2.0, 2.0)
 
 
-def drive(landmarks, seen, seconds=4.0, seed=0, cov=np.diag([0.004, 0.002, 0.006]) ** 2):
+def drive(landmarks, seen, seconds=4.0, seed=0):
     """The sum after each step of a drive in which some of the landmarks are seen at 5 Hz, and the true poses."""
+    cov = np.diag([0.004, 0.002, 0.006]) ** 2
     rng, total, pose = np.random.default_rng(seed), GaussianSum(config(), landmark_map(*landmarks)), TRUTH
     motion = np.array([0.08, 0.0, 0.06])
     for k in range(round(seconds / 0.2)):
@@ -119,8 +121,6 @@ def test_the_batch_begins_with_the_first_step(tmp_path, mode):
 
 def near(world: World, reach: float) -> list:
     """Its events with the sightings of beacons within reach alone."""
-    from dataclasses import replace
-
     kept = []
     for event in world.events():
         if hasattr(event, "sightings"):

@@ -41,11 +41,6 @@ class Attendance:
         """Note that a topic speaks without keeping when."""
         self._silent.discard(topic)
 
-    @property
-    def heard(self) -> set[Role]:
-        """Roles of which something usable was heard."""
-        return {role for role, topic in self._expected.items() if topic not in self._silent}
-
     def missing(self) -> tuple[str, ...]:
         """A sentence for each expected topic of which nothing usable was heard so far.
 

@@ -70,8 +70,10 @@ class GaussianSum:
             return None
         weights = np.exp(self.log_weights - self.log_weights.max())
         weights /= weights.sum()
-        spread = np.linalg.cholesky(self.covs + 1e-12 * np.eye(3)) * math.sqrt(3.0)
-        points = np.stack([_moved(self.poses, sign * spread[:, :, j]) for j in range(3) for sign in (-1.0, 1.0)], 1)
+        spread = np.asarray(np.linalg.cholesky(self.covs + 1e-12 * np.eye(3)) * math.sqrt(3.0), dtype=np.float64)
+        points = np.stack(
+            [_moved(self.poses, np.asarray(sign * spread[:, :, j])) for j in range(3) for sign in (-1.0, 1.0)], 1
+        )
         share = np.repeat(weights / 6.0, 6)
         x, y, yaw = points.reshape(-1, 3).T
         middle = math.atan2(float(share @ np.sin(yaw)), float(share @ np.cos(yaw)))

@@ -220,8 +220,9 @@ class Whereabouts:
             said.append(f"... and {len(self._jumps) - _NAMED} times more")
         if self._never_found:
             said.append(
-                "the sightings never told where on the map the robot is: its poses are LOST, relative to one another at "
-                "best, from the map's origin if nothing was seen; give estimator.initial_pose, or let the robot see more landmarks"
+                "the sightings never told where on the map the robot is: its poses are LOST, and right relative to one "
+                "another at best (from the map's origin on if nothing was seen); give estimator.initial_pose, or let "
+                "the robot see more landmarks"
             )
         if self.defied is not None:
             said.append(
