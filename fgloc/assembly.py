@@ -71,13 +71,18 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
         CameraError: the calibration is missing, unusable or does not fit the images.
         MapError, ModelError, ConfigError: as their loaders have it.
     """
-    if not {"odometry", "joints", "command"} & set(recording.roles):
+    if not {"odometry", "joints", "command", "imu"} & set(recording.roles):
         raise RecordingError(
-            f"{recording.path}: no odometry, joint states or commands; a run needs one of them. Topics: "
+            f"{recording.path}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
             f"{', '.join(f'{t.name} ({t.message_type})' for t in recording.topics) or 'none'}"
         )
     landmark_map = load_map(map_path, config.markers.default_size_m) if map_path is not None else None
     notes = list(landmark_map.notes) if landmark_map is not None else []
+    if not {"odometry", "joints", "command"} & set(recording.roles):
+        notes.append(
+            "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
+            "gate.max_speed takes it."
+        )
     first = _first_events(recording)
     camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()

@@ -26,6 +26,7 @@ from fgloc.graph.outage_inflation import interval_scale
 from fgloc.graph.slip_noise import BLIND_S
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
+from fgloc.relocalization.global_search import Start
 from fgloc.relocalization.tracking_state import CONTRADICTS, Whereabouts
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -38,6 +39,7 @@ from fgloc.types import (
     FloatArray,
     LandmarkMap,
     LandmarkMeasurement,
+    Mode,
     MotionMeasurement,
     Readings,
     Step,
@@ -92,7 +94,8 @@ class Localizer:
         self.trust = SourceTrust(config.weights, self.sources, config.wheels.track)
         self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
         self._suspicion = Suspicion(config, landmark_map, self.estimator, self.weights)
-        self._whereabouts = Whereabouts(config, landmark_map, self.factors)
+        self._whereabouts = Whereabouts(config, landmark_map, self.factors, keep_all)
+        self._keep_all = keep_all
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
 
@@ -116,6 +119,8 @@ class Localizer:
 
     def _begin_segment(self, step: Step) -> None:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
+        if self._keep_all:
+            self.finish()
         self._segment = step.segment
         self.sources.begin_segment()
         self.trust.begin(step)
@@ -128,19 +133,50 @@ class Localizer:
             prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
             self._whereabouts.start_known()
             return self._start(step, prior, sightings)
-        started = self._whereabouts.collect(step, self.sources.combine(readings), sightings, readings)
+        motions = self.sources.combine(readings) or [self.sources.unknown(step, readings)]
+        started = self._whereabouts.collect(step, motions, sightings, readings)
         if started is None:
-            return self._advance(step, readings, ()) if self._whereabouts.lost else None
+            return self._advance(step, readings, ()) if self._whereabouts.lost else self._unconfirmed(step)
         if self._whereabouts.lost:
             return self._found(step, started.newest, [])
+        estimates = self._replay(started)
+        decisions = [d for estimate in estimates for d in estimate.decisions]
+        return dataclasses.replace(estimates[-1], decisions=tuple(decisions))
+
+    def _unconfirmed(self, step: Step) -> Estimate | None:
+        """The pose before the sightings are enough to begin the graph with."""
+        belief = self._whereabouts.unconfirmed()
+        if belief is None:
+            return None
+        cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+        return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED)
+
+    def _replay(self, started: Start) -> list[Estimate]:
+        """Run the collected steps through the estimator."""
         first, *rest = started.steps
         self.weights.contrary = started.contrary
-        estimate = self._start(first.step, started.first, first.sightings)
-        decisions = [*estimate.decisions]
-        for later in rest:
-            estimate = self._advance(later.step, later.readings, later.sightings)
-            decisions += estimate.decisions
-        return dataclasses.replace(estimate, decisions=tuple(decisions))
+        self.sources.begin_segment()
+        estimates = [self._start(first.step, started.first, first.sightings)]
+        estimates += [self._advance(later.step, later.readings, later.sightings) for later in rest]
+        return estimates
+
+    def finish(self, blind: bool = False) -> list[Estimate]:
+        """The run (or a segment of it) is over: if its first pose was never found, start from the likeliest place.
+
+        Args:
+            blind: no sensor was there that could have seen a landmark: then the map's origin is as likely as any place.
+
+        Returns:
+            The estimates of its steps; none if there is nothing to make up for.
+        """
+        started = self._whereabouts.give_up(blind)
+        if started is None:
+            return []
+        first, mode = self.estimator.k + 1, Mode.LOST if self._whereabouts.lost else Mode.UNCONFIRMED
+        estimates = [dataclasses.replace(estimate, mode=mode) for estimate in self._replay(started)]
+        for k, frame in self.estimator.log.keyframes.items():
+            frame.mode = mode if k >= first else frame.mode
+        return estimates
 
     def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
@@ -162,7 +198,7 @@ class Localizer:
             footing = self.estimator.log.footing(k, self._whereabouts.blind_s > BLIND_S)
             motions = self.sources.combine(readings, trust.off, footing)
             if not motions:
-                motions = [self.sources.unknown(step)]
+                motions = [self.sources.unknown(step, readings)]
                 self.rejections["motion.silent"] += 1
             motions, scale, returned = self._return(k, step, motions, sightings)
             decisions += returned

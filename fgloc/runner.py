@@ -30,6 +30,7 @@ from fgloc.types import (
     ImageEvent,
     LandmarkMap,
     RunResult,
+    SightingsEvent,
     Step,
     Trajectory,
     TruthEvent,
@@ -88,10 +89,12 @@ def run(
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
             estimate = parts.localizer.update(step)
-            replay.record(estimate, (time.perf_counter() - start) * 1e3)
+            replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
             parts.diagnosis.observe(step, parts.wheels.measure(step))
             if on_step is not None:
                 on_step(step, estimate)
+        if mode == "batch" or not replay.estimates:
+            replay.make_up(parts.localizer.finish(replay.blind))
         if isinstance(detector, RememberedDetections):
             detector.save()
         hints = (*parts.diagnosis.notes(parts.wheels.source), *replay.attendance.missing())
@@ -145,6 +148,7 @@ def run(
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),
+        first_pose_s=replay.first_pose_s,
     )
 
 
@@ -169,6 +173,9 @@ class _Replay:
         self._sightings = sightings if sightings is not None else iter
         self._image_rejections: Counter[str] = Counter()
         self._first_ns: int | None = None
+        self._first_step_ns: int | None = None
+        self.first_pose_s: float | None = None
+        self.blind = True  # no image and no sighting was recorded, not even an unusable one
         self.attendance = Attendance(roles)
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
@@ -187,12 +194,23 @@ class _Replay:
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
-    def record(self, estimate: Estimate | None, milliseconds: float) -> None:
+    def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note one step's outcome."""
         self.step_ms.append(milliseconds)
-        if estimate is not None:
-            self.estimates.append(estimate)
-            self.decisions.extend(estimate.decisions)
+        if self._first_step_ns is None:
+            self._first_step_ns = step.stamp_ns
+        if estimate is None:
+            return
+        if self.first_pose_s is None:
+            self.first_pose_s = (step.stamp_ns - self._first_step_ns) * 1e-9
+        self.estimates.append(estimate)
+        self.decisions.extend(estimate.decisions)
+
+    def make_up(self, estimates: list[Estimate]) -> None:
+        """Note what only the end of the run made possible; it replaces nothing that was told before."""
+        self.decisions.extend(d for estimate in estimates for d in estimate.decisions)
+        if not self.estimates:
+            self.estimates = estimates
 
     def rejections(self) -> Counter[str]:
         """Everything refused anywhere, by reason."""
@@ -228,6 +246,7 @@ class _Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
+            self.blind = self.blind and not isinstance(event, ImageEvent | SightingsEvent)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)

@@ -344,6 +344,7 @@ class Mode(StrEnum):
     """How the estimate came about."""
 
     OK = "OK"
+    UNCONFIRMED = "UNCONFIRMED"  # by sightings that nothing checks yet: before the first pose is certain
     DEAD_RECKONING = "DEAD_RECKONING"
     LOST = "LOST"
 
@@ -430,3 +431,4 @@ class RunResult:
     source: Path | None = None
     wheels: WheelCalibration | None = None  # if it was asked for
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
+    first_pose_s: float | None = None  # from the first step until a pose was known, as the run went

@@ -47,6 +47,7 @@ def figure_eight(seed=0, n=300, truth=True, modes=None):
             "/camera": Heard(np.r_[np.arange(0, 10, 0.1), np.arange(20, 30, 0.1)], 200, 1, 10.1),
         },
         source=Path("first_run"),
+        first_pose_s=0.4,
     )
 
 

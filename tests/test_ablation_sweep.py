@@ -162,11 +162,11 @@ def test_fault_70_killed_sweep_resumes_and_runs_nothing_twice(folder, swept, tmp
 
 
 def test_job_that_cannot_run_is_quarantined_and_listed(folder, tmp_path):
-    variants = [{"name": "no start", "config": {"recording": {"topics": {"sightings": "none"}}}}]
+    variants = [{"name": "no motion", "config": {"recording": {"topics": {"odometry": "none"}}}}]
     jobs = jobs_of(folder, variants=variants, failures=[])
     (record,) = sweep(jobs, tmp_path, workers=1).values()
     assert record.outcome == "refused"
-    assert "the first pose was never found" in record.error
+    assert "no odometry, joint states or commands" in record.error
     sweep(jobs, tmp_path, workers=1)
     assert len(attempts(tmp_path)) == 1  # left alone
     sweep(jobs, tmp_path, workers=1, retry=True)

@@ -37,6 +37,7 @@ FILES = {
 KEYS = [
     "duration_s",
     "keyframes",
+    "first_pose_s",
     "ate_mean_m",
     "ate_rmse_m",
     "yaw_mae_deg",
@@ -222,7 +223,7 @@ def test_truth_based_metrics_are_null_without_truth(tmp_path):
     report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert list(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == KEYS[2:9]
+    assert [key for key in KEYS if content[key] is None] == KEYS[3:10]
 
 
 def test_truth_of_another_time_counts_as_none(tmp_path):

@@ -47,6 +47,7 @@ class Metrics(BaseModel):
 
     duration_s: float
     keyframes: int
+    first_pose_s: float | None  # None: the place on the map was never known
     ate_mean_m: float | None
     ate_rmse_m: float | None
     yaw_mae_deg: float | None
@@ -220,6 +221,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
     return Metrics(
         duration_s=duration,
         keyframes=len(stamps),
+        first_pose_s=result.first_pose_s,
         ate_mean_m=against_truth(ate_mean_m),
         ate_rmse_m=against_truth(ate_rmse_m),
         yaw_mae_deg=against_truth(yaw_mae_deg),

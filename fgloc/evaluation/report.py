@@ -170,6 +170,7 @@ def _figures(metrics: Metrics) -> str:
             " / ".join(_number(share.get(k), 100.0, "{:.1f} %") for k in ("1", "2", "3")),
             "share of x, y and yaw errors inside their band; honest: 68.3 / 95.4 / 99.7 %",
         ),
+        ("first pose", _number(metrics.first_pose_s, 1.0, "{:.1f} s"), "after the recording's first step, as it went"),
         ("update", steps, "wall time of one step: median / p95 / p99 / worst"),
         (
             "real-time factor",

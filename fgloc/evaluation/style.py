@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from fgloc.types import FloatArray, Mode, RunResult
 
 BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#555555"
-MODE_LOOKS = {Mode.DEAD_RECKONING: (ORANGE, "dead reckoning", "//"), Mode.LOST: (RED, "lost", "xx")}
+MODE_LOOKS = {
+    Mode.UNCONFIRMED: (SKY, "first pose not confirmed", ".."),
+    Mode.DEAD_RECKONING: (ORANGE, "dead reckoning", "//"),
+    Mode.LOST: (RED, "lost", "xx"),
+}
 WIDTH = 9.0  # inches
 GAP_S = 1.0  # a line is not drawn across a longer silence
 TEXT: dict[str, Any] = {"fontsize": 9, "color": "#222222"}

@@ -238,13 +238,19 @@ class MotionSources:
         rows = [index[name] for name in names]
         return D, self._factors.believed.cov[np.ix_(rows, rows)]
 
-    def unknown(self, step: Step) -> MotionMeasurement:
-        """Nothing spoke: sigma grows with the time of silence, however many steps it is cut into."""
+    def unknown(self, step: Step, readings: Readings | None = None) -> MotionMeasurement:
+        """Nothing told the way: sigma grows with the time of silence, however many steps it is cut into.
+
+        A gyro, if there is one, still tells the turn.
+        """
         before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
         gate = self._config.gate
         speed, turn = _LIKELY * gate.max_speed, _LIKELY * gate.max_yaw_rate
         cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
-        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, np.zeros(3), cov)
+        motion, gyro = np.zeros(3), None if readings is None else readings.gyro
+        if gyro is not None:
+            motion, cov[2, 2] = _turned(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
     def went(self, readings: Readings, fix: Belief | None) -> None:
         """The robot went on by a step.

@@ -1,6 +1,5 @@
 """The installation as a state: what map, camera, clocks, wheels and gyro are off by, estimated beside the poses.
 
-
 The state θ ``(n,)`` holds deviations from what map and configuration say. Each has a prior sigma; one of sigma 0 is
 taken as exact and is no state. What can't be observed stays at its prior, and its sigma reaches the pose's covariance
 through the joint covariance of pose and θ.

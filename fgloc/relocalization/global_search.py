@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief
 from fgloc.graph.pose_fit import Fit, joint_fit, sighting_costs
+from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -30,6 +32,7 @@ from fgloc.types import (
 )
 
 _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
+ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
 _RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
@@ -75,13 +78,21 @@ class Initializer:
 
     Attributes:
         waiting: whether the first pose is still looked for.
+        hypotheses: where the robot may be before that is confirmed.
     """
 
-    def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
+    def __init__(
+        self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors, keep_all: bool = False
+    ) -> None:
+        """Take the parts; ``keep_all``: steps that the search has forgotten are kept for the replay from the start."""
         self._config = config
+        self._keep_all = keep_all
         self._map = landmark_map
         self._factors = factors
-        self._steps: deque[Collected] = deque(maxlen=_MAX_STEPS)
+        self._steps: deque[Collected] = deque()
+        self._earlier: list[Collected] = []  # with keep_all: before those, since the segment began
+        self._first = False  # whether the segment has had no pose yet
+        self.hypotheses = GaussianSum(config, landmark_map)
         self._doubted: frozenset[int] = frozenset()  # landmarks that contradicted one another
         self._since_ns: int | None = None  # the first sighting of the search
         self.waiting = True
@@ -89,7 +100,7 @@ class Initializer:
     def reset(self) -> None:
         """Look for the pose again."""
         self.forget()
-        self.waiting = True
+        self.waiting = self._first = True
 
     @property
     def searching(self) -> bool:
@@ -99,6 +110,9 @@ class Initializer:
     def forget(self) -> None:
         """What was collected is of no use any more: the robot is where it was believed to be."""
         self._steps.clear()
+        self._earlier.clear()
+        self.hypotheses.reset()
+        self._first = False
         self._doubted, self._since_ns = frozenset(), None
 
     def collect(
@@ -121,19 +135,38 @@ class Initializer:
         """
         self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
-        while self._steps[0].step.stamp_ns < horizon:
-            self._steps.popleft()
+        while self._steps[0].step.stamp_ns < horizon or len(self._steps) > _MAX_STEPS:
+            forgotten = self._steps.popleft()
+            if self._keep_all and self._first:
+                self._earlier.append(forgotten)
+        if self._first:
+            self.hypotheses.add(motions if len(self._steps) + len(self._earlier) > 1 else (), sightings)
         if sightings and self._since_ns is None:
             self._since_ns = step.stamp_ns
         best = self._solve(known) if sightings else None
         if best is None:
             return None
+        return self._start(Belief(best.fit.pose, best.fit.cov), best.contrary)
+
+    def give_up(self) -> Start | None:
+        """The segment is over: all its steps, from the likeliest place; None if none are kept.
+
+        Without any sighting the first pose is put at the map's origin, and the others are relative to it.
+        """
+        if not self._first or not self._steps:
+            return None
+        likeliest = self.hypotheses.likeliest()
+        if likeliest is not None:
+            return self._start(likeliest, frozenset())
+        origin = Belief(np.zeros(3), ORIGIN.copy())
+        return dataclasses.replace(self._start(origin, frozenset()), first=origin)
+
+    def _start(self, newest: Belief, contrary: frozenset[SightingKey]) -> Start:
         self.waiting = False
-        back = se2.inverse(self._travelled())
-        steps = tuple(self._steps)
+        steps = (*self._earlier, *self._steps)
+        first = Belief(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
         self.forget()
-        first = Belief(se2.compose(best.fit.pose, back), _WEAK_PRIOR.copy())
-        return Start(steps, first, Belief(best.fit.pose, best.fit.cov), best.contrary)
+        return Start(steps, first, newest, contrary)
 
     def _solve(self, known: bool) -> Agreed | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
@@ -254,13 +287,14 @@ class Initializer:
                 ad = se2.adjoint(step)
                 motion, cov = se2.compose(motion, back), se2.compose_cov(cov, back, ad @ step_cov @ ad.T)
 
-    def _travelled(self) -> FloatArray:
-        """``T_oldest_newest``."""
-        travelled = np.zeros(3)
-        for collected in list(self._steps)[1:]:
-            if collected.motions:
-                travelled = se2.compose(travelled, fuse(collected.motions)[0])
-        return travelled
+
+def _travelled(steps: Sequence[Collected]) -> FloatArray:
+    """``T_oldest_newest``."""
+    travelled = np.zeros(3)
+    for collected in steps[1:]:
+        if collected.motions:
+            travelled = se2.compose(travelled, fuse(collected.motions)[0])
+    return travelled
 
 
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:

@@ -13,13 +13,12 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.gating import NEAR_M, NEAR_RAD
 from fgloc.graph.measurement_log import Belief, Sighting
-from fgloc.relocalization.global_search import Initializer, Start
+from fgloc.relocalization.global_search import ORIGIN, Initializer, Start
 from fgloc.types import Decision, FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 _NAMED = 3  # jumps
 _CONFIRMED = 2  # sightings in excess of those that speak against it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
-_ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # without a map the first pose is its origin
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
@@ -36,11 +35,14 @@ class Whereabouts:
         defied: how far ``(3,)`` from the given first pose, in its frame, sightings put the robot; None: they did not.
     """
 
-    def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
+    def __init__(
+        self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors, keep_all: bool = False
+    ) -> None:
+        """Take the parts; ``keep_all``: the steps before the first pose are all kept for the replay."""
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
         self._known = factors.known
-        self._initializer = Initializer(config, landmark_map, factors)
+        self._initializer = Initializer(config, landmark_map, factors, keep_all)
         self.lost = False
         self.fix_elapsed_s = 0.0
         self.defied: FloatArray | None = None
@@ -48,10 +50,12 @@ class Whereabouts:
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._speaking_for = self._speaking_against = 0  # sightings
         self._jumps: list[FloatArray] = []
+        self._told = False  # whether a pose that is not confirmed has been told
+        self._never_found = False
 
     def begin_segment(self, last: Belief | None) -> Belief | None:
         """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
-        self.lost = self._given = False
+        self.lost = self._given = self._told = False
         self._initializer.reset()
         given = self._config.initial_pose
         if given is not None and last is None:
@@ -59,7 +63,7 @@ class Whereabouts:
             return Belief(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
         if self._known:
             return None
-        return Belief(np.zeros(3), _ORIGIN) if last is None else Belief(last.pose, _ANYWHERE.copy())
+        return Belief(np.zeros(3), ORIGIN.copy()) if last is None else Belief(last.pose, _ANYWHERE.copy())
 
     def elapse(self, seconds: float) -> None:
         """Time goes on."""
@@ -152,6 +156,32 @@ class Whereabouts:
         """While waiting: add a step; the start once it is clear."""
         return self._initializer.collect(step, motions, sightings, readings)
 
+    def unconfirmed(self) -> Belief | None:
+        """Where the robot is by the sightings so far, before they are enough to check one another.
+
+        Told from when the pose is known well enough for a sighting to be judged by it.
+        """
+        belief = self._initializer.hypotheses.belief()
+        if belief is None or (not self._told and self.nowhere(belief)):
+            return None
+        self._told = True
+        return belief
+
+    def give_up(self, blind: bool) -> Start | None:
+        """The segment is over, and its first pose was not found: what is to be replayed, and from where.
+
+        Args:
+            blind: nothing could have been seen, so that the map's origin does as well as any place.
+        """
+        if not self.waiting or self.lost:
+            return None
+        belief = self._initializer.hypotheses.belief()
+        start = self._initializer.give_up() if blind or belief is not None else None
+        if start is not None and (belief is None or self.nowhere(belief)):
+            self._never_found = True
+            self.get_lost()
+        return start
+
     def search(
         self,
         step: Step,
@@ -188,6 +218,12 @@ class Whereabouts:
         said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps[:_NAMED]]
         if len(self._jumps) > _NAMED:
             said.append(f"... and {len(self._jumps) - _NAMED} times more")
+        if self._never_found:
+            said.append(
+                "the sightings never told where on the map the robot is: its poses are LOST, and right relative to one "
+                "another at best (from the map's origin on if nothing was seen); give estimator.initial_pose, or let "
+                "the robot see more landmarks"
+            )
         if self.defied is not None:
             said.append(
                 f"sightings contradict the given first pose: they put the robot {_far(self.defied)} off and were "

@@ -1,0 +1,174 @@
+"""A batch never loses a run: gaps, silent sensors, no sightings, no map, odometry and IMU alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from robot_world import SPEED, START_NS, TURN, World, beacons, config, truth_at
+from world_bags import write_world
+
+from datasets.bag import BagWriter
+from fgloc import se2
+from fgloc.runner import run
+from fgloc.sensors.maps import write_map
+from fgloc.types import CommandEvent, Mode, OdometryEvent, RangeBearingEvent
+
+MODES = ("batch", "online")
+STEP_NS = 20_000_000
+
+
+def finite(result) -> bool:
+    poses, covs = result.trajectory.poses, result.trajectory.covs
+    return bool(np.isfinite(poses).all() and np.isfinite(covs).all() and (np.linalg.eigvalsh(covs) > 0.0).all())
+
+
+def span_s(result) -> float:
+    stamps = result.trajectory.stamps_ns
+    return float(stamps[-1] - stamps[0]) * 1e-9
+
+
+def distances(result) -> np.ndarray:
+    truth = np.array([truth_at((stamp - START_NS) * 1e-9) for stamp in result.trajectory.stamps_ns.tolist()])
+    return np.hypot(*(result.trajectory.poses - truth)[:, :2].T)
+
+
+def nis(result) -> np.ndarray:
+    """Squared Mahalanobis distance of each position from the truth."""
+    truth = np.array([truth_at((stamp - START_NS) * 1e-9) for stamp in result.trajectory.stamps_ns.tolist()])
+    off = (result.trajectory.poses - truth)[:, :2]
+    return np.einsum("ni,nij,nj->n", off, np.linalg.inv(result.trajectory.covs[:, :2, :2]), off)
+
+
+def write(folder, world: World, commands=False, odometry=True, silent=(), unseen=(), imu=False):
+    """The world's bag with some topics, and nothing but sightings (or nothing at all) in some intervals [s]."""
+
+    def inside(stamp, spans):
+        return any(a <= (stamp - world.start_ns) * 1e-9 < b for a, b in spans)
+
+    with BagWriter(folder / "bag") as bag:
+        for event in world.events():
+            stamp = event.stamp_ns
+            if isinstance(event, OdometryEvent):
+                x, y, yaw = world.truth(stamp)
+                if odometry and not inside(stamp, silent):
+                    bag.odometry("/odom", stamp, (x, y, yaw), (event.linear[0], event.angular[2]))
+                if imu:
+                    bag.imu("/imu", stamp, (0.01, -0.01, TURN + 0.002), (0.1, 0.2, 9.8))
+                bag.truth("/truth", stamp, (x, y, 0.0), (0, 0, math.sin(yaw / 2), math.cos(yaw / 2)))
+            elif isinstance(event, CommandEvent):
+                if commands and not inside(stamp, silent):
+                    bag.command("/cmd_vel", stamp, event.v, event.omega)
+            elif isinstance(event, RangeBearingEvent) and not inside(stamp, unseen):
+                seen = [(s.landmark_id, s.range_m, s.bearing_rad) for s in event.sightings]
+                bag.range_bearing("/landmarks", stamp, seen)
+    write_map(world.map, folder / "map.yaml")
+    return folder / "bag"
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("unseen", [(), ((8.0, 18.0),)], ids=["seen", "unseen"])
+@pytest.mark.parametrize("commands", [False, True], ids=["odometry", "commands"])
+def test_ten_seconds_without_motion(tmp_path, mode, unseen, commands):
+    world = World(beacons(), seconds=24.0)
+    bag = write(tmp_path, world, commands, not commands, silent=((8.0, 18.0),), unseen=unseen)
+    settings = config(wheels={"source": "command"} if commands else {})
+    result = run(bag, tmp_path / "map.yaml", settings, mode)
+    assert finite(result)
+    assert span_s(result) > 23.5
+    assert distances(result)[-20:].max() < 0.3
+    inside = (np.abs((result.trajectory.stamps_ns - START_NS) * 1e-9 - 13.0)) < 4.0
+    assert nis(result)[inside].max() < 16.0
+    assert any("No wheel motion was known" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_map_but_no_sightings_at_all(tmp_path, mode):
+    bag = write_world(tmp_path, World(beacons(), seconds=10.0), sightings=False)
+    result = run(bag, tmp_path / "map.yaml", config(), mode)
+    assert finite(result)
+    assert span_s(result) > (9.5 if mode == "batch" else 4.5)  # online keeps no more than the search looks at
+    assert set(result.modes) == {Mode.LOST}
+    assert result.first_pose_s is None
+    assert any("never told where on the map" in note for note in result.notes)
+    relative = result.trajectory.poses[:, :2] - result.trajectory.poses[0, :2]
+    assert np.hypot(*relative[len(relative) // 2]) > 0.3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_neither_map_nor_sightings(tmp_path, mode):
+    bag = write_world(tmp_path, World(beacons(), seconds=10.0), sightings=False)
+    result = run(bag, None, config(), mode)
+    assert finite(result)
+    assert span_s(result) > 9.5
+    assert np.hypot(*result.trajectory.poses[0, :2]) < 1e-3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_no_map_with_a_gap(tmp_path, mode):
+    world = World(beacons(), seconds=24.0)
+    bag = write(tmp_path, world, silent=((8.0, 18.0),), unseen=((8.0, 18.0),))
+    result = run(bag, None, config(), mode)
+    assert finite(result)
+    assert span_s(result) > 23.5
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("sightings", [True, False], ids=["sightings", "blind"])
+def test_gyro_without_wheels(tmp_path, mode, sightings):
+    world = World(beacons(), seconds=12.0)
+    bag = write(tmp_path, world, odometry=False, imu=True, unseen=() if sightings else ((-1.0, 99.0),))
+    result = run(bag, tmp_path / "map.yaml", config(), mode)
+    assert finite(result)
+    assert span_s(result) > (11.0 if sightings or mode == "batch" else 4.5)
+    if sightings:
+        assert distances(result)[10:].mean() < 0.3
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mapped", [True, False], ids=["map", "no_map"])
+def test_two_odometries_an_imu_in_three_dimensions_and_minutes_of_rest(tmp_path, mode, mapped):
+    rng = np.random.default_rng(5)
+    seconds, rest = 300, (60.0, 240.0)
+    pose = np.zeros(3)
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(seconds * 20):
+            stamp, t = START_NS + k * 50_000_000, 0.05 * k
+            v, omega = (0.0, 0.0) if rest[0] <= t < rest[1] else (SPEED, TURN)
+            pose = se2.compose(pose, se2.exp((0.05 * v, 0.0, 0.05 * omega)))
+            bag.odometry("/odom", stamp, pose, (v, omega))
+            bag.odometry("/odometry/second", stamp + 7_000_000, pose, (v, omega))
+            gyro = np.array([0.0, 0.0, omega + 0.004]) + rng.normal(0.0, 0.01, 3)
+            bag.imu("/imu/data", stamp + 3_000_000, gyro, (0.3, -0.2, 9.7))
+    write_map(beacons(), tmp_path / "map.yaml")
+    result = run(tmp_path / "bag", tmp_path / "map.yaml" if mapped else None, config(), mode)
+    assert finite(result)
+    assert span_s(result) > (4.5 if mapped and mode == "online" else seconds - 1.0)
+    if span_s(result) < seconds / 2:
+        return
+    stamps = (result.trajectory.stamps_ns - START_NS) * 1e-9
+    resting = result.trajectory.poses[(stamps > rest[0] + 2.0) & (stamps < rest[1] - 2.0)]
+    assert np.ptp(resting[:, :2], axis=0).max() < 0.05
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_one_beacon_alone_tells_a_ring(tmp_path, mode):
+    """Not where the robot is: no pose is sure of itself, and the batch still has every keyframe."""
+    world = World(beacons(), seconds=12.0)
+    only = 2
+
+    with BagWriter(tmp_path / "bag") as bag:
+        for event in world.events():
+            stamp = event.stamp_ns
+            if isinstance(event, OdometryEvent):
+                bag.odometry("/odom", stamp, world.truth(stamp), (event.linear[0], event.angular[2]))
+            elif isinstance(event, RangeBearingEvent):
+                seen = [(s.landmark_id, s.range_m, s.bearing_rad) for s in event.sightings if s.landmark_id == only]
+                if seen:
+                    bag.range_bearing("/landmarks", stamp, seen)
+    write_map(world.map, tmp_path / "map.yaml")
+    result = run(tmp_path / "bag", tmp_path / "map.yaml", config(), mode)
+    assert finite(result)
+    assert span_s(result) > (11.0 if mode == "batch" else 4.5)
+    assert set(result.modes) <= {Mode.LOST, Mode.UNCONFIRMED}
