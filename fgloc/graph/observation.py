@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.graph.installation import Installation
@@ -48,6 +49,25 @@ class Linearized:
         return np.asarray(np.eye(len(self.residual)) + self.shared @ self.shared.T)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Stacked:
+    """Residuals and Jacobians of sightings of one kind, whitened by their own noise.
+
+    Attributes:
+        residual: ``(m, d)``.
+        J: ``(m, d, 3)`` by the pose.
+        H: ``(m, d, c)`` by the parameters in `columns` ``(m, c)``; -1: none, then H is 0.
+        columns: see above.
+        behind: ``(m,)`` whether a corner is behind the camera.
+    """
+
+    residual: FloatArray
+    J: FloatArray
+    H: FloatArray
+    columns: IntArray
+    behind: NDArray[np.bool_]
+
+
 class Observations:
     """Sightings prepared for being linearized, once or often."""
 
@@ -62,15 +82,15 @@ class Observations:
             installation: the parameters.
         """
         self._count = len(measurements)
-        self._corners = [i for i, m in enumerate(measurements) if isinstance(m, CornerMeasurement)]
-        self._planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement)]
-        self._made: list[CornerBatch | PlanarBatch] = []
-        if self._corners:
+        corners = [i for i, m in enumerate(measurements) if isinstance(m, CornerMeasurement)]
+        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement)]
+        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch]] = []
+        if corners:
             seen = [m for m in measurements if isinstance(m, CornerMeasurement)]
-            self._made.append(CornerBatch(seen, landmarks, installation))
-        if self._planar:
+            self.batches.append((corners, CornerBatch(seen, landmarks, installation)))
+        if planar:
             rest = [m for m in measurements if not isinstance(m, CornerMeasurement)]
-            self._made.append(PlanarBatch(rest, landmarks, installation))
+            self.batches.append((planar, PlanarBatch(rest, landmarks, installation)))
 
     def __len__(self) -> int:
         return self._count
@@ -79,8 +99,16 @@ class Observations:
         """Every sighting at a pose ``(3,)``, or each at its own ``(m, 3)``, and an installation ``(n,)``."""
         each = np.broadcast_to(poses, (self._count, 3))
         found: dict[int, Linearized] = {}
-        for rows, batch in zip([r for r in (self._corners, self._planar) if r], self._made, strict=True):
-            found.update(zip(rows, batch.linearize(each[rows], theta), strict=True))
+        for rows, batch in self.batches:
+            stack = batch.evaluate(each[rows], theta)
+            for i, row in enumerate(rows):
+                used = stack.columns[i] >= 0
+                d = batch.rows[i]
+                H, J = stack.H[i, :d], stack.J[i, :d]
+                shared = batch.shared(i, J, H)
+                found[row] = Linearized(
+                    stack.residual[i, :d], J, stack.columns[i][used], H[:, used], shared, bool(stack.behind[i])
+                )
         return [found[i] for i in range(self._count)]
 
 
@@ -109,19 +137,20 @@ class CornerBatch:
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = [m.motion_cov for m in seen]
+        self.rows = [8] * len(seen)
         first = installation.blocks.get("camera")
         self._camera = None if first is None else np.arange(first[0], first[0] + 12)
-        self._marker = np.array([installation.landmarks.get(m.landmark_id, (-1, 0))[0] for m in seen])
-        self._marker[[installation.landmarks.get(m.landmark_id, (-1, 0))[1] != 6 for m in seen]] = -1
+        marker = np.array([_block(installation, m.landmark_id, 6) for m in seen])
+        self._columns = np.full((len(seen), 18), -1)
+        if self._camera is not None:
+            self._columns[:, :12] = self._camera
+        self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
 
-    def linearize(self, poses: FloatArray, theta: FloatArray) -> list[Linearized]:
-        """As `Observations.linearize`, with a pose for each."""
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
         n = len(poses)
         camera = np.zeros(12) if self._camera is None else theta[self._camera]
-        marker = np.zeros((n, 6))
-        for i, first in enumerate(self._marker):
-            if first >= 0:
-                marker[i] = theta[first : first + 6]
+        marker = np.append(theta, 0.0)[self._columns[:, 12:]]
         # 1. Corners in the map, in the base frame, at the exposure, in the camera
         turned = _cross(marker[:, None, 3:], self._local)
         local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
@@ -167,6 +196,10 @@ class CornerBatch:
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
         )
+        residual = ((predicted - self._pixels) * scale[:, None, None]).reshape(n, 8)
+        J = (J * scale[:, None, None, None]).reshape(n, 8, 3)
+        if not by_installation:
+            return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
         H[..., 3:6] = _crossed(A, X)  # -A (φ x X) by φ
@@ -178,26 +211,15 @@ class CornerBatch:
         M = B @ Rz.transpose(0, 2, 1)[:, None]
         H[..., 12:15] = M
         H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
-        residual = ((predicted - self._pixels) * scale[:, None, None]).reshape(n, 8)
-        J = (J * scale[:, None, None, None]).reshape(n, 8, 3)
+        H[..., :12] *= self._camera is not None
+        H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
-        return [self._one(i, residual[i], J[i], H[i], bool(behind[i])) for i in range(n)]
+        return Stacked(residual, J, H, self._columns, behind)
 
-    def _one(self, i: int, residual: FloatArray, J: FloatArray, H: FloatArray, behind: bool) -> Linearized:
-        shared = [self._jitter[i] * H[:, 11:12]]
-        moved = self._moved[i]
-        if moved is not None:
-            shared.append(J @ _root(moved))
-        first = self._marker[i]
-        parts, columns = [], []
-        if self._camera is not None:
-            parts.append(H[:, :12])
-            columns.append(self._camera)
-        if first >= 0:
-            parts.append(H[:, 12:])
-            columns.append(np.arange(first, first + 6))
-        used = np.concatenate(columns) if columns else np.zeros(0, dtype=int)
-        return Linearized(residual, J, used, np.hstack(parts) if parts else np.zeros((8, 0)), np.hstack(shared), behind)
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it, of one sighting."""
+        jitter, moved = self._jitter[i] * H[:, 11:12], self._moved[i]
+        return jitter if moved is None else np.hstack([jitter, J @ _root(moved)])
 
 
 class PlanarBatch:
@@ -209,68 +231,73 @@ class PlanarBatch:
         landmarks: Mapping[int, Landmark],
         installation: Installation,
     ) -> None:
-        self._seen = list(seen)
-        self._poses = [m if isinstance(m, MarkerPoseMeasurement) else None for m in seen]
+        poses = [m.pose if isinstance(m, MarkerPoseMeasurement) else None for m in seen]
+        self.rows = [2 if pose is None else 3 for pose in poses]
+        self._whole = np.array([pose is not None for pose in poses])
+        self._yaw = np.array([0.0 if pose is None else pose[2] for pose in poses])
         self._place = np.array([landmarks[m.landmark_id].planar for m in seen])
-        self._point, whitenings = [], []
-        for m in seen:
-            point, cov = (m.pose[:2], m.cov) if isinstance(m, MarkerPoseMeasurement) else cartesian(m)
-            self._point.append(point)
-            whitenings.append(np.linalg.inv(np.linalg.cholesky(cov)))
-        self._whitening = whitenings
+        self._point = np.zeros((len(seen), 2))
+        self._whitening = np.zeros((len(seen), 3, 3))  # of the residual in the base frame
+        for i, m in enumerate(seen):
+            if isinstance(m, MarkerPoseMeasurement):
+                self._point[i] = m.pose[:2]
+                c, s = np.cos(m.pose[2]), np.sin(m.pose[2])
+                turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+                self._whitening[i] = np.linalg.inv(np.linalg.cholesky(m.cov)) @ turn
+            else:
+                self._point[i], cov = cartesian(m)
+                self._whitening[i, :2, :2] = np.linalg.inv(np.linalg.cholesky(cov))
+        self._twist = np.array([m.twist for m in seen])
+        self._offset = np.array([m.offset_s for m in seen])
         first = installation.blocks.get("sightings")
         self._sensor = None if first is None else np.arange(first[0], first[0] + 3)
-        self._landmark = [installation.landmarks.get(m.landmark_id) for m in seen]
-        self._rotation = [landmarks[m.landmark_id].rotation for m in seen]
-
-    def linearize(self, poses: FloatArray, theta: FloatArray) -> list[Linearized]:
-        """As `Observations.linearize`, with a pose for each."""
-        return [self._one(i, pose, theta) for i, pose in enumerate(poses)]
-
-    def _one(self, i: int, pose: FloatArray, theta: FloatArray) -> Linearized:
-        m = self._seen[i]
-        sensor = np.zeros(3) if self._sensor is None else theta[self._sensor]
-        moved = np.zeros(3)
-        block = self._landmark[i]
-        if block is not None:
-            moved[:2] = theta[block[0] : block[0] + 2]
-            if block[1] == 6:
-                moved[2] = self._rotation[i][2] @ theta[block[0] + 3 : block[0] + 6]
-        place = self._place[i] + moved
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        R_base_map = np.array([[c, s], [-s, c]])
-        q = R_base_map @ (place[:2] - pose[:2])
-        flow = np.array([m.twist[0] - m.twist[2] * q[1], m.twist[1] + m.twist[2] * q[0], m.twist[2]])
-        late = sensor[2] - m.offset_s
-        co, so = np.cos(sensor[1]), np.sin(sensor[1])
-        seen = np.exp(sensor[0]) * np.array([[co, so], [-so, co]]) @ self._point[i]
-        J = np.array([[-1.0, 0.0, q[1]], [0.0, -1.0, -q[0]], [0.0, 0.0, -1.0]])
-        H = np.zeros((3, 6))  # sensor, place, yaw of the landmark
-        H[:2, 0], H[0, 1], H[1, 1], H[2, 1] = -seen, -seen[1], seen[0], 1.0
-        H[:, 2], H[:2, 3:5], H[2, 5] = flow, R_base_map, 1.0
-        residual = np.array([*(q + late * flow[:2] - seen), 0.0])
-        if not isinstance(m, MarkerPoseMeasurement):
-            residual, J, H = residual[:2], J[:2], H[:2]
-        else:
-            residual[2] = se2.wrap(place[2] - pose[2] + late * flow[2] - m.pose[2] + sensor[1])
-            cm, sm = np.cos(m.pose[2]), np.sin(m.pose[2])
-            turn = np.array([[cm, sm, 0.0], [-sm, cm, 0.0], [0.0, 0.0, 1.0]])
-            residual, J, H = turn @ residual, turn @ J, turn @ H
-        W = self._whitening[i]
-        residual, J, H = W @ residual, W @ J, W @ H
-        parts, columns = [], []
+        self._up = np.array([landmarks[m.landmark_id].rotation[2] for m in seen])
+        place = np.array([_block(installation, m.landmark_id, 2) for m in seen])
+        turn = np.array([_block(installation, m.landmark_id, 6) for m in seen])
+        self._columns = np.full((len(seen), 8), -1)  # sensor, place, rotation of the landmark
         if self._sensor is not None:
-            parts.append(H[:, :3])
-            columns.append(self._sensor)
-        if block is not None:
-            parts.append(H[:, 3:5])
-            columns.append(np.arange(block[0], block[0] + 2))
-            if block[1] == 6:
-                parts.append(H[:, 5:] @ self._rotation[i][2][None])
-                columns.append(np.arange(block[0] + 3, block[0] + 6))
-        used = np.concatenate(columns) if columns else np.zeros(0, dtype=int)
-        by_installation = np.hstack(parts) if parts else np.zeros((len(residual), 0))
-        return Linearized(residual, J, used, by_installation, np.zeros((len(residual), 0)))
+            self._columns[:, :3] = self._sensor
+        self._columns[:, 3:5] = np.where(place[:, None] >= 0, place[:, None] + np.arange(2), -1)
+        self._columns[:, 5:] = np.where(turn[:, None] >= 0, turn[:, None] + np.arange(3, 6), -1)
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
+        n = len(poses)
+        held = np.append(theta, 0.0)
+        sensor = np.zeros(3) if self._sensor is None else theta[self._sensor]
+        place = self._place[:, :2] + held[self._columns[:, 3:5]]
+        facing = self._place[:, 2] + np.einsum("ni,ni->n", self._up, held[self._columns[:, 5:]])
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        R = np.stack([np.stack([c, s], 1), np.stack([-s, c], 1)], 1)  # R_base_map
+        q = np.einsum("nij,nj->ni", R, place - poses[:, :2])
+        w = self._twist[:, 2]
+        flow = np.stack([self._twist[:, 0] - w * q[:, 1], self._twist[:, 1] + w * q[:, 0], w], 1)
+        late = sensor[2] - self._offset
+        co, so = np.cos(sensor[1]), np.sin(sensor[1])
+        seen = np.exp(sensor[0]) * self._point @ np.array([[co, so], [-so, co]]).T
+        residual = np.zeros((n, 3))
+        residual[:, :2] = q + late[:, None] * flow[:, :2] - seen
+        yaw = se2.wrap_array(facing - poses[:, 2] + late * w - self._yaw + sensor[1])
+        residual[:, 2] = np.where(self._whole, yaw, 0.0)
+        J = np.zeros((n, 3, 3))
+        J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
+        J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
+        H = np.zeros((n, 3, 8))
+        H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -seen, -seen[:, 1], seen[:, 0], 1.0
+        H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, R, self._up
+        H = np.where(self._columns[:, None] >= 0, H, 0.0)
+        W = self._whitening
+        return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it: the noise of these sightings has all in it."""
+        return np.zeros((len(J), 0))
+
+
+def _block(installation: Installation, landmark_id: int, rows: int) -> int:
+    """Where the state of a landmark begins, if it has as many rows; else -1."""
+    first, count = installation.landmarks.get(landmark_id, (-1, 0))
+    return first if count >= rows else -1
 
 
 def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement
+from fgloc.graph.observation import CornerBatch, PlanarBatch, Stacked
+from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
 _HUBER = 0.95
@@ -66,29 +68,22 @@ class PoseFit:
 
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
         self._observed = factors.observe(sightings)
-        self._factors = factors
-        self._k = [cauchy_k(m, config) for m in sightings]
+        self._theta, self._cov = factors.believed.mean, factors.believed.cov
+        self._k = np.array([cauchy_k(m, config) for m in sightings])
+        self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray, iterations: int) -> Fit | None:
         """As `joint_fit`."""
-        theta, pose, previous = self._factors.believed.mean, start, math.inf
-        whiten: list[FloatArray] | None = None
+        pose, previous = start, math.inf
         for step in range(iterations):
-            lines = self._observed.linearize(pose, theta)
-            if whiten is None or step == 1:  # the noise hardly depends on the pose, once it is about right
-                whiten = [np.eye(8) if one.behind else self._factors.whitening(one) for one in lines]
             normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
-            for one, W, k in zip(lines, whiten, self._k, strict=True):
-                dof += len(one.residual)
-                if one.behind:
-                    cost += _BEHIND_COST  # cannot be projected: as wrong as can be, and without a pull
-                    continue
-                r, J = W @ one.residual, W @ one.J
-                square = float(r @ r)
-                weight = k**2 / (k**2 + square / len(r) * 2.0)  # as if of one two-dimensional sighting
-                cost += _robust_cost(square, len(r), k)
-                normal += weight * J.T @ J
-                pull += weight * J.T @ r
+            for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
+                square = np.einsum("ni,ni->n", r, r)
+                weight = np.where(behind, 0.0, k**2 / (k**2 + 2.0 * square / d))  # as if of two-dimensional sightings
+                cost += float(np.where(behind, _BEHIND_COST, _robust_costs(square, d, k)).sum())
+                dof += int(d.sum())
+                normal += np.einsum("n,nij,nik->jk", weight, J, J)
+                pull += np.einsum("n,nij,ni->j", weight, J, r)
             if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
                 return None
             if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
@@ -98,19 +93,45 @@ class PoseFit:
         cov = np.linalg.inv(normal)
         return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
 
+    def costs(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Robust cost of each sighting at a pose (infinite: it cannot have been made there), and its residuals."""
+        costs, dofs = np.zeros(len(self._observed)), np.zeros(len(self._observed), dtype=int)
+        for (rows, _), (r, _, behind, d, k) in zip(self._observed.batches, self._white(pose, anew=True), strict=True):
+            square = np.einsum("ni,ni->n", r, r)
+            costs[rows] = np.where(behind, np.inf, _robust_costs(square, d, k))
+            dofs[rows] = d
+        return costs, dofs
+
+    def _whiten(self, batch: CornerBatch | PlanarBatch, stack: Stacked) -> FloatArray:
+        """What is not known of the installation, of the stamps and of the motion in between counts as noise."""
+        n, d = stack.residual.shape
+        cov = np.broadcast_to(np.eye(d), (n, d, d))
+        if len(self._cov):
+            P = self._cov[stack.columns[:, :, None], stack.columns[:, None, :]]
+            cov = cov + stack.H @ P @ stack.H.transpose(0, 2, 1)
+        shared = [batch.shared(i, stack.J[i], stack.H[i]) for i in range(n)]
+        cov = cov + np.array([g @ g.T for g in shared])
+        cov = np.where(stack.behind[:, None, None], np.eye(d), cov)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+
+    def _white(
+        self, pose: FloatArray, anew: bool
+    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray]]:
+        """Of each kind: residuals, Jacobians, what is behind the camera, residuals of each, Cauchy constants."""
+        for i, (rows, batch) in enumerate(self._observed.batches):
+            stack = batch.evaluate(np.broadcast_to(pose, (len(rows), 3)), self._theta, by_installation=anew)
+            if anew:
+                self._whitening[i] = self._whiten(batch, stack)
+            W = self._whitening[i]
+            r = np.einsum("nij,nj->ni", W, stack.residual)
+            yield r, W @ stack.J, stack.behind, np.array(batch.rows), self._k[rows]
+
 
 def sighting_costs(
     pose: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
-) -> list[tuple[float, int] | None]:
-    """Robust cost and degrees of freedom of each sighting made from a pose; None if it cannot have been."""
-    costs: list[tuple[float, int] | None] = []
-    for m, one in zip(sightings, factors.linearize(sightings, pose), strict=True):
-        if one.behind:
-            costs.append(None)
-            continue
-        r = factors.whitening(one) @ one.residual
-        costs.append((_robust_cost(float(r @ r), len(r), cauchy_k(m, config)), len(r)))
-    return costs
+) -> tuple[FloatArray, IntArray]:
+    """Robust cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
+    return PoseFit(sightings, factors, config).costs(pose)
 
 
 def cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
@@ -118,10 +139,10 @@ def cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
     return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
 
 
-def _robust_cost(square: float, dof: int, k: float) -> float:
-    """Cauchy's cost of a squared whitened residual, as if it were that of two-dimensional sightings."""
+def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:
+    """Cauchy's costs of squared whitened residuals, as if they were those of two-dimensional sightings."""
     pairs = dof / 2.0
-    return k**2 * math.log1p(square / pairs / k**2) * pairs
+    return np.asarray(k**2 * np.log1p(square / pairs / k**2) * pairs)
 
 
 def robust_weight(nis: float, dof: int) -> float:

@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief
-from fgloc.graph.pose_fit import Fit, joint_fit, sighting_costs
+from fgloc.graph.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
 from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
 from fgloc.sensors.motion_compensation import carry
@@ -41,7 +41,10 @@ _TRIMS = 3
 _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 _CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
-_MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 48, 12, 12  # sightings for the fit, for the rough fit, for places to start from
+_MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
+_HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
+_MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
+_UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
 _ITERATIONS, _ROUGH_ITERATIONS = 16, 4
 
@@ -170,8 +173,15 @@ class Initializer:
 
     def _solve(self, known: bool) -> Agreed | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
-        few = _spread(here, _MAX_ROUGH)
-        rough = [fit for c in self._candidates(here) if (fit := self._fit(c, few, _ROUGH_ITERATIONS)) is not None]
+        if known and len({m.landmark_id for m in here}) < 2:
+            return None  # one landmark alone may have been moved, or misread
+        fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
+        candidates = sorted(
+            self._candidates(here), key=lambda c: float(np.minimum(fit_few.costs(c)[0], _UNLIKELY).sum())
+        )
+        rough = [fit for c in candidates[:_MAX_CANDIDATES] if (fit := fit_few.solve(c, _ROUGH_ITERATIONS)) is not None]
+        if known and all(fit.cost > _HOPELESS * MAX_COST_PER_DOF * fit.dof for fit in rough):
+            return None
         places: list[FloatArray] = []
         for fit in sorted(rough, key=lambda fit: fit.cost):
             if len(places) < _MAX_PLACES and all(apart(fit.pose, other) for other in places):
@@ -249,12 +259,9 @@ class Initializer:
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
-        costs = sighting_costs(pose, sightings, self._factors, self._config)
-        return [
-            m
-            for m, cost in zip(sightings, costs, strict=True)
-            if cost is not None and cost[0] < MAX_COST_PER_DOF * cost[1]
-        ]
+        costs, dofs = sighting_costs(pose, sightings, self._factors, self._config)
+        explained = (costs < MAX_COST_PER_DOF * dofs).tolist()
+        return [m for m, kept in zip(sightings, explained, strict=True) if kept]
 
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
         return joint_fit(start, sightings, self._factors, self._config, iterations)
