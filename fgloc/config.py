@@ -180,6 +180,9 @@ class MarkersConfig(Section):
     dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
     default_size_m: float | None = Field(None, gt=0, le=5.0, description="side, for maps that give none")
     sigma_px: float = Field(0.5, gt=0, description="noise of one corner coordinate")
+    blur_sigma_px: float = Field(
+        0.2, ge=0, description="px by which blur draws all corners of a marker of 20 px in or out; falls with its area"
+    )
     cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
     max_sightings: int = Field(12, gt=0, description="the largest markers of an image that are used")
 

@@ -20,6 +20,8 @@ from fgloc.types import (
     RangeBearingMeasurement,
 )
 
+_BLURRED_SIDE_PX = 20.0  # side of a marker at which CornerMeasurement.blur_sigma_px holds; it falls with its square
+_MOST_BLURRED = 2.0
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
@@ -137,6 +139,7 @@ class CornerBatch:
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = [m.motion_cov for m in seen]
+        self._together = _drawn_in(self._pixels, np.array([m.blur_sigma_px for m in seen]))
         self.rows = [8] * len(seen)
         first = installation.blocks.get("camera")
         self._camera = None if first is None else np.arange(first[0], first[0] + 12)
@@ -218,8 +221,11 @@ class CornerBatch:
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
-        jitter, moved = self._jitter[i] * H[:, 11:12], self._moved[i]
-        return jitter if moved is None else np.hstack([jitter, J @ _root(moved)])
+        common = [self._together[i, :, None] / self._sigma[i], self._jitter[i] * H[:, 11:12]]
+        moved = self._moved[i]
+        if moved is not None:
+            common.append(J @ _root(moved))
+        return np.hstack(common)
 
 
 class PlanarBatch:
@@ -292,6 +298,15 @@ class PlanarBatch:
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it: the noise of these sightings has all in it."""
         return np.zeros((len(J), 0))
+
+
+def _drawn_in(pixels: FloatArray, sigma_px: FloatArray) -> FloatArray:
+    """One sigma ``(m, 8)`` of an error that moves all four corners ``(m, 4, 2)`` away from their middle alike."""
+    outward = pixels - pixels.mean(axis=1, keepdims=True)
+    side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
+    sigma = sigma_px * np.minimum((_BLURRED_SIDE_PX / side) ** 2, _MOST_BLURRED)
+    unit = outward / np.linalg.norm(outward, axis=2, keepdims=True)
+    return np.asarray((unit * sigma[:, None, None]).reshape(len(pixels), 8))
 
 
 def _block(installation: Installation, landmark_id: int, rows: int) -> int:

@@ -135,7 +135,10 @@ class LandmarkSensor:
         if not np.isfinite(corners).all():
             self._reject("undistortable")
             return None
-        return CornerMeasurement(event.stamp_ns, seen.marker_id, corners, self._config.markers.sigma_px, ideal)
+        section = self._config.markers
+        return CornerMeasurement(
+            event.stamp_ns, seen.marker_id, corners, section.sigma_px, ideal, blur_sigma_px=section.blur_sigma_px
+        )
 
     def _single_view(
         self, event: CornersEvent, seen: MarkerCorners, camera: Camera, landmark: Landmark | None
