@@ -133,7 +133,7 @@ class WheelsConfig(Section):
     )
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
     time_offset_sigma_s: float = Field(
-        0.01, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
+        0.005, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
     )
     yaw_per_m_sigma: float = Field(
         0.015,
@@ -180,8 +180,11 @@ class MarkersConfig(Section):
     dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
     default_size_m: float | None = Field(None, gt=0, le=5.0, description="side, for maps that give none")
     sigma_px: float = Field(0.5, gt=0, description="noise of one corner coordinate")
-    blur_sigma_px: float = Field(
-        0.2, ge=0, description="px by which blur draws all corners of a marker of 20 px in or out; falls with its area"
+    blur_s: float = Field(
+        2e-4,
+        ge=0,
+        le=0.1,
+        description="s: a blurred corner is off by as much as the image moves in this time (3 % of an exposure of 6 ms)",
     )
     cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
     max_sightings: int = Field(12, gt=0, description="the largest markers of an image that are used")

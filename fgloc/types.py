@@ -305,7 +305,7 @@ class CornerMeasurement:
         default_factory=lambda: _AT_REST
     )  # (3,) of the base at the exposure: m/s, m/s, rad/s, in the keyframe's axes
     offset_s: float = 0.0  # how late the stamp was taken to be when the sighting was moved to its keyframe
-    blur_sigma_px: float = 0.0  # by which blur draws all corners of a marker of 20 px in or out together
+    blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
     jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
 

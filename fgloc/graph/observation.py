@@ -20,7 +20,7 @@ from fgloc.types import (
     RangeBearingMeasurement,
 )
 
-_BLURRED_SIDE_PX = 20.0  # side of a marker at which CornerMeasurement.blur_sigma_px holds; it falls with its square
+_BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
 _MOST_BLURRED = 2.0
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
@@ -139,7 +139,8 @@ class CornerBatch:
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = [m.motion_cov for m in seen]
-        self._together = _drawn_in(self._pixels, np.array([m.blur_sigma_px for m in seen]))
+        self._outward, self._small = _shrinking(self._pixels)
+        self._blur_s = np.array([m.blur_s for m in seen])
         self.rows = [8] * len(seen)
         first = installation.blocks.get("camera")
         self._camera = None if first is None else np.arange(first[0], first[0] + 12)
@@ -195,7 +196,9 @@ class CornerBatch:
         A[..., :2] = by_ray / Z[..., None, None]
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
         B = A @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame
-        scale = 1.0 / self._sigma
+        by_time = (B @ flow[..., None])[..., 0]
+        speed = np.sqrt((by_time**2).sum(axis=2).mean(axis=1))  # px/s
+        scale = 1.0 / np.hypot(self._sigma, self._blur_s * speed)
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
         )
@@ -210,7 +213,7 @@ class CornerBatch:
         H[..., 7:9] = np.eye(2)
         H[..., 9] = f * np.stack([x, y], axis=2) * r2[..., None]
         H[..., 10] = H[..., 9] * r2[..., None]
-        H[..., 11] = (B @ flow[..., None])[..., 0]
+        H[..., 11] = by_time
         M = B @ Rz.transpose(0, 2, 1)[:, None]
         H[..., 12:15] = M
         H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
@@ -221,7 +224,9 @@ class CornerBatch:
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
-        common = [self._together[i, :, None] / self._sigma[i], self._jitter[i] * H[:, 11:12]]
+        speed = np.linalg.norm(H[:, 11]) * 0.5  # of a corner in the image, in units of the noise
+        shrunk = self._outward[i, :, None] * (self._blur_s[i] * self._small[i] * speed)
+        common = [shrunk, self._jitter[i] * H[:, 11:12]]
         moved = self._moved[i]
         if moved is not None:
             common.append(J @ _root(moved))
@@ -300,13 +305,15 @@ class PlanarBatch:
         return np.zeros((len(J), 0))
 
 
-def _drawn_in(pixels: FloatArray, sigma_px: FloatArray) -> FloatArray:
-    """One sigma ``(m, 8)`` of an error that moves all four corners ``(m, 4, 2)`` away from their middle alike."""
+def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors ``(m, 8)`` by which all four corners ``(m, 4, 2)`` move outwards, and how much a marker shrinks.
+
+    Blur draws in the edges of a marker whose cells are not much wider than it.
+    """
     outward = pixels - pixels.mean(axis=1, keepdims=True)
     side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
-    sigma = sigma_px * np.minimum((_BLURRED_SIDE_PX / side) ** 2, _MOST_BLURRED)
     unit = outward / np.linalg.norm(outward, axis=2, keepdims=True)
-    return np.asarray((unit * sigma[:, None, None]).reshape(len(pixels), 8))
+    return unit.reshape(len(pixels), 8), np.minimum((_BLURRED_SIDE_PX / side) ** 2, _MOST_BLURRED)
 
 
 def _block(installation: Installation, landmark_id: int, rows: int) -> int:

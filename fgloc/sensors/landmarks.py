@@ -137,7 +137,7 @@ class LandmarkSensor:
             return None
         section = self._config.markers
         return CornerMeasurement(
-            event.stamp_ns, seen.marker_id, corners, section.sigma_px, ideal, blur_sigma_px=section.blur_sigma_px
+            event.stamp_ns, seen.marker_id, corners, section.sigma_px, ideal, blur_s=section.blur_s
         )
 
     def _single_view(
