@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
 from robot_world import (
+    CAMERA,
     START_NS,
     Chain,
     World,
@@ -137,12 +138,11 @@ def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
     settings, motion, cov = config(), np.array([-0.1, 0.0, -0.05]), np.diag([0.01, 0.01, 0.02]) ** 2
     keyframe = np.array([0.2, 0.1, 0.0])
     then = se2.compose(keyframe, motion)
-    camera = Chain(settings, room()).localizer._landmarks._pinhole
     values = []
     for _ in range(40):
-        seen = CornerMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, camera)
+        seen = CornerMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
         wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
-        fit = joint_fit(keyframe, [carry(seen, wrong, cov, landmark.size_m)], factors, settings)
+        fit = joint_fit(keyframe, [carry(seen, wrong, cov)], factors, settings)
         error = se2.log(se2.between(fit.pose, keyframe))
         values.append(float(error @ np.linalg.solve(fit.cov, error)))
     assert np.mean(values) < 3.0 * 1.5

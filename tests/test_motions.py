@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
 from fgloc.fusion.motion import MotionSources, worsened
-from fgloc.graph.estimator import fuse
+from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief, Keyframe
 from fgloc.graph.slip_noise import Footing
 from fgloc.localizer import Localizer

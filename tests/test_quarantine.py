@@ -49,7 +49,7 @@ def test_the_displacement_of_a_moved_landmark_is_what_it_was_moved_by(by):
     found = []
     for pose in poses(0, 12):
         sighting = factors.sighting(0, beacon(pose, moved(landmark, *by), rng), None)
-        found.append(displacement(sighting, 0, pose, factors))
+        found.append(displacement(sighting, pose, factors))
     assert np.median(found, axis=0) == pytest.approx(by, abs=0.08)
 
 

@@ -277,11 +277,12 @@ def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
     """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
 
     The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
-    bearing's sigma, which is exact enough below 0.2 rad.
+    bearing's sigma, which is exact enough below 0.2 rad. The true range, which may be off by its sigma, makes the
+    sigma across: it does not vanish right at a landmark.
     """
     c, s = np.cos(m.bearing_rad), np.sin(m.bearing_rad)
-    r = m.range_m
-    J = np.array([[-r * s, c], [r * c, s]])  # columns: bearing, range
+    r, lever = m.range_m, np.sqrt(m.range_m**2 + m.cov[1, 1])
+    J = np.array([[-lever * s, c], [lever * c, s]])  # columns: bearing, range
     cov = J @ m.cov @ J.T
     return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
 
