@@ -213,7 +213,43 @@ class Weights:
             if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
-        return judged
+        return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
+
+    def _agreed(
+        self, measurements: Sequence[LandmarkMeasurement], predicted: Belief, judged: list[tuple[float, int, str]]
+    ) -> list[tuple[float, int, str]]:
+        """After dead reckoning the prediction excludes little: of sightings that exclude each other, the most that agree.
+
+        Between as many as that, those that the prediction finds likeliest.
+
+        Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
+        """
+        rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
+        known = predicted.installation or self._factors.believed
+        probability = self._config.estimator.gate_probability
+        together = correct(predicted, known, [measurements[i] for i in rows], self._factors) if len(rows) > 1 else None
+        dof = sum(judged[i][1] for i in rows)
+        if len(rows) < 2 or (together is not None and together[1] <= chi2_bound(probability, dof)):
+            return judged
+        most: tuple[int, float, set[int]] = 0, 0.0, set(rows)
+        for i in rows:
+            alone = correct(predicted, known, [measurements[i]], self._factors)
+            if alone is None or alone[0].installation is None:
+                continue
+            belief, theirs = alone[0], alone[0].installation
+            lines = self._factors.observe([measurements[j] for j in rows]).linearize(belief.pose, theirs.mean)
+            found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
+            agree = {
+                j
+                for j, one, nis in zip(rows, lines, found, strict=True)
+                if not one.behind and nis <= chi2_bound(probability, len(one.residual))
+            }
+            if i in agree:
+                most = max(most, (len(agree), -alone[1], agree), key=lambda item: item[:2])
+        return [
+            (nis, dof, reason or ("" if i in most[2] else "contradicts_others"))
+            for i, (nis, dof, reason) in enumerate(judged)
+        ]
 
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
         self._seen[m.landmark_id] += 1
