@@ -294,17 +294,27 @@ def test_fault_22_long_dead_reckoning_grows_and_recovers():
     assert np.hypot(*(beliefs[-1].pose - truths[-1])[:2]) < 0.2
 
 
+def break_down(estimator: IncrementalEstimator) -> None:
+    """GTSAM throws in the middle of the next update, and leaves ruins."""
+
+    def update(*_):
+        raise RuntimeError("Indeterminate linear system detected")
+
+    estimator._backend.update = update
+
+
 def test_fault_67_an_exception_in_gtsam_rebuilds_the_window_without_the_offender():
-    """A sighting that is no number leaves an estimate that is none."""
     walls = LandmarkFactors(wall_map())
-    seen = corner_sighting(np.zeros(3), wall_map().landmarks[0], np.nan)
+    seen = corner_sighting(np.zeros(3), wall_map().landmarks[0])
     estimator = IncrementalEstimator(EstimatorConfig(), walls)
     estimator.start(0, Belief(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)
     for k in range(1, 10):
         estimator.update(k * 10**8, 0.1, [motion])
+    break_down(estimator)
     belief = estimator.update(10**9, 0.1, [motion], [walls.sighting(10, seen, 3.0)])
     assert estimator.rebuilt == 1
+    assert [s.measurement for s in estimator.log.keyframes[10].refused] == [seen]
     assert belief.pose[0] == pytest.approx(7.0, abs=1e-6)
     assert belief.cov[0, 0] == pytest.approx(11e-4, rel=1e-6)
     after = estimator.update(11 * 10**8, 0.1, [motion])
@@ -373,7 +383,7 @@ def test_sightings_that_exclude_each_other_are_not_averaged(off):
     a, b = (corner_sighting(np.zeros(3), wall_map().landmarks[i]) for i in (0, 7))
     liar = corner_sighting(np.array([0.0, off, 0.0]), wall_map().landmarks[7])
     pose, reasons = after_a_slip(a, liar)
-    assert reasons == ["", "contradicts_others"]
+    assert sorted(reasons) == ["", "contradicts_others"]  # the one that the prediction finds likelier
     assert np.linalg.norm(pose[:2]) < 0.05
     beacon = point_sighting(np.zeros(3), wall_map().landmarks[9], np.diag([0.01, 0.02]) ** 2)
     liar = corner_sighting(np.array([0.0, -off, 0.0]), wall_map().landmarks[0])
@@ -387,7 +397,7 @@ def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
     landmarks = wall_map()
     walls = LandmarkFactors(landmarks)
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.02, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
-    offender = walls.sighting(31, corner_sighting(np.zeros(3), landmarks.landmarks[0], np.nan), 3.0)
+    offender = walls.sighting(31, corner_sighting(np.zeros(3), landmarks.landmarks[0]), 3.0)
 
     def filtered(offend: bool) -> Belief:
         estimator = IncrementalEstimator(EstimatorConfig(lag_s=1.0), walls)
@@ -395,6 +405,8 @@ def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
         for k in range(1, 31):
             seen = point_sighting(np.array([0.02 * k, 0.0, 0.0]), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
             estimator.update(k * 10**8, 0.1, [motion], [walls.sighting(k, seen, None)])
+        if offend:
+            break_down(estimator)
         belief = estimator.update(31 * 10**8, 0.1, [motion], [offender] if offend else [])
         assert estimator.rebuilt == offend
         return belief

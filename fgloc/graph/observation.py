@@ -134,9 +134,9 @@ class CornerBatch:
         flow = np.zeros_like(q)  # of the point in the base frame by a later stamp
         flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
-        q = q + (camera[11] - self._offset)[:, None, None] * flow
-        X = (q - self._t[:, None]) @ self._R
-        X = X - camera[:3] - _cross(camera[3:6], X)
+        late = camera[11] - self._offset
+        mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
+        X = mounted - camera[:3] - _cross(camera[3:6], mounted)
         depth = X[:, :, 2]
         behind = (depth < MIN_DEPTH_M).any(axis=1)
         Z = np.maximum(depth, MIN_DEPTH_M)
@@ -162,19 +162,22 @@ class CornerBatch:
         A = np.empty((n, 4, 2, 3))
         A[..., :2] = by_ray / Z[..., None, None]
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
-        B = A @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame
+        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame at the exposure
+        by_time = (B @ flow[..., None])[..., 0]
+        turn = (late * self._twist[:, 2])[:, None, None]
+        B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
         scale = 1.0 / self._sigma
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
         )
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
-        H[..., 3:6] = _crossed(A, X)  # -A (φ x X) by φ
+        H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
         H[..., 6] = f * image / (1.0 + camera[6])
         H[..., 7:9] = np.eye(2)
         H[..., 9] = f * np.stack([x, y], axis=2) * r2[..., None]
         H[..., 10] = H[..., 9] * r2[..., None]
-        H[..., 11] = (B @ flow[..., None])[..., 0]
+        H[..., 11] = by_time
         M = B @ Rz.transpose(0, 2, 1)[:, None]
         H[..., 12:15] = M
         H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
@@ -242,20 +245,22 @@ class PlanarBatch:
         q = R_base_map @ (place[:2] - pose[:2])
         flow = np.array([m.twist[0] - m.twist[2] * q[1], m.twist[1] + m.twist[2] * q[0], m.twist[2]])
         late = sensor[2] - m.offset_s
+        turn = np.array([[1.0, -late * m.twist[2]], [late * m.twist[2], 1.0]])  # of the point by a later stamp
         co, so = np.cos(sensor[1]), np.sin(sensor[1])
         seen = np.exp(sensor[0]) * np.array([[co, so], [-so, co]]) @ self._point[i]
         J = np.array([[-1.0, 0.0, q[1]], [0.0, -1.0, -q[0]], [0.0, 0.0, -1.0]])
         H = np.zeros((3, 6))  # sensor, place, yaw of the landmark
         H[:2, 0], H[0, 1], H[1, 1], H[2, 1] = -seen, -seen[1], seen[0], 1.0
-        H[:, 2], H[:2, 3:5], H[2, 5] = flow, R_base_map, 1.0
+        H[:, 2], H[:2, 3:5], H[2, 5] = flow, turn @ R_base_map, 1.0
+        J[:2] = turn @ J[:2]
         residual = np.array([*(q + late * flow[:2] - seen), 0.0])
         if not isinstance(m, MarkerPoseMeasurement):
             residual, J, H = residual[:2], J[:2], H[:2]
         else:
             residual[2] = se2.wrap(place[2] - pose[2] + late * flow[2] - m.pose[2] + sensor[1])
             cm, sm = np.cos(m.pose[2]), np.sin(m.pose[2])
-            turn = np.array([[cm, sm, 0.0], [-sm, cm, 0.0], [0.0, 0.0, 1.0]])
-            residual, J, H = turn @ residual, turn @ J, turn @ H
+            R = np.array([[cm, sm, 0.0], [-sm, cm, 0.0], [0.0, 0.0, 1.0]])
+            residual, J, H = R @ residual, R @ J, R @ H
         W = self._whitening[i]
         residual, J, H = W @ residual, W @ J, W @ H
         parts, columns = [], []
