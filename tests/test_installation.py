@@ -87,16 +87,26 @@ def test_what_is_a_state_depends_on_the_sensors():
     assert "map.3.z_m" not in points
     assert "wheels.time_offset_s" not in corners
     assert "wheels.time_offset_s" in installation_of(config(), room(), True, has_gyro=True).names
-    assert not any("." in n and n.split(".")[0] in ("map", "camera") for n in installation_of(config(), None, True).names)
+    assert not any(
+        "." in n and n.split(".")[0] in ("map", "camera") for n in installation_of(config(), None, True).names
+    )
     many = beacons(MOST_LANDMARKS + 1)
     assert not installation_of(config(), many, False).landmarks
 
 
 # --- prediction and correction against a dense Gaussian ---------------------------------------------------------------
 
-NAMES = ("wheels.radius", "sightings.range_scale", "sightings.bearing_offset_rad", "sightings.time_offset_s", "gyro.scale")
+NAMES = (
+    "wheels.radius",
+    "sightings.range_scale",
+    "sightings.bearing_offset_rad",
+    "sightings.time_offset_s",
+    "gyro.scale",
+)
 SIGMAS = (0.02, 0.03, 0.02, 0.01, 0.05)
-POINTS = LandmarkMap({i: Landmark(i, np.array([3.0 * np.cos(i), 3.0 * np.sin(i), 0.0]), np.eye(3), 0.0) for i in range(5)})
+POINTS = LandmarkMap(
+    {i: Landmark(i, np.array([3.0 * np.cos(i), 3.0 * np.sin(i), 0.0]), np.eye(3), 0.0) for i in range(5)}
+)
 
 
 def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> RangeBearingMeasurement:
@@ -140,7 +150,9 @@ def test_prediction_is_that_of_the_dense_joint_gaussian():
 
 
 def test_fused_motions_depend_on_both_installations():
-    a = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4, {"wheels.radius": (np.ones(3), 0.1)})
+    a = MotionMeasurement(
+        "wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4, {"wheels.radius": (np.ones(3), 0.1)}
+    )
     b = MotionMeasurement("gyro", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 3e-4, {"gyro.scale": (np.ones(3), 0.0)})
     _, _, depends = fuse_installed([a, b])
     assert depends["wheels.radius"][0] == pytest.approx(0.75 * np.ones(3))

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from motion_models import make_card, make_tensors
 from exact import exact
+from motion_models import make_card, make_tensors
 from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 

@@ -1,4 +1,4 @@
-"""Sightings as functions of pose and installation: residuals against GTSAM's, derivatives against finite differences."""
+"""Sightings by pose and installation: residuals against GTSAM's, derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -38,11 +38,12 @@ def scene(seed: int, n: int = 5):
     poses, markers, seen = [], {}, []
     for i in range(n):
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = FORWARD @ rotation(rng, 0.1), rng.normal(0.0, 0.1, 3) + [0.1, 0.0, 0.3]
+        T[:3, :3], T[:3, 3] = FORWARD @ rotation(rng, 0.1), rng.normal((0.1, 0.0, 0.3), 0.1)
         pose = np.array([*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)])
         x, y, yaw = se2.compose(pose, (rng.uniform(1.5, 4.0), rng.uniform(-0.5, 0.5), np.pi + rng.uniform(-0.5, 0.5)))
         flat = standing(i, x, y, yaw, 0.2)
-        markers[i] = replace(flat, position=flat.position + [0, 0, 0.2], rotation=flat.rotation @ rotation(rng, 0.1))
+        place = flat.position + np.array([0.0, 0.0, 0.2])
+        markers[i] = replace(flat, position=place, rotation=flat.rotation @ rotation(rng, 0.1))
         camera = Camera(640, 480, "plumb_bob", K, D, T)
         poses.append(pose)
         seen.append(CornerMeasurement(0, i, np.zeros((4, 2)), 0.5, camera))
@@ -97,7 +98,7 @@ def differences(observed, poses, theta, i: int, h: float = 1e-6):
 def check(observed, poses, theta, atol: float):
     for i, one in enumerate(observed.linearize(poses, theta)):
         J, H = differences(observed, poses, theta, i)
-        assert one.J == pytest.approx(J, rel=1e-4, abs=1e-4 * np.abs(J).max())
+        assert np.abs(one.J - J).max() < 1e-4 * np.abs(J).max()
         dense = np.zeros_like(H)
         dense[:, one.columns] = one.H
         for name in range(H.shape[1]):

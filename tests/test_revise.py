@@ -120,7 +120,10 @@ def test_many_revisions_as_poses_leave_the_window(kind):
     assert_same(settled(revised), settled(told), 1e-3, 5e-3)  # sightings are linear about what was predicted then
     assert revised.rebuilt == told.rebuilt == 0
     assert_same(
-        follow(revised, drive, range(150, 155), drive.first), follow(told, drive, range(150, 155), drive.first), 5e-4, 5e-3
+        follow(revised, drive, range(150, 155), drive.first),
+        follow(told, drive, range(150, 155), drive.first),
+        5e-4,
+        5e-3,
     )
 
 

@@ -292,7 +292,7 @@ class BatchSmoother:
     def _sighting_factors(
         self, seen: Sequence[tuple[int, FloatArray, Sighting]], share: float = 1.0
     ) -> Iterator[gtsam.NonlinearFactor]:
-        """Of sightings with their keyframes and poses, keyframes in order; of a known map with a share of what they say."""
+        """Of sightings with their keyframes and poses, keyframes in order; a share of them if the map is known."""
         if not self._factors.known or not seen:
             for _, _, s in seen:
                 yield from s.factors

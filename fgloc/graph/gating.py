@@ -218,7 +218,7 @@ class Weights:
     def _agreed(
         self, measurements: Sequence[LandmarkMeasurement], predicted: Belief, judged: list[tuple[float, int, str]]
     ) -> list[tuple[float, int, str]]:
-        """After dead reckoning the prediction excludes little: of sightings that exclude each other, the most that agree.
+        """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
 
         Between as many as that, those that the prediction finds likeliest.
 
@@ -250,7 +250,7 @@ class Weights:
     def _agreeing_with(
         self, first: int, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: Belief
     ) -> tuple[float, list[int]]:
-        """How little the prediction agrees with one sighting, and those that agree with both, the best of them first."""
+        """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
         known = predicted.installation or self._factors.believed
         alone = correct(predicted, known, [measurements[first]], self._factors)
         if alone is None or alone[0].installation is None:

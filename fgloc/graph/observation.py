@@ -162,7 +162,9 @@ class CornerBatch:
         A = np.empty((n, 4, 2, 3))
         A[..., :2] = by_ray / Z[..., None, None]
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
-        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame at the exposure
+        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[
+            :, None
+        ]  # by the point in the base frame at the exposure
         by_time = (B @ flow[..., None])[..., 0]
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
