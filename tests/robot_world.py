@@ -180,7 +180,8 @@ class Chain:
         self.gate = Gate(settings.gate, None if landmark_map is None else set(landmark_map.landmarks))
         self.stepper = Stepper(settings.keyframes, settings.gate, settings.estimator.lag_s)
         self.wheels = WheelMotion(settings.wheels)
-        sensor = LandmarkSensor(settings, landmark_map, CAMERA, None)
+        markers = landmark_map is not None and any(m.size_m for m in landmark_map.landmarks.values())
+        sensor = LandmarkSensor(settings, landmark_map, CAMERA if markers else None, None)
         self.localizer = Localizer(settings, landmark_map, self.wheels, sensor, learned, None, keep_all)
         self.estimates: list[Estimate] = []
         self.steps = 0

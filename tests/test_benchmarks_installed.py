@@ -129,8 +129,8 @@ def test_only_sightings_are_refused():
 
 def test_the_truth_has_the_names_of_the_documentation():
     truth = truth_values(INSTALLED)
-    assert truth["camera.time_offset_s"] == pytest.approx(0.019)
-    assert truth["imu.time_offset_s"] == pytest.approx(0.005)
+    assert truth["camera.time_offset_s"] == pytest.approx(0.014)
+    assert truth["wheels.time_offset_s"] == pytest.approx(-0.005)
     assert truth["camera.focal_scale"] == pytest.approx(528.0 / 525.0)
     assert truth["wheels.radius_scale"] == pytest.approx(1.0)
     assert truth["wheels.radius_ratio"] == pytest.approx(0.0505 / 0.0495)

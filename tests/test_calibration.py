@@ -98,9 +98,10 @@ def test_the_gains_of_commands_are_found_and_the_path_gets_its_length(commanded,
         smoothed = run(commanded, commanded.parent / "map.yaml", config, "batch")
         poses = smoothed.trajectory.poses
         truth = se2.interpolate(smoothed.truth.stamps_ns, smoothed.truth.poses, smoothed.trajectory.stamps_ns)
-        errors.append(abs(length(poses) / length(truth) - 1.0))
+        errors.append(np.hypot(*(poses - truth)[:, :2].T).mean())
+    assert abs(length(poses) / length(truth) - 1.0) < 0.02
     assert errors[1] < 0.02
-    assert errors[0] > 3.0 * errors[1]
+    assert errors[0] > 3.0 * errors[1]  # gains are states of every run, but not delay and slowdown
 
 
 def test_sigmas_are_honest_and_shrink_with_every_recording(wheeled):

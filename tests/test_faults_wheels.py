@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
-from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
+from robot_world import CAMERA, SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
 
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
@@ -58,7 +58,7 @@ def chain(tmp_path, witness: str, keep_all: bool = False, kinematics: Kinematics
         save_model(tmp_path / "m.safetensors", make_tensors(card, np.random.default_rng(0)), card)
         learned = LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
     gyro = Gyro(GyroConfig()) if witness == "gyro" else None
-    camera = made.localizer._landmarks._pinhole
+    camera = CAMERA
     sensor = LandmarkSensor(settings, world_map, camera, None)
     made.localizer = Localizer(settings, world_map, made.wheels, sensor, learned, None, keep_all, gyro)
     return made

@@ -73,7 +73,7 @@ def test_a_floor_is_slippery_for_a_while_after_a_slip():
 
 
 def test_the_log_knows_the_footing_of_the_next_step():
-    log = MeasurementLog()
+    log = MeasurementLog(10.0, keep_all=True)
     for k, why in enumerate(["", "slip", "slip", "frozen", ""]):
         frame = Keyframe(k, k * 10**8, 0.1 * k, Belief(np.zeros(3), np.eye(3)), off={"wheels": why} if why else {})
         frame.step, frame.footing = Step(k, 0, (k - 1) * 10**8, k * 10**8), log.footing(k, True)

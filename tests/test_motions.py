@@ -7,14 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exact import exact
 from motion_models import make_card, make_tensors
-from robot_world import SPEED, START_NS, TURN, Chain, World, beacons, config
+from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
 from fgloc.fusion.motion import MotionSources, worsened
-from fgloc.graph.estimator import fuse
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.installation import Installation
+from fgloc.graph.joint import fuse, predict
 from fgloc.graph.measurement_log import Belief, Keyframe
 from fgloc.graph.slip_noise import Footing
 from fgloc.localizer import Localizer
@@ -159,25 +162,32 @@ def test_commands_that_stand_in_for_wheels_are_left_out_beside_a_model_that_read
     assert beside.disagreement(readings) is None  # they are no witness of each other
 
 
+def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> Belief:
+    """Belief after 10 s, from the origin; ``off`` is what is known of radius, track and yaw_per_m."""
+    names_ = ("wheels.radius", "wheels.track", "wheels.yaw_per_m")
+    factors = LandmarkFactors(None, Installation(dict(zip(names_, sigmas, strict=True))))
+    if len(factors.installation):
+        factors.believed = replace(factors.believed, mean=np.array(off))
+    settings = Config.model_validate({"wheels": {"source": "command", "noise": {}}})
+    some = MotionSources(settings, WheelMotion(settings.wheels), factors=factors)
+    belief = Belief(np.zeros(3), np.zeros((3, 3)))
+    for i in range(round(10.0 / dt)):
+        readings = some.read(step(i, dt))
+        if readings.wheels is not None:
+            belief = predict(belief, factors.believed, factors.installation, [readings.wheels])
+    return belief
+
+
 def test_systematic_errors_of_the_wheels_grow_with_the_way_however_it_is_cut():
-    scales = {"scale_sigma": 0.02, "turn_scale_sigma": 0.05, "yaw_per_m_sigma": 0.01}
-    totals = []
+    """The joint prediction spreads them along the path as driving it with other wheels would."""
+    sigmas = np.array([0.02, 0.05, 0.01])
+    moved = [end_pose(0.05, sigmas, off).pose for off in 1e-3 * np.vstack([np.eye(3), -np.eye(3)])]
+    J = np.array([se2.log(se2.between(b, a)) / 2e-3 for a, b in zip(moved[:3], moved[3:], strict=True)]).T
+    expected = J @ np.diag(sigmas**2) @ J.T
     for dt in (0.05, 0.2):
-        some = sources(wheels={"source": "command", "noise": {}, **scales})
-        plain = sources(wheels={"source": "command", "noise": {}})
-        total = np.zeros((3, 3))
-        for i in range(round(10.0 / dt)):
-            a, b = some.read(step(i, dt)), plain.read(step(i, dt))
-            total += a.wheels.cov - b.wheels.cov
-            some.went(a, None)
-        totals.append(total)
-    way, turn = SPEED * 10.0, TURN * 10.0
-    expected = [(0.02 * way) ** 2, 0.0, (0.05 * turn) ** 2 + (0.01 * way) ** 2]
-    assert np.diag(totals[0]) == pytest.approx(expected, rel=0.01)
-    assert np.diag(totals[1]) == pytest.approx(np.diag(totals[0]), rel=0.01)
-    some.went(a, Belief(np.zeros(3), np.eye(3)))  # a fix: the way begins anew
-    after = some.read(step(200, 0.2)).wheels.cov - plain.read(step(200, 0.2)).wheels.cov
-    assert after[0, 0] == pytest.approx((0.02 * SPEED * 0.2) ** 2, rel=0.02)
+        grown = end_pose(dt, sigmas).cov - end_pose(dt, np.zeros(3)).cov
+        assert np.abs(grown - expected).max() < 0.03 * np.abs(expected).max()
+        assert end_pose(dt, sigmas).cross == pytest.approx(J @ np.diag(sigmas**2), abs=0.02 * 0.05**2 * 10.0)
 
 
 def test_factors_made_again_keep_what_sightings_said_against_them():
@@ -207,7 +217,7 @@ def blind_covs(tmp_path, max_interval_s: float, kind: str | None, gyro: bool, **
     """Covariance in the map frame every 2 s of 8 s without sightings."""
     adaptive = kind is None  # a model of random weights is wrong, and that would be noticed sooner or later
     kernels = {"cauchy_k": 1000.0}  # what these weigh differs by chance before the stretch, and with it the gyro's bias
-    settings = config(keyframes={"max_interval_s": max_interval_s}, weights={"adaptive": adaptive}, landmarks=kernels)
+    settings = exact(keyframes={"max_interval_s": max_interval_s}, weights={"adaptive": adaptive}, landmarks=kernels)
     settings = settings.model_copy(update={"wheels": settings.wheels.model_copy(update=wheels)})
     world_map = beacons()
     chain = Chain(settings, world_map)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exact import exact
 from robot_world import CAMERA, SIGMA_PX, Chain, World, beacons, config, polar, position_error, project, room, truth_at
 
 from fgloc import se2
@@ -49,7 +50,7 @@ def test_the_displacement_of_a_moved_landmark_is_what_it_was_moved_by(by):
     found = []
     for pose in poses(0, 12):
         sighting = factors.sighting(0, beacon(pose, moved(landmark, *by), rng), None)
-        found.append(displacement(sighting, 0, pose, factors))
+        found.append(displacement(sighting, pose, factors))
     assert np.median(found, axis=0) == pytest.approx(by, abs=0.08)
 
 
@@ -172,7 +173,7 @@ def test_fault_51_a_moved_marker_that_is_put_back_does_no_harm_in_a_run():
     early, late = World(true_map, seconds=22.0, shown=LandmarkMap(away)), World(true_map, seconds=42.0, seed=1)
     at = early.start_ns + 22 * 10**9
     events = [e for e in early.events() if e.stamp_ns < at] + [e for e in late.events() if e.stamp_ns >= at]
-    chain = Chain(config(), true_map)
+    chain = Chain(exact(), true_map)
     estimates = chain.run(events)
     reasons = [(e.stamp_ns, d.reason) for e in estimates for d in e.decisions if d.landmark_id == 7]
     assert sum(reason == "quarantined" for stamp, reason in reasons if stamp < at) > 3

@@ -38,12 +38,20 @@ class Wheels:
 
     stands_in = False
 
+    def twist(self, step: Step, at_ns: int) -> np.ndarray:
+        return MOTION * (1e9 / STEP_NS)
+
+    def carry(self, step: Step, start_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        return se2.exp(MOTION * ((end_ns - start_ns) / STEP_NS)), np.eye(3) * 1e-8
+
     def measure(self, step: Step) -> MotionMeasurement:
         return MotionMeasurement("wheels", step.start_ns, step.stamp_ns, MOTION, np.diag([1e-6, 1e-6, 1e-6]))
 
 
 class Beacons:
     """Exact ranges and bearings."""
+
+    sees_corners = False
 
     def measure(self, event: RangeBearingEvent) -> tuple[RangeBearingMeasurement, ...]:
         cov = np.diag([1e-4, 1e-3])

@@ -40,6 +40,7 @@ def calibrate_wheels(parts: Assembly, solver: BatchSmoother) -> WheelCalibration
     hessian = fit.hessian()
     for _ in range(_NEWTON_STEPS):
         fit.move(fit.value - np.linalg.solve(hessian, fit.gradient()))
+    fit.release()
     found = WheelCalibration(fit.names, fit.value, np.asarray(np.linalg.inv(hessian)))
     if (np.linalg.eigvalsh(hessian) <= 0.0).any() or (abs(fit.value - fit.start) > _FAR * fit.sigmas).any():
         raise EstimatorError(
@@ -50,7 +51,7 @@ def calibrate_wheels(parts: Assembly, solver: BatchSmoother) -> WheelCalibration
 
 
 class _Fit:
-    """The graph with the wheels' gains as its parameters.
+    """The graph with the wheels' gains as its parameters, and for the time being none of the wheels' states.
 
     Attributes:
         names: of the gains, as `WheelsConfig` has them.
@@ -76,13 +77,16 @@ class _Fit:
             )
         self._ends = np.array(list(factors))
         self._information = np.linalg.inv([wheels.cov for wheels in factors.values()])
-        self._motions = self._measured(self.value)
-        self._slopes = self._differentiated()
+        self.move(self.value)
 
     def move(self, value: FloatArray) -> None:
         """Solve with these gains, and linearize there."""
         self._solve(np.maximum(value, self._least))
         self._slopes = self._differentiated()
+
+    def release(self) -> None:
+        """Let the wheels' states say again how far the gains may be off, which are now those that were found."""
+        self._solve(self.value, released=True)
 
     def gradient(self) -> FloatArray:
         """Of the cost that is left, by the gains ``(n,)``."""
@@ -100,13 +104,15 @@ class _Fit:
         self._solve(at)
         return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
-    def _solve(self, value: FloatArray) -> None:
+    def _solve(self, value: FloatArray, released: bool = False) -> None:
         self.value, self._motions = value, self._measured(value)
         again = {}
         for i, motion in zip(self._ends.tolist(), self._motions, strict=True):
             frame = self._solver.frames[i]
             if frame.readings.wheels is not None:
-                readings = replace(frame.readings, wheels=replace(frame.readings.wheels, motion=motion))
+                before = frame.readings.wheels
+                depends = {name: (by, 0.0) for name, (by, _) in before.depends_on.items()} if released else {}
+                readings = replace(frame.readings, wheels=replace(before, motion=motion, depends_on=depends))
                 again[frame.k] = tuple(self._sources.combine_again(frame, readings))
         self._solver.replace_motions(again)
 

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from typing import TypeVar
 
@@ -24,6 +25,7 @@ from fgloc.graph.factors import (
     pose_key,
     prior_factor,
     sighting_factors,
+    sighting_whitening,
 )
 from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
 from fgloc.graph.installation import InstallationBelief
@@ -132,11 +134,11 @@ class BatchSmoother:
                 continue
             cov, dof = one.noise(), len(one.residual)
             bound = chi2_bound(self._probability, dof)
-            nis = float(one.residual @ np.linalg.solve(cov, one.residual))
+            nis = _squared(one.residual, cov)
             if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
-                marginals = marginals or _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+                marginals = marginals or self._marginals()
                 cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
-                nis = float(one.residual @ np.linalg.solve(cov, one.residual))
+                nis = _squared(one.residual, cov)
             if nis <= bound:
                 kept[k] = (*kept[k], replace(s, weight=robust_weight(nis, dof)))
         return kept
@@ -169,14 +171,16 @@ class BatchSmoother:
                     inliers.add(factor)
                     continue
                 motions.append((frame.k, m.source))
-                candidates.append(Candidate((factor,), chi2_bound(self._probability, 3)))
+                made = partial(self._weighted_motion, frame.k, m, poses[i - 1])
+                candidates.append(Candidate((factor,), chi2_bound(self._probability, 3), made))
         for frame, pose in zip(self.frames, poses, strict=True):
             for s in _of_others((*frame.sightings, *frame.refused), self._moved):
-                made = tuple(self._sighting_factors([(frame.k, pose, s)]))
-                if made:
+                factors = tuple(self._sighting_factors([(frame.k, pose, s)]))
+                if factors:
                     sightings.append((frame.k, s))
-                    dof = sum(factor.dim() for factor in made)
-                    candidates.append(Candidate(made, chi2_bound(self._probability, dof)))
+                    bound = chi2_bound(self._probability, sum(factor.dim() for factor in factors))
+                    again = partial(self._sighting_factors, [(frame.k, pose, s)]) if self._factors.known else None
+                    candidates.append(Candidate(factors, bound, again))
         weights, self._values = graduate(inliers, candidates, self._values, self._solve)
         trusted = (weights >= 0.5).tolist()
         doubted = [key for key, good in zip(motions, trusted, strict=False) if not good]
@@ -185,6 +189,11 @@ class BatchSmoother:
         for (k, sighting), good in zip(sightings, trusted[len(motions) :], strict=True):
             if good:
                 self.believed[k] = (*self.believed[k], sighting)
+
+    def _weighted_motion(
+        self, k: int, m: MotionMeasurement, before: FloatArray, weight: float
+    ) -> tuple[gtsam.NonlinearFactor]:
+        return (installed_motion_factor(k, replace(m, cov=m.cov / weight), before, self._factors.installation),)
 
     def stamps_ns(self) -> IntArray:
         """Times of the keyframes ``(n,)``."""
@@ -206,7 +215,7 @@ class BatchSmoother:
         n = len(self._factors.installation)
         if not n:
             return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
-        marginals = _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+        marginals = self._marginals()
         return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def result(self) -> Smoothed:
@@ -215,14 +224,17 @@ class BatchSmoother:
         Raises:
             EstimatorError: the graph leaves a pose undetermined.
         """
+        marginals = self._marginals()
+        return _with_deep_stack(lambda: self._result(marginals))
+
+    def _marginals(self) -> gtsam.Marginals:
         try:
-            return _with_deep_stack(self._result)
+            return _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
         except RuntimeError as error:
             why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
             raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
 
-    def _result(self) -> Smoothed:
-        marginals = gtsam.Marginals(self._graph, self._values)
+    def _result(self, marginals: gtsam.Marginals) -> Smoothed:
         covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
         return Smoothed(
             stamps_ns=self.stamps_ns(),
@@ -277,8 +289,10 @@ class BatchSmoother:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
 
-    def _sighting_factors(self, seen: Sequence[tuple[int, FloatArray, Sighting]]) -> Iterator[gtsam.NonlinearFactor]:
-        """Of sightings with their keyframes and poses, keyframes in order."""
+    def _sighting_factors(
+        self, seen: Sequence[tuple[int, FloatArray, Sighting]], share: float = 1.0
+    ) -> Iterator[gtsam.NonlinearFactor]:
+        """Of sightings with their keyframes and poses, keyframes in order; a share of them if the map is known."""
         if not self._factors.known or not seen:
             for _, _, s in seen:
                 yield from s.factors
@@ -289,7 +303,8 @@ class BatchSmoother:
         for k, group in groupby(zip(seen, lines, strict=True), key=lambda item: item[0][0]):
             kept = [(pose, s, one) for (_, pose, s), one in group if not one.behind]
             if kept:
-                yield from sighting_factors(k, [s for _, s, _ in kept], [one for _, _, one in kept], kept[0][0], theta)
+                sightings, ahead = [s for _, s, _ in kept], [one for _, _, one in kept]
+                yield from sighting_factors(k, sightings, ahead, kept[0][0], theta, share)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         params = gtsam.LevenbergMarquardtParams()
@@ -297,6 +312,10 @@ class BatchSmoother:
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
         params.setRelativeErrorTol(1e-7)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _squared(residual: FloatArray, cov: FloatArray) -> float:
+    return float(np.sum((sighting_whitening(cov) @ residual) ** 2))
 
 
 def _of_others(sightings: Iterable[Sighting], moved: Collection[int]) -> tuple[Sighting, ...]:

@@ -115,7 +115,12 @@ def installed_prior_factor(k: int, prior: Belief, belief: InstallationBelief) ->
 
 
 def sighting_factors(
-    k: int, sightings: Sequence[Sighting], lines: Sequence[Linearized], pose: FloatArray, theta: FloatArray
+    k: int,
+    sightings: Sequence[Sighting],
+    lines: Sequence[Linearized],
+    pose: FloatArray,
+    theta: FloatArray,
+    share: float = 1.0,
 ) -> list[gtsam.NonlinearFactor]:
     """One factor for all sightings of one image, linear about a pose and an installation.
 
@@ -125,6 +130,7 @@ def sighting_factors(
         lines: the same, linearized there.
         pose: ``(3,)``.
         theta: ``(n,)``.
+        share: of their information.
     """
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*pose))
@@ -136,7 +142,7 @@ def sighting_factors(
     made = []
     for members in images.values():
         r, J, H, cov = stacked([lines[i] for i in members], len(theta), [sightings[i].weight for i in members])
-        W = _whitening(cov)
+        W = math.sqrt(share) * sighting_whitening(cov)
         blocks = {pose_key(k): W @ J}
         if len(theta):
             blocks[INSTALLATION] = W @ H
@@ -175,6 +181,23 @@ def _whitening(cov: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
     except np.linalg.LinAlgError as error:
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
+
+
+def sighting_whitening(cov: FloatArray) -> FloatArray:
+    """W with ``Wᵀ W`` the inverse of a covariance that is no less than the identity.
+
+    Of a corner hardly in front of the camera it is so large that the identity is lost to rounding.
+
+    Raises:
+        CovarianceError: it is not finite.
+    """
+    if not np.isfinite(cov).all():
+        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: not finite")
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(cov)
+        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
 
 
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
@@ -259,7 +282,7 @@ class LandmarkFactors:
     def whitening(self, one: Linearized) -> FloatArray:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""
         cov = one.noise() + one.H @ self.believed.cov[np.ix_(one.columns, one.columns)] @ one.H.T
-        return _whitening(cov)
+        return sighting_whitening(cov)
 
     def near(self, landmark_id: int, displacement: FloatArray, within_m: float) -> list[int]:
         """Other known landmarks this near to where one would stand if it were displaced so ``(2,)`` in the map."""

@@ -213,7 +213,57 @@ class Weights:
             if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
-        return judged
+        return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
+
+    def _agreed(
+        self, measurements: Sequence[LandmarkMeasurement], predicted: Belief, judged: list[tuple[float, int, str]]
+    ) -> list[tuple[float, int, str]]:
+        """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
+
+        Between as many as that, those that the prediction finds likeliest.
+
+        Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
+        """
+        rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
+        if len(rows) < 2 or self._compatible(rows, measurements, predicted):
+            return judged
+        found = [self._agreeing_with(i, rows, measurements, predicted) for i in rows]
+        most: list[int] = []
+        for _, agree in sorted(found, key=lambda item: (-len(item[1]), item[0])):
+            while len(agree) > max(len(most), 1) and not self._compatible(agree, measurements, predicted):
+                agree = agree[:-1]
+            if len(agree) > len(most):
+                most = agree
+        return [
+            (nis, dof, reason or ("" if i in most or not most else "contradicts_others"))
+            for i, (nis, dof, reason) in enumerate(judged)
+        ]
+
+    def _compatible(self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: Belief) -> bool:
+        """Whether these sightings and the prediction may all be right."""
+        known = predicted.installation or self._factors.believed
+        seen = [measurements[i] for i in rows]
+        together = correct(predicted, known, seen, self._factors)
+        dof = sum(8 if isinstance(m, CornerMeasurement) else len(m.cov) for m in seen)
+        return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
+
+    def _agreeing_with(
+        self, first: int, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: Belief
+    ) -> tuple[float, list[int]]:
+        """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
+        known = predicted.installation or self._factors.believed
+        alone = correct(predicted, known, [measurements[first]], self._factors)
+        if alone is None or alone[0].installation is None:
+            return math.inf, []
+        belief, theirs = alone[0], alone[0].installation
+        others = [i for i in rows if i != first]
+        lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
+        found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
+        ratios = {
+            i: math.inf if one.behind else nis / chi2_bound(self._config.estimator.gate_probability, len(one.residual))
+            for i, one, nis in zip(others, lines, found, strict=True)
+        }
+        return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
 
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
         self._seen[m.landmark_id] += 1

@@ -6,7 +6,7 @@ solvers to global outlier rejection", truncated least squares (GNC-TLS).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -28,10 +28,12 @@ class Candidate:
     Attributes:
         factors: Gaussian.
         bound: squared whitened residual above which they are outliers: a χ² quantile of their dimensions.
+        made: the factors of a weight; None: they are nonlinear, so that GTSAM can give them another noise.
     """
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     bound: float
+    made: Callable[[float], Iterable[gtsam.NonlinearFactor]] | None = None
 
     def ratio(self, values: gtsam.Values) -> float:
         """Squared whitened residual over the bound."""
@@ -41,11 +43,14 @@ class Candidate:
         """The factors with their information times the weight."""
         if weight == 1.0:
             return list(self.factors)
-        root = np.sqrt(max(weight, LEAST_WEIGHT))
-        return [
-            f.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.SqrtInformation(f.noiseModel().R() * root))  # type: ignore[attr-defined]
-            for f in self.factors
-        ]
+        weight = max(weight, LEAST_WEIGHT)
+        return list(self.made(weight)) if self.made else [_weighted(f, weight) for f in self.factors]
+
+
+def _weighted(factor: gtsam.NonlinearFactor, weight: float) -> gtsam.NonlinearFactor:
+    R = factor.noiseModel().R()  # type: ignore[attr-defined]
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(R * np.sqrt(weight))
+    return factor.cloneWithNewNoiseModel(noise)  # type: ignore[attr-defined, no-any-return]
 
 
 Solve = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.Values]

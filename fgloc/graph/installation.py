@@ -47,12 +47,13 @@ class Installation:
         """Take prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
         Args:
-            parameters: prior sigmas; inside a block a sigma may be 0 (a state that is held), elsewhere it is left out.
+            parameters: prior sigmas; one of 0 is left out but in a block that holds others (there it is a state that
+                is held).
             landmark_cov: covariance of x, y ``(2, 2)`` of landmarks for which the map gives it.
         """
-        kept = {
-            name: s for name, s in parameters.items() if s > 0.0 or name.split(".")[0] in ("camera", "sightings", "map")
-        }
+        blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
+        blocks |= {f"map.{i}" for i in landmark_cov or {}}
+        kept = {name: s for name, s in parameters.items() if s > 0.0 or _block(name) in blocks}
         self.names = tuple(kept)
         self.sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
@@ -85,6 +86,12 @@ class Installation:
             if section in self.blocks:
                 return float(belief.mean[self.blocks[section][0] + row])
         return 0.0
+
+
+def _block(name: str) -> str:
+    """Of a parameter that is one of a block; "" for one by itself, whose sigma alone says whether it is a state."""
+    section = name.split(".")[0]
+    return name.rpartition(".")[0] if section == "map" else section if section in TIME_OFFSET else ""
 
 
 _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state

@@ -138,15 +138,16 @@ class IncrementalEstimator(Estimator):
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
             self._backend = self._new_backend()
             self._slots.clear()
-        initial = self._linearization(frame)
+        initial, predicted = self._linearization(frame), frame.belief
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
             self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
-            predicted, frame.belief = frame.belief, self._newest(frame.k)
+            frame.belief = self._newest(frame.k)
             if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > _TURNED_RAD and frame.prior is None:
                 self._relinearize(frame)
         except _GTSAM_ERRORS:
-            self._rebuild(frame, initial)
+            frame.belief = predicted  # which the sightings at fault have no part in
+            self._rebuild(frame, predicted)
 
     def _relinearize(self, newest: Keyframe) -> None:
         """The window was turned by much, as after dead reckoning: build it again at where its poses are now."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from fgloc import se2
-from fgloc.graph.factors import LandmarkFactors, stacked
+from fgloc.graph.factors import LandmarkFactors, sighting_whitening, stacked
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.graph.measurement_log import Belief
 from fgloc.graph.observation import Linearized
@@ -111,8 +111,7 @@ def nis_of_each(found: Innovation, lines: Sequence[Linearized]) -> list[float]:
     out, row = [], 0
     for one in lines:
         part = slice(row, row + len(one.residual))
-        r = found.residual[part]
-        out.append(float(r @ np.linalg.solve(found.cov[part, part], r)))
+        out.append(float(np.sum((sighting_whitening(found.cov[part, part]) @ found.residual[part]) ** 2)))
         row += len(one.residual)
     return out
 
@@ -140,7 +139,10 @@ def correct(
         if any(one.behind for one in lines):
             return None
         found = innovation(P, lines, weights)
-        factor = cho_factor(found.cov, check_finite=False)
+        try:
+            factor = cho_factor(found.cov, check_finite=False)
+        except np.linalg.LinAlgError:  # corners hardly in front of the camera
+            return None
         gap = found.residual - found.H @ x
         after = -P @ found.H.T @ cho_solve(factor, gap, check_finite=False)
         cost = float(gap @ cho_solve(factor, gap, check_finite=False))
@@ -148,6 +150,8 @@ def correct(
         pose, theta = se2.compose(belief.pose, se2.exp(x[:3])), known.mean + x[3:]
         if (np.abs(step) < _STILL * np.sqrt(np.diag(P))).all():
             break
+    if not np.isfinite(x).all() or (np.abs(step) > np.sqrt(np.diag(P))).any():
+        return None
     gain = P @ found.H.T
     after_cov = P - gain @ cho_solve(factor, gain.T, check_finite=False)
     after_cov = 0.5 * (after_cov + after_cov.T)

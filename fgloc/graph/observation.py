@@ -167,9 +167,9 @@ class CornerBatch:
         flow = np.zeros_like(q)  # of the point in the base frame by a later stamp
         flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
-        q = q + (camera[11] - self._offset)[:, None, None] * flow
-        X = (q - self._t[:, None]) @ self._R
-        X = X - camera[:3] - _cross(camera[3:6], X)
+        late = camera[11] - self._offset
+        mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
+        X = mounted - camera[:3] - _cross(camera[3:6], mounted)
         depth = X[:, :, 2]
         behind = (depth < MIN_DEPTH_M).any(axis=1)
         Z = np.maximum(depth, MIN_DEPTH_M)
@@ -195,8 +195,11 @@ class CornerBatch:
         A = np.empty((n, 4, 2, 3))
         A[..., :2] = by_ray / Z[..., None, None]
         A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
-        B = A @ self._R.transpose(0, 2, 1)[:, None]  # by the point in the base frame
+        # by the point in the base frame at the exposure
+        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]
         by_time = (B @ flow[..., None])[..., 0]
+        turn = (late * self._twist[:, 2])[:, None, None]
+        B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
         speed = np.sqrt((by_time**2).sum(axis=2).mean(axis=1))  # px/s
         scale = 1.0 / np.hypot(self._sigma, self._blur_s * speed)
         J: FloatArray = np.stack(
@@ -208,7 +211,7 @@ class CornerBatch:
             return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
-        H[..., 3:6] = _crossed(A, X)  # -A (φ x X) by φ
+        H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
         H[..., 6] = f * image / (1.0 + camera[6])
         H[..., 7:9] = np.eye(2)
         H[..., 9] = f * np.stack([x, y], axis=2) * r2[..., None]
@@ -288,14 +291,18 @@ class PlanarBatch:
         seen = np.exp(sensor[0]) * self._point @ np.array([[co, so], [-so, co]]).T
         residual = np.zeros((n, 3))
         residual[:, :2] = q + late[:, None] * flow[:, :2] - seen
+        turn = np.zeros((n, 2, 2))  # of the point by a later stamp
+        turn[:, 0, 0] = turn[:, 1, 1] = 1.0
+        turn[:, 0, 1], turn[:, 1, 0] = -late * w, late * w
         yaw = se2.wrap_array(facing - poses[:, 2] + late * w - self._yaw + sensor[1])
         residual[:, 2] = np.where(self._whole, yaw, 0.0)
         J = np.zeros((n, 3, 3))
         J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
         J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
+        J[:, :2] = turn @ J[:, :2]
         H = np.zeros((n, 3, 8))
         H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -seen, -seen[:, 1], seen[:, 0], 1.0
-        H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, R, self._up
+        H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, turn @ R, self._up
         H = np.where(self._columns[:, None] >= 0, H, 0.0)
         W = self._whitening
         return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
@@ -326,11 +333,12 @@ def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
     """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
 
     The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
-    bearing's sigma, which is exact enough below 0.2 rad.
+    bearing's sigma, which is exact enough below 0.2 rad. The true range, which may be off by its sigma, makes the
+    sigma across: it does not vanish right at a landmark.
     """
     c, s = np.cos(m.bearing_rad), np.sin(m.bearing_rad)
-    r = m.range_m
-    J = np.array([[-r * s, c], [r * c, s]])  # columns: bearing, range
+    r, lever = m.range_m, np.sqrt(m.range_m**2 + m.cov[1, 1])
+    J = np.array([[-lever * s, c], [lever * c, s]])  # columns: bearing, range
     cov = J @ m.cov @ J.T
     return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
 
