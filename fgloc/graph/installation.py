@@ -48,13 +48,14 @@ class Installation:
 
         Args:
             parameters: prior sigmas; inside a block a sigma may be 0 (a state that is held), elsewhere it is left out.
-            landmark_cov: covariance of x, y ``(2, 2)`` of landmarks for which the map gives it.
+            landmark_cov: covariance of landmarks for which the map gives it, as `Landmark` has it; what it leaves out
+                (z, the rotation) keeps its sigma, what is no state is passed over.
         """
         kept = {
             name: s for name, s in parameters.items() if s > 0.0 or name.split(".")[0] in ("camera", "sightings", "map")
         }
         self.names = tuple(kept)
-        self.sigmas = np.array(list(kept.values()))
+        sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
         self.landmarks: dict[int, tuple[int, int]] = {}
@@ -66,11 +67,13 @@ class Installation:
             elif section in TIME_OFFSET:
                 first, count = self.blocks.get(section, (i, 0))
                 self.blocks[section] = (first, count + 1)
-        self._prior_cov = np.diag(np.maximum(self.sigmas, _HELD) ** 2)
+        self._prior_cov = np.diag(np.maximum(sigmas, _HELD) ** 2)
         for landmark_id, cov in (landmark_cov or {}).items():
             if landmark_id in self.landmarks:
-                first = self.landmarks[landmark_id][0]
-                self._prior_cov[first : first + 2, first : first + 2] = cov
+                first, count = self.landmarks[landmark_id]
+                n = min(count, len(cov))
+                self._prior_cov[first : first + n, first : first + n] = cov[:n, :n]
+        self.sigmas = np.sqrt(np.diag(self._prior_cov))
 
     def __len__(self) -> int:
         return len(self.names)
