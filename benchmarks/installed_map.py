@@ -1,20 +1,23 @@
-"""Maps for `benchmarks.installed`: a hook.
-
-The map is to be found from the images of a tour of three minutes in a room of 6 m; then the tour is smoothed with it.
-`measure` yields the rows whose ids begin with ``map.``.
-"""
+"""Maps for `benchmarks.installed`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from datasets.sim.scenario import Control, Markers, Scenario, World
+from benchmarks.installed_recordings import installed
 
-from benchmarks.adaptive_recordings import Split
-from benchmarks.common import Row, not_run
+TOUR_S = 180.0
+_TOUR = (
+    (-1.8, -1.6), (-0.4, -1.5), (1.0, -1.5), (1.8, -0.5), (1.4, 1.2), (0.2, 1.6), (-0.3, 0.3), (-1.4, -0.2),
+    (-1.8, 1.2), (-0.9, 1.7), (0.3, 0.5), (1.2, -0.5), (0.3, -1.2), (-1.0, -0.8),
+)  # fmt: skip
 
-IDS = ("map.images.position_mm", "map.fed_back.ate_mm")
 
-
-def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
-    """All rows of maps; a quick run takes one seed."""
-    del quick, split
-    yield from not_run(IDS, "not measured yet")
+def tour(made: Scenario) -> Scenario:
+    """Three minutes around a room of 6 m."""
+    changes = {
+        "duration_s": TOUR_S,
+        "start": (*_TOUR[0], 0.0),
+        "world": World(size_m=(6.0, 6.0), markers=Markers(count=16)),
+        "control": Control(waypoints=_TOUR, speed=0.42),
+    }
+    return installed(made).model_copy(update=changes)

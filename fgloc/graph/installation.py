@@ -74,13 +74,27 @@ class Installation:
                 n = min(count, len(cov))
                 self._prior_cov[first : first + n, first : first + n] = cov[:n, :n]
         self.sigmas = np.sqrt(np.diag(self._prior_cov))
+        self._prior_mean = np.zeros(len(kept))
 
     def __len__(self) -> int:
         return len(self.names)
 
     def prior(self) -> InstallationBelief:
         """Before anything was measured."""
-        return InstallationBelief(np.zeros(len(self)), self._prior_cov.copy())
+        return InstallationBelief(self._prior_mean.copy(), self._prior_cov.copy())
+
+    def measured(self, row: FloatArray, value: float, sigma: float) -> None:
+        """Take a measurement of the parameters into the prior.
+
+        Args:
+            row: ``(n,)`` derivative of what was measured by the parameters.
+            value: measured, less what it would be if all parameters were 0.
+            sigma: of the measurement.
+        """
+        gain = self._prior_cov @ row / (row @ self._prior_cov @ row + sigma**2)
+        self._prior_mean = self._prior_mean + gain * (value - row @ self._prior_mean)
+        cov = self._prior_cov - np.outer(gain, row @ self._prior_cov)
+        self._prior_cov = 0.5 * (cov + cov.T)
 
     def time_offset(self, belief: InstallationBelief) -> float:
         """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
@@ -95,7 +109,11 @@ MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but f
 
 
 def installation_of(
-    config: Config, landmark_map: LandmarkMap | None, corners: bool, has_gyro: bool = False
+    config: Config,
+    landmark_map: LandmarkMap | None,
+    corners: bool,
+    has_gyro: bool = False,
+    most: int = MOST_LANDMARKS,
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -107,6 +125,7 @@ def installation_of(
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
+        most: landmarks of a map that are states; a larger map is taken as exact.
     """
     wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
     sigmas = {
@@ -127,7 +146,7 @@ def installation_of(
     else:
         sensor = (rb.range_scale_sigma, rb.bearing_bias_sigma_rad, rb.time_offset_sigma_s)
         sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}
-    if len(landmark_map) <= MOST_LANDMARKS:
+    if len(landmark_map) <= most:
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)
     return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None})
