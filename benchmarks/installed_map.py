@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from datasets.sim.scenario import Control, Markers, Scenario, World
 from benchmarks.installed_recordings import installed
+from datasets.sim.scenario import Control, Markers, Scenario, World
 
 TOUR_S = 180.0
 _TOUR = (

@@ -76,11 +76,11 @@ def _agreed(views: list[tuple[int, float, list[FloatArray]]]) -> Guess:
     """The pose that most views agree with."""
     depths = np.array([depth for _, depth, _ in views])
     both = np.array([[*made, *made][:2] for _, _, made in views])  # (n, 2, 4, 4)
-    best, support = both[0, 0], np.zeros(len(views), dtype=bool)
+    best, most = both[0, 0], 0
     for one in both[:: max(1, len(both) // _VOTERS)].reshape(-1, 4, 4):
-        agree = _near(one, both, depths).any(axis=1)
-        if agree.sum() > support.sum():
-            best, support = one, agree
+        agree = int(_near(one, both, depths).any(axis=1).sum())
+        if agree > most:
+            best, most = one, agree
     for _ in range(2):
         near = _near(best, both, depths)
         if not near.any():
@@ -90,8 +90,8 @@ def _agreed(views: list[tuple[int, float, list[FloatArray]]]) -> Guess:
         best = np.eye(4)
         best[:3, 3] = np.median(chosen[:, :3, 3], axis=0)
         best[:3, :3] = Rotation.from_matrix(chosen[:, :3, :3]).mean().as_matrix()
-    support = _near(best, both, depths).any(axis=1)
-    return Guess(best, frozenset(views[i][0] for i in np.flatnonzero(support)), len(views))
+    support = np.flatnonzero(_near(best, both, depths).any(axis=1))
+    return Guess(best, frozenset(views[i][0] for i in support), len(views))
 
 
 def _near(one: FloatArray, both: FloatArray, depths: FloatArray) -> FloatArray:

@@ -69,7 +69,7 @@ def survey(
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
-    sizes = {i: config.markers.default_size_m or 0.0 for i in seen} | {i: m.size_m for i, m in anchors.items()}
+    sizes = dict.fromkeys(seen, config.markers.default_size_m or 0.0) | {i: m.size_m for i, m in anchors.items()}
     legs, start, left_out = _joined(drives, sizes, anchors, config.landmarks.min_sightings)
     absent = [i for d in distances for i in (d.first, d.second) if i not in start]
     if absent:
@@ -86,8 +86,8 @@ def survey(
             left_out[i] = f"{views[i]} of its sightings fit the rest"
         elif sigma[:3].max() > _KNOWN_M or sigma[3:].max() > _KNOWN_RAD:
             left_out[i] = (
-                f"known to {100.0 * sigma[:3].max():.0f} cm and {np.degrees(sigma[3:].max()):.0f} degrees only: look at "
-                "it from nearer and from several places"
+                f"known to {100.0 * sigma[:3].max():.0f} cm and {np.degrees(sigma[3:].max()):.0f} degrees only: look "
+                "at it from nearer and from several places"
             )
     if not set(surveyed) - set(left_out):
         told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
@@ -161,6 +161,6 @@ def _off(d: Distance, landmarks: Mapping[int, Landmark]) -> float:
 
 def _missed(d: Distance, landmarks: Mapping[int, Landmark]) -> str:
     return (
-        f"Markers {d.first} and {d.second} come out {d.of(landmarks):.3f} m apart, measured were {d.metres:.3f} m: check "
-        "the markers' size."
+        f"Markers {d.first} and {d.second} come out {d.of(landmarks):.3f} m apart, measured were {d.metres:.3f} m: "
+        "check the markers' size."
     )

@@ -15,7 +15,7 @@ from fgloc.config import Config
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief, installation_of
-from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog
+from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import cauchy_k
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
@@ -172,7 +172,8 @@ class SurveyGraph:
                 if frame.prior is not None:
                     origin = n == 0 and not leg.free
                     prior = Belief(frame.prior.pose, _ORIGIN) if origin else Belief(pose, _FREE)
-                believed, refused = [], []
+                believed: list[Sighting] = []
+                refused: list[Sighting] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
                     (believed if agrees else refused).append(factors.sighting(k, m, cauchy_k(m, self._config)))
