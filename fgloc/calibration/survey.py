@@ -84,6 +84,8 @@ def survey(
         sigma = np.sqrt(np.diag(surveyed[i].cov))  # type: ignore[arg-type]
         if views[i] < config.landmarks.min_sightings:
             left_out[i] = f"{views[i]} of its sightings fit the rest"
+        elif i in graph.undecided:
+            left_out[i] = "its views fit two directions alike: look at it from the side and from nearer"
         elif sigma[:3].max() > _KNOWN_M or sigma[3:].max() > _KNOWN_RAD:
             left_out[i] = (
                 f"known to {100.0 * sigma[:3].max():.0f} cm and {np.degrees(sigma[3:].max()):.0f} degrees only: look "

@@ -8,21 +8,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fgloc.calibration.drives import Drive
+from fgloc.calibration.mirrored import mirrored, moved_by
 from fgloc.config import Config
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief, installation_of
 from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import cauchy_k
-from fgloc.types import FloatArray, Landmark, LandmarkMap
+from fgloc.types import CornerMeasurement, FloatArray, Landmark, LandmarkMap
 
 _WIDE_M, _WIDE_RAD = 0.5, 0.5  # sigmas of an unknown marker: next to nothing is known of it
 _FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of the first pose of a drive that finds itself by the markers
 _ORIGIN = np.diag(np.square([1e-4, 1e-4, 1e-5]))  # of the one that is the map's origin
-_ROUNDS = 5
+_ROUNDS = 6
+_MOST_VIEWS = 100  # of a marker that decide which way round it is ...
+_DECIDED = 12.0  # ... if they are by this much likelier one way (twice the log of the likelihood)
 _STILL_M, _STILL_RAD = 1e-3, 5e-3  # markers that move less were linearized well
 
 
@@ -66,6 +68,7 @@ class SurveyGraph:
     Attributes:
         installation: the parameters, the markers among them ...
         belief: ... and what was found of them.
+        undecided: markers that fit in two directions about alike.
         landmark_map: the markers that these are deviations from.
     """
 
@@ -92,6 +95,7 @@ class SurveyGraph:
         held = {i: m if i in anchors else replace(m, cov=wide) for i, m in landmarks.items()}
         self.landmark_map = LandmarkMap(held)
         self._views: Counter[int] = Counter()
+        self.undecided: set[int] = set()
         self.installation = self._installation()
         self.belief = self.installation.prior()
 
@@ -114,11 +118,11 @@ class SurveyGraph:
             )
             self.belief, self._poses = solver.installed(), solver.poses()
             self._views = Counter(s.measurement.landmark_id for held in solver.believed.values() for s in held)
-            if self._still():
+            better = self._look_from_the_other_side(solver)
+            if self._still() and not better:
                 break
-            self.landmark_map = LandmarkMap(
-                {i: m if i in self._anchors else self._found(m) for i, m in self.landmark_map.landmarks.items()}
-            )
+            moved = {i: m if i in self._anchors else self._found(m) for i, m in self.landmark_map.landmarks.items()}
+            self.landmark_map = LandmarkMap(moved | better)
 
     def landmarks(self) -> dict[int, Landmark]:
         """Markers as they were found, with covariances ``(6, 6)``."""
@@ -137,8 +141,29 @@ class SurveyGraph:
     def _found(self, landmark: Landmark) -> Landmark:
         first, _ = self.installation.landmarks[landmark.landmark_id]
         move = self.belief.mean[first : first + 6]
-        turned = landmark.rotation @ Rotation.from_rotvec(move[3:]).as_matrix()
-        return replace(landmark, position=landmark.position + move[:3], rotation=turned)
+        return moved_by(landmark, move)
+
+    def _look_from_the_other_side(self, solver: BatchSmoother) -> dict[int, Landmark]:
+        """Markers that fit better the other way round; of those that fit both ways about alike, note the ids."""
+        seen: dict[int, list[tuple[CornerMeasurement, FloatArray]]] = {}
+        for frame, pose in zip(solver.frames, self._poses, strict=True):
+            for s in (*frame.sightings, *frame.refused):
+                if isinstance(s.measurement, CornerMeasurement):
+                    seen.setdefault(s.measurement.landmark_id, []).append((s.measurement, pose))
+        better = {}
+        self.undecided = set()
+        for i, views in seen.items():
+            views = views[:: 1 + len(views) // _MOST_VIEWS]
+            if i in self._anchors:
+                continue
+            poses = np.array([pose for _, pose in views])
+            found = self._found(self.landmark_map.landmarks[i])
+            other = mirrored(found, [m for m, _ in views], poses, self.installation, self.belief.mean)
+            if other is not None and other.gain > 0.0:
+                better[i] = other.landmark
+            if other is not None and abs(other.gain) < _DECIDED:
+                self.undecided.add(i)
+        return better
 
     def _still(self) -> bool:
         for i, (first, _) in self.installation.landmarks.items():
