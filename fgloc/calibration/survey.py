@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +102,8 @@ def survey(
     found = found_values(graph.installation, graph.belief, first.config, first.camera, graph.landmark_map)
     notes = [note for one in drives for note in one.notes]
     notes += [f"Markers {sorted(unseen)} of the given map were not seen, and stay as given."] if unseen else []
-    notes += [_missed(d, kept) for d in distances if _off(d, kept) > _CONTRADICTS]
+    misfits = [(d, graph.misfit(d)) for d in distances]
+    notes += [_missed(d, sigmas) for d, sigmas in misfits if sigmas > _CONTRADICTS]
     return Survey(landmarks, {i: views[i] for i in kept}, left_out, found, tuple(dict.fromkeys(notes)))
 
 
@@ -137,8 +138,7 @@ def _joined(
         told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
         raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {told or 'none was seen'}")
     start = {
-        i: replace(anchors[i]) if i in anchors else Landmark(i, T[:3, 3], T[:3, :3], sizes[i])
-        for i, T in sorted(known.items())
+        i: anchors[i] if i in anchors else Landmark(i, T[:3, 3], T[:3, :3], sizes[i]) for i, T in sorted(known.items())
     }
     seen = {i for leg in legs for i in leg.agreeing}
     return legs, {i: m for i, m in start.items() if i in seen}, {i: w for i, w in left_out.items() if i not in start}
@@ -154,15 +154,8 @@ def _matrix(landmark: Landmark) -> FloatArray:
     return T
 
 
-def _off(d: Distance, landmarks: Mapping[int, Landmark]) -> float:
-    """By how many of its sigmas a measured distance is missed."""
-    if d.first not in landmarks or d.second not in landmarks:
-        return 0.0
-    return abs(d.of(landmarks) - d.metres) / d.sigma_m
-
-
-def _missed(d: Distance, landmarks: Mapping[int, Landmark]) -> str:
+def _missed(d: Distance, sigmas: float) -> str:
     return (
-        f"Markers {d.first} and {d.second} come out {d.of(landmarks):.3f} m apart, measured were {d.metres:.3f} m: "
-        "check the markers' size."
+        f"The distance of markers {d.first} and {d.second}, {d.metres:g} m, is {sigmas:.0f} sigmas from what is seen: "
+        "check it, and the markers' size."
     )

@@ -138,6 +138,17 @@ class SurveyGraph:
         """Sightings that are believed, by marker."""
         return self._views
 
+    def misfit(self, d: Distance) -> float:
+        """By how many sigmas a distance that is in the graph differs from what all else says of it.
+
+        What is left of a difference r with variance S, once a measurement of variance R is in, is r R / S, and the
+        variance of the value is R - R² / S.
+        """
+        row = self._along(d, self.installation)
+        left = d.metres - d.of(self.landmarks())
+        share = d.sigma_m**2 - float(row @ self.belief.cov @ row)
+        return abs(left) / math.sqrt(max(share, 1e-12))
+
     def _found(self, landmark: Landmark) -> Landmark:
         first, _ = self.installation.landmarks[landmark.landmark_id]
         move = self.belief.mean[first : first + 6]
@@ -176,13 +187,16 @@ class SurveyGraph:
         has_gyro = any(leg.drive.parts.localizer.sources.gyro is not None for leg in self._legs)
         made = installation_of(self._config, self.landmark_map, True, has_gyro, len(self.landmark_map))
         for d in self._distances:
-            at = self.landmark_map.landmarks
-            along = (at[d.second].position - at[d.first].position) / max(d.of(at), 1e-9)
-            row = np.zeros(len(made))
-            for i, sign in ((d.first, -1.0), (d.second, 1.0)):
-                row[made.landmarks[i][0] : made.landmarks[i][0] + 3] = sign * along
-            made.measured(row, d.metres - d.of(at), d.sigma_m)
+            made.measured(self._along(d, made), d.metres - d.of(self.landmark_map.landmarks), d.sigma_m)
         return made
+
+    def _along(self, d: Distance, installation: Installation) -> FloatArray:
+        """Derivative ``(n,)`` of a distance by the parameters."""
+        at, row = self.landmark_map.landmarks, np.zeros(len(installation))
+        along = (at[d.second].position - at[d.first].position) / max(d.of(at), 1e-9)
+        for i, sign in ((d.first, -1.0), (d.second, 1.0)):
+            row[installation.landmarks[i][0] : installation.landmarks[i][0] + 3] = sign * along
+        return row
 
     def _log(self, factors: LandmarkFactors) -> MeasurementLog:
         """Keyframes of all drives, one after the other, with the corners seen from each."""
