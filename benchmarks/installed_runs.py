@@ -50,7 +50,7 @@ from fgloc.types import Estimate, Step, Trajectory
 
 CASES = ("none", "slip", "mu01", "dark30", "dark60", "ids30", "moved", "frozen", "onewheel", "kidnap")
 _ROOT = Path(__file__).resolve().parent.parent
-_SCORING = ("adaptive_runs", "installed_runs", "installed_scores", "textbook")
+_SCORING = ("adaptive_runs", "installed_map", "installed_runs", "installed_scores", "textbook")
 _PLAIN = {"motion": {"use": False}}  # a textbook knows no learned motion either
 
 

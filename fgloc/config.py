@@ -184,7 +184,7 @@ class MarkersConfig(Section):
         2e-4,
         ge=0,
         le=0.1,
-        description="s: a blurred corner is off by as much as the image moves in this time (3 % of an exposure of 6 ms)",
+        description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
     )
     cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
     max_sightings: int = Field(12, gt=0, description="the largest markers of an image that are used")

@@ -206,7 +206,9 @@ class Landmark:
     position: FloatArray  # (3,) m in the map frame
     rotation: FloatArray  # (3, 3) R_map_marker; identity for a point
     size_m: float
-    cov: FloatArray | None = None  # (2, 2) of x, y for an estimated landmark
+    cov: FloatArray | None = None
+    """Of x, y ``(2, 2)``, of x, y, z ``(3, 3)`` in the map frame, or ``(6, 6)`` of these and the rotation [rad] about
+    the marker's own axes; None: not known."""
 
     def corners(self) -> FloatArray:
         """Corners ``(4, 3)`` in the map frame, in the order of MarkerCorners."""

@@ -130,6 +130,11 @@ class World:
         t = (stamp_ns - self.start_ns) * 1e-9 + self.start_s
         return truth_at(t, math.pi if t >= self.kidnap_s else 0.0)
 
+    @property
+    def sees_corners(self) -> bool:
+        """Whether the landmarks are markers."""
+        return next(iter((self.shown or self.map).landmarks.values())).size_m > 0.0
+
     def events(self) -> list[Event]:
         """In order of receipt."""
         self._rng = np.random.default_rng(self.seed)
@@ -157,7 +162,7 @@ class World:
     def _sightings(self, stamp: int) -> CornersEvent | RangeBearingEvent:
         pose, received = self.truth(stamp), stamp + round(self.late_s * 1e9)
         landmarks = (self.shown or self.map).landmarks.values()
-        if next(iter(landmarks)).size_m:
+        if self.sees_corners:
             seen = [(m.landmark_id, c) for m in landmarks if (c := project(pose, m)) is not None]
             noisy = [MarkerCorners(i, c + self._rng.normal(0.0, SIGMA_PX, (4, 2))) for i, c in seen]
             return CornersEvent(stamp, received, "/tags", "cam", tuple(noisy))

@@ -11,7 +11,9 @@ import pytest
 from real_data import real_data
 from scipy.spatial.transform import Rotation
 
+from fgloc.config import Config
 from fgloc.errors import MapError
+from fgloc.graph.installation import MARKER, installation_of
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import Landmark, LandmarkMap
 
@@ -69,6 +71,8 @@ def test_written_maps_read_back_the_same(tmp_path: Path) -> None:
     }
     A = rng.normal(size=(2, 2))
     landmarks[41] = Landmark(41, np.array([1.0 / 3.0, -2.0, 0.0]), np.eye(3), 0.0, A @ A.T + 0.01 * np.eye(2))
+    B = rng.normal(size=(6, 6))
+    landmarks[42] = Landmark(42, np.array([1.0, 2.0, 0.5]), np.eye(3), 0.1, B @ B.T + np.eye(6))
     path = tmp_path / "new" / "map.yaml"
     write_map(LandmarkMap(landmarks, "DICT_4X4_100"), path)
     again = load_map(path)
@@ -79,8 +83,45 @@ def test_written_maps_read_back_the_same(tmp_path: Path) -> None:
         assert back.size_m == m.size_m
         assert np.abs(back.rotation - m.rotation).max() < 1e-14
         assert (back.cov is None) == (m.cov is None)
-    assert np.array_equal(again.landmarks[41].cov, landmarks[41].cov)
+    for i in (41, 42):
+        assert np.array_equal(again.landmarks[i].cov, landmarks[i].cov)
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_sigmas_of_landmarks(tmp_path: Path) -> None:
+    text = """
+landmarks:
+  - {id: 1, position: [1, 2, 0.5], facing: 0, size: 0.1, sigma_m: 0.01, sigma_rad: [0.1, 0.2, 0.3]}
+  - {id: 2, position: [1, 2], sigma_m: [0.1, 0.2, 0.3]}
+  - {id: 3, position: [1, 2, 0.5], facing: 0, size: 0.1, sigma_m: 0.01}
+"""
+    m = load_map(written(tmp_path, text))
+    write_map(m, tmp_path / "again.yaml")
+    again = load_map(tmp_path / "again.yaml")
+    expected = {1: [0.01, 0.01, 0.01, 0.1, 0.2, 0.3], 2: [0.1, 0.2, 0.3], 3: [0.01] * 3}
+    for read in (m, again):
+        for i, sigmas in expected.items():
+            cov = read.landmarks[i].cov
+            assert cov is not None
+            assert np.allclose(cov, np.diag(np.square(sigmas)), rtol=1e-12, atol=0)
+    prior = installation_of(Config(), m, corners=True)
+    assert np.allclose(prior.sigmas[[prior.index[f"map.1.{name}"] for name in MARKER]], expected[1])
+    assert prior.sigmas[prior.index["map.3.rx_rad"]] == Config().map.rotation_sigma_rad
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ("facing: 0, sigma_m: 0", "expected more than 0"),
+        ("sigma_m: 0.1, sigma_rad: 0.1", "without an orientation"),
+        ("facing: 0, sigma_rad: 0.1", "without sigma_m"),
+        ("facing: 0, sigma_m: 0.1, cov: [[1, 0], [0, 1]]", "not both"),
+        ("cov: [[1, 0, 0], [0, 1]]", "is not a covariance"),
+    ],
+)
+def test_sigmas_that_are_none(tmp_path: Path, fields: str, message: str) -> None:
+    with pytest.raises(MapError, match=message):
+        load_map(written(tmp_path, f"landmarks:\n  - {{id: 1, position: [1, 2, 0.5], {fields}}}\n"))
 
 
 def test_tagslam_format(tmp_path: Path) -> None:

@@ -109,8 +109,8 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
         "xy_per_sqrt_s": 0.002,
         "yaw_per_sqrt_s": 0.002,
     }
-    # Corners are good to 0.07 px at rest; what motion blur adds is in markers.blur_s. Of validation recordings as installed
-    # NEES/3 without failure is 0.77 with this and 0.5 % of sound sightings are refused; with 0.09 px and no blur_s 3 %.
+    # Corners are good to 0.07 px at rest; what motion blur adds is in markers.blur_s. On validation recordings as
+    # installed NEES/3 is 0.77 and 0.5 % of sound sightings are refused; with 0.09 px and no blur_s 3 %.
     markers = {"sigma_px": 0.1}
     topics = {"command": "/cmd_vel", "odometry": "/odom", "truth": "/truth"}
     settings: dict[str, Any] = {"recording": {"topics": topics}, "wheels": wheels, "markers": markers}

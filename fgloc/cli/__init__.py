@@ -10,7 +10,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from fgloc.cli import runs, sweeps, tools
+from fgloc.cli import runs, surveys, sweeps, tools
 from fgloc.cli.terminal import EXIT_BAD_INPUT
 from fgloc.errors import FglocError
 
@@ -39,7 +39,7 @@ app.command()(tools.info)
 app.command()(runs.smooth)
 app.command()(runs.online)
 app.command()(tools.evaluate)
-app.command(name="map")(runs.make_map)
+app.command(name="map")(surveys.make_map)
 app.command()(runs.calibrate)
 app.command()(sweeps.ablate)
 

@@ -1,4 +1,4 @@
-"""Commands of one robot: ``demo``, ``smooth``, ``online``, ``map`` and ``calibrate``."""
+"""Commands of one robot: ``demo``, ``smooth``, ``online`` and ``calibrate``."""
 
 from __future__ import annotations
 
@@ -95,25 +95,6 @@ def online(
     """Replay the recording as a live robot would hear it; each pose knows only what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
     _finish(*_localise(bag, map_file, model, config, out, "online", typed(), pace), out)
-
-
-def make_map(
-    bag: Bag,
-    out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", dir_okay=False, help="map file to be written")],
-    model: ModelOption = None,
-    config: ConfigOption = None,
-) -> None:
-    """Survey the landmarks of a recording; the first pose is the map's origin."""
-    from fgloc.runner import run
-    from fgloc.sensors.maps import write_map
-
-    with run_bar(bag.name) as progress:
-        result = run(bag, None, configured(bag, config, model), "batch", progress)
-    if result.landmarks is None or not len(result.landmarks):
-        raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
-    write_map(result.landmarks, out)
-    typer.echo(f"{len(result.landmarks)} landmarks in {out}")
-    exit_if_lost(result.modes)
 
 
 def calibrate(

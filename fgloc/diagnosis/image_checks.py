@@ -26,6 +26,11 @@ def image_hints(recording: Recording, detector: MarkerDetector) -> tuple[str, ..
     return tuple(hints)
 
 
+def fitting_dictionary(recording: Recording) -> str | None:
+    """The marker dictionary that fits what is seen in a recording; None if none does."""
+    return suggest_dictionary(_some_images(recording))
+
+
 def _some_images(recording: Recording) -> list[GrayImage]:
     events = list(islice((e for e in recording.events() if isinstance(e, ImageEvent)), _SCANNED))
     images = []

@@ -46,6 +46,7 @@ _LINEARIZATIONS = 6
 _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
 _STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
 _DECISIONS = 3
+_ABSURD = 1e4  # sigmas: of a marker that would be all but in the plane of the camera; its derivatives mean nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +131,7 @@ class BatchSmoother:
         held = {id(s.measurement) for sightings in self.believed.values() for s in sightings}
         marginals = None
         for (k, _, s), one in zip(seen, lines, strict=True):
-            if one.behind:
+            if one.behind or np.abs(one.residual).max() > _ABSURD:
                 continue
             cov, dof = one.noise(), len(one.residual)
             bound = chi2_bound(self._probability, dof)

@@ -49,13 +49,14 @@ class Installation:
         Args:
             parameters: prior sigmas; one of 0 is left out but in a block that holds others (there it is a state that
                 is held).
-            landmark_cov: covariance of x, y ``(2, 2)`` of landmarks for which the map gives it.
+            landmark_cov: covariance of landmarks for which the map gives it, as `Landmark` has it; what it leaves out
+                (z, the rotation) keeps its sigma, what is no state is passed over.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
         kept = {name: s for name, s in parameters.items() if s > 0.0 or _block(name) in blocks}
         self.names = tuple(kept)
-        self.sigmas = np.array(list(kept.values()))
+        sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
         self.landmarks: dict[int, tuple[int, int]] = {}
@@ -67,18 +68,34 @@ class Installation:
             elif section in TIME_OFFSET:
                 first, count = self.blocks.get(section, (i, 0))
                 self.blocks[section] = (first, count + 1)
-        self._prior_cov = np.diag(np.maximum(self.sigmas, _HELD) ** 2)
+        self._prior_cov = np.diag(np.maximum(sigmas, _HELD) ** 2)
         for landmark_id, cov in (landmark_cov or {}).items():
             if landmark_id in self.landmarks:
-                first = self.landmarks[landmark_id][0]
-                self._prior_cov[first : first + 2, first : first + 2] = cov
+                first, count = self.landmarks[landmark_id]
+                n = min(count, len(cov))
+                self._prior_cov[first : first + n, first : first + n] = cov[:n, :n]
+        self.sigmas = np.sqrt(np.diag(self._prior_cov))
+        self._prior_mean = np.zeros(len(kept))
 
     def __len__(self) -> int:
         return len(self.names)
 
     def prior(self) -> InstallationBelief:
         """Before anything was measured."""
-        return InstallationBelief(np.zeros(len(self)), self._prior_cov.copy())
+        return InstallationBelief(self._prior_mean.copy(), self._prior_cov.copy())
+
+    def measured(self, row: FloatArray, value: float, sigma: float) -> None:
+        """Take a measurement of the parameters into the prior.
+
+        Args:
+            row: ``(n,)`` derivative of what was measured by the parameters.
+            value: measured, less what it would be if all parameters were 0.
+            sigma: of the measurement.
+        """
+        gain = self._prior_cov @ row / (row @ self._prior_cov @ row + sigma**2)
+        self._prior_mean = self._prior_mean + gain * (value - row @ self._prior_mean)
+        cov = self._prior_cov - np.outer(gain, row @ self._prior_cov)
+        self._prior_cov = 0.5 * (cov + cov.T)
 
     def time_offset(self, belief: InstallationBelief) -> float:
         """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
@@ -99,7 +116,11 @@ MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but f
 
 
 def installation_of(
-    config: Config, landmark_map: LandmarkMap | None, corners: bool, has_gyro: bool = False
+    config: Config,
+    landmark_map: LandmarkMap | None,
+    corners: bool,
+    has_gyro: bool = False,
+    most: int = MOST_LANDMARKS,
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -111,6 +132,7 @@ def installation_of(
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
+        most: landmarks of a map that are states; a larger map is taken as exact.
     """
     wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
     sigmas = {
@@ -131,7 +153,7 @@ def installation_of(
     else:
         sensor = (rb.range_scale_sigma, rb.bearing_bias_sigma_rad, rb.time_offset_sigma_s)
         sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}
-    if len(landmark_map) <= MOST_LANDMARKS:
+    if len(landmark_map) <= most:
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)
     return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None})

@@ -319,8 +319,8 @@ def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     outward = pixels - pixels.mean(axis=1, keepdims=True)
     side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
-    unit = outward / np.linalg.norm(outward, axis=2, keepdims=True)
-    return unit.reshape(len(pixels), 8), np.minimum((_BLURRED_SIDE_PX / side) ** 2, _MOST_BLURRED)
+    unit = outward / np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
+    return unit.reshape(len(pixels), 8), np.minimum((_BLURRED_SIDE_PX / np.maximum(side, 1.0)) ** 2, _MOST_BLURRED)
 
 
 def _block(installation: Installation, landmark_id: int, rows: int) -> int:

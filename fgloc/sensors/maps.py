@@ -9,9 +9,10 @@ Our format, all in metres and radians::
       - {id: 3, position: [1.0, 2.0, 0.0], rpy: [0, 0, 1], size: 0.1}  # turned by fixed-axis roll, pitch, yaw
       - {id: 4, position: [1.0, 3.0, 2.4], quaternion: [1, 0, 0, 0]}   # turned by a quaternion x, y, z, w
       - {id: 7, position: [2.0, 2.5], cov: [[0.01, 0], [0, 0.01]]}     # a point, perhaps with covariance of x, y
+      - {id: 8, position: [3.0, 0.0, 0.5], facing: 0, sigma_m: 0.005, sigma_rad: 0.01}  # how well it is known
 
 ``rpy`` and ``quaternion`` turn the marker frame into the map's: x to the marker's right as seen, y to its top, z out of
-its face. Without any turn a marker lies on the floor, face up, its right along the map's x.
+its face. Without any turn a marker lies on the floor, face up, its right along the map's x. Sigmas: `map_sigmas`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.recording.outputs import atomic_file
 from fgloc.sensors.dictionaries import load_dictionary
 from fgloc.sensors.documents import Item, read_document
+from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 _MAX_SIZE_M = 5.0
@@ -126,8 +128,7 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
         if landmark.size_m > 0.0:
             quaternion = Rotation.from_matrix(landmark.rotation).as_quat()
             fields += [f"quaternion: {_row(quaternion)}", f"size: {landmark.size_m!r}"]
-        if landmark.cov is not None:
-            fields.append(f"cov: [{', '.join(_row(row) for row in landmark.cov)}]")
+        fields += sigma_fields(landmark)
         lines.append(f"  - {{{', '.join(fields)}}}")
     with atomic_file(path) as file:
         file.write("\n".join(lines) + "\n")
@@ -145,7 +146,7 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
     if size is not None:
         builder.default_size_m = _size(size)
     for item in landmarks.entries():
-        item.only("id", "position", "size", "cov", *_ORIENTATIONS)
+        item.only("id", "position", "size", *KEYS, *_ORIENTATIONS)
         position = item.need("position").numbers(2, 3)
         given = [(key, value) for key in _ORIENTATIONS if (value := item.get(key)) is not None]
         if len(given) > 1:
@@ -153,14 +154,13 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
         if given and len(position) == 2:
             raise item.fail("a marker with an orientation needs a position of x, y, z")
         rotation = _orientation(*given[0]) if given else None
-        cov = item.get("cov")
         builder.add(
             item,
             item.need("id"),
             np.append(position, 0.0)[:3],
             rotation,
             item.get("size"),
-            None if cov is None else _cov(cov),
+            read_cov(item, rotation is not None),
         )
     return builder.finish(path, root, dictionary, [])
 
@@ -268,19 +268,6 @@ def _size(item: Item) -> float:
             f"marker size {size:g} m is too large; sizes are in metres: if it is {size:g} {unit}, write {metres:g}"
         )
     return size
-
-
-def _cov(item: Item) -> FloatArray:
-    cov = np.array([row.numbers(2) for row in item.entries()])
-    if (
-        cov.shape != (2, 2)
-        or abs(cov[0, 1] - cov[1, 0]) > 1e-9 * np.abs(cov).max()
-        or np.linalg.eigvalsh(cov)[0] <= 0.0
-    ):
-        raise item.fail(
-            f"cov {cov.tolist()} is not a covariance of x, y: expected 2 by 2, symmetric, positive definite"
-        )
-    return cov
 
 
 def _row(values: FloatArray) -> str:
