@@ -11,7 +11,9 @@ from typing import Literal
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
+from fgloc.calibration.contradictions import contradictions
 from fgloc.calibration.found import found_values
+from fgloc.calibration.settings import installation_found
 from fgloc.config import Config, Role
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
@@ -34,7 +36,6 @@ from fgloc.types import (
     Step,
     Trajectory,
     TruthEvent,
-    WheelCalibration,
 )
 
 RunMode = Literal["batch", "online"]
@@ -115,14 +116,13 @@ def run(
         raise EstimatorError(" ".join([_never_found(replay, rejections), *hints]))
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
-    wheels: WheelCalibration | None = None
     installed = parts.localizer.estimator.installed
     if mode == "batch":
         try:
             smoothed = smooth_run(parts)
         except EstimatorError as error:
             raise EstimatorError(" ".join([_sentence(str(error)), *hints])) from error
-        estimates, landmarks, wheels = smoothed.estimates, smoothed.landmarks, smoothed.wheels
+        estimates, landmarks = smoothed.estimates, smoothed.landmarks
         installed = smoothed.installation
         notes = (*notes, *smoothed.notes)
     if again := len(estimates) - len(last_pass(estimates)):
@@ -131,6 +131,8 @@ def run(
             f"The clock jumped back: {again} poses whose times came again are left out.",
         )
         estimates = last_pass(estimates)
+    found = installation_found(parts, recording.roles, installed)
+    notes = (*notes, *contradictions(found, parts.config))
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),
@@ -144,10 +146,10 @@ def run(
         landmarks=landmarks,
         spans=replay.spans(),
         source=recording_path,
-        wheels=wheels,
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),
+        found=found,
         first_pose_s=replay.first_pose_s,
     )
 

@@ -7,6 +7,7 @@ else is SI. Arrays are float64 and are not to be written to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -402,17 +403,35 @@ class Heard:
     longest_silence_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A value of the installation, as it was given and as a run found it; in the units of ``robot.yaml``."""
+
+    name: str
+    given: float
+    found: float
+    sigma: float  # of what was found
+    prior_sigma: float  # of what was given
+
+    @property
+    def off(self) -> float:
+        """How far the two are apart, in sigmas of both."""
+        return (self.found - self.given) / math.hypot(self.sigma, self.prior_sigma)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class WheelCalibration:
-    """Gains of the wheels that fit a run best."""
+class InstallationFound:
+    """The whole installation state of a run ``(n,)``, with the prior that it began from."""
 
-    names: tuple[str, ...]  # as `fgloc.config.WheelsConfig` has them
-    value: FloatArray  # (n,)
+    names: tuple[str, ...]
+    mean: FloatArray  # (n,)
     cov: FloatArray  # (n, n)
-
-    def __str__(self) -> str:
-        rows = zip(self.names, self.value.tolist(), np.sqrt(abs(np.diag(self.cov))).tolist(), strict=True)
-        return ", ".join(f"{name} {value:.4f} ± {sigma:.4f}" for name, value, sigma in rows)
+    prior_cov: FloatArray  # (n, n)
+    camera: Camera | None  # of corners, as the run used it
+    seen_by: str  # role whose stamps the sightings have
+    wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they never spoke
+    settings: tuple[Setting, ...] = ()  # all but the map's
+    landmarks: LandmarkMap | None = None  # of a known map, where they were found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -431,6 +450,6 @@ class RunResult:
     landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
     spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None
-    wheels: WheelCalibration | None = None  # if it was asked for
+    found: InstallationFound | None = None
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went

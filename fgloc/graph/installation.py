@@ -95,7 +95,11 @@ MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but f
 
 
 def installation_of(
-    config: Config, landmark_map: LandmarkMap | None, corners: bool, has_gyro: bool = False
+    config: Config,
+    landmark_map: LandmarkMap | None,
+    corners: bool,
+    has_gyro: bool = False,
+    has_model: bool = True,
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -107,15 +111,18 @@ def installation_of(
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
+        has_model: whether there is a learned motion.
     """
     wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
     sigmas = {
         "wheels.radius": wheels.scale_sigma,
         "wheels.track": wheels.turn_scale_sigma,
         "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
-        "gyro.scale": gyro.scale_sigma,
+        "wheels.slowdown": wheels.slowdown_sigma,
+        "wheels.delay_s": wheels.delay_sigma_s,
+        "gyro.scale": gyro.scale_sigma if has_gyro else 0.0,
         "wheels.time_offset_s": wheels.time_offset_sigma_s if has_gyro else 0.0,
-        "learned.scale": config.motion.scale_sigma,
+        "learned.scale": config.motion.scale_sigma if has_model else 0.0,
     }
     if landmark_map is None:
         return Installation(sigmas)
