@@ -32,6 +32,7 @@ class SmoothedRun:
     landmarks: LandmarkMap | None  # given or estimated
     notes: tuple[str, ...]
     installation: InstallationBelief
+    cost: float
 
 
 def smooth_run(parts: Assembly) -> SmoothedRun:
@@ -62,7 +63,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
-    return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed())
+    return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
 
 
 def take_room_back(localizer: Localizer) -> None:

@@ -415,8 +415,19 @@ class Setting:
 
     @property
     def off(self) -> float:
-        """How far the two are apart, in sigmas of both."""
-        return (self.found - self.given) / math.hypot(self.sigma, self.prior_sigma)
+        """How far what was given and what the measurements alone say are apart, in sigmas of both.
+
+        What was found lies between the two, by their sigmas; its expected square distance from the given value is the
+        difference of the variances.
+        """
+        spread = self.prior_sigma**2 - self.sigma**2
+        return (self.found - self.given) / math.sqrt(max(spread, 1e-6 * self.prior_sigma**2, 1e-30))
+
+    @property
+    def unpulled(self) -> float:
+        """The change that the measurements alone ask for, without the pull of the prior."""
+        share = 1.0 - (self.sigma / self.prior_sigma) ** 2 if self.prior_sigma > 0.0 else 1.0
+        return (self.found - self.given) / max(share, 0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -452,4 +463,5 @@ class RunResult:
     source: Path | None = None
     found: InstallationFound | None = None
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
+    cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went

@@ -30,6 +30,7 @@ from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import chi2_bound, robust_weight
 from fgloc.types import (
+    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
@@ -208,6 +209,14 @@ class BatchSmoother:
             return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
         marginals = _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
         return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+
+    def cost(self) -> float:
+        """Half the sum of squared residuals; a sighting that is left out counts as the least that would be refused."""
+        held = {id(s.measurement) for sightings in self.believed.values() for s in sightings}
+        out = [s for f in self.frames for s in (*f.sightings, *f.refused) if id(s.measurement) not in held]
+        sizes = {CornerMeasurement: 8, RangeBearingMeasurement: 2, MarkerPoseMeasurement: 3}
+        bounds = [chi2_bound(self._probability, sizes[type(s.measurement)]) for s in out]
+        return float(self._graph.error(self._values)) + 0.5 * sum(bounds)
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from fgloc.types import (
     RangeBearingMeasurement,
 )
 
+_MOST_LOG_SCALE = 3.0  # of ranges: an estimate that diverges goes on to be refused, not to overflow
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
@@ -243,7 +245,11 @@ class PlanarBatch:
         flow = np.array([m.twist[0] - m.twist[2] * q[1], m.twist[1] + m.twist[2] * q[0], m.twist[2]])
         late = sensor[2] - m.offset_s
         co, so = np.cos(sensor[1]), np.sin(sensor[1])
-        seen = np.exp(sensor[0]) * np.array([[co, so], [-so, co]]) @ self._point[i]
+        seen = (
+            math.exp(max(-_MOST_LOG_SCALE, min(_MOST_LOG_SCALE, sensor[0])))
+            * np.array([[co, so], [-so, co]])
+            @ self._point[i]
+        )
         J = np.array([[-1.0, 0.0, q[1]], [0.0, -1.0, -q[0]], [0.0, 0.0, -1.0]])
         H = np.zeros((3, 6))  # sensor, place, yaw of the landmark
         H[:2, 0], H[0, 1], H[1, 1], H[2, 1] = -seen, -seen[1], seen[0], 1.0
