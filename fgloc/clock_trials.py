@@ -13,7 +13,7 @@ from fgloc.types import InstallationFound, RunResult, Setting
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SAME_S = 0.01
-_BETTER = 4.5  # of the cost, half a χ²: three sigmas of one parameter
+_BETTER, _BETTER_SHARE = 4.5, 0.02  # of the cost, half a χ²: three sigmas of one parameter, and what models leave out
 _MODEL_S = 0.003  # what the model of a robot leaves out
 _WHEELS = ("joints", "odometry")
 
@@ -50,8 +50,12 @@ def clock_trials(found: InstallationFound, seen: Mapping[str, float], config: Co
     return tuple(kept)
 
 
-def clock_note(trials: tuple[Trial, ...], config: Config, again: Callable[[Config], RunResult]) -> tuple[str, ...]:
-    """The sentence on the correction that makes the run fit best; none if none makes it fit clearly better.
+def clock_note(
+    trials: tuple[Trial, ...], config: Config, again: Callable[[Config], RunResult]
+) -> tuple[str, InstallationFound] | None:
+    """A sentence on the correction that makes the run fit best, and what is found with it.
+
+    None if no correction makes it fit clearly better.
 
     Args:
         trials: what to try.
@@ -59,13 +63,13 @@ def clock_note(trials: tuple[Trial, ...], config: Config, again: Callable[[Confi
         again: the same run in batch, with another configuration.
     """
     if not trials:
-        return ()
+        return None
     plain = again(config).cost
     done = [(trial, again(_with(config, trial))) for trial in trials]
     costs = [(math.inf if result.cost is None else result.cost, i) for i, (_, result) in enumerate(done)]
     least, best = min(costs)
-    if plain is None or least > plain - _BETTER or done[best][1].found is None:
-        return ()
+    if plain is None or least > plain - max(_BETTER, _BETTER_SHARE * plain) or done[best][1].found is None:
+        return None
     trial, result = done[best]
     assert result.found is not None
     given = {str(r): offset for r, offset in config.recording.stamp_offset_s.items()}.get(trial.role, 0.0)
@@ -75,14 +79,15 @@ def clock_note(trials: tuple[Trial, ...], config: Config, again: Callable[[Confi
     sigma = math.hypot(_MODEL_S, max((s.sigma for s in clocks), default=0.0) if left is None else left.sigma)
     late = given - setting
     if abs(late) < _LATE_S:
-        return ()
+        return None
     has_gyro = any(s.name == "gyro.scale" for s in result.found.settings)
     name, against = _names(trial.role, has_gyro)
-    return (
+    said = (
         f"The stamps of the {name} are {abs(late):.3f} ± {sigma:.3f} s {'late' if late > 0 else 'early'} against the "
         f"{against}: set recording.stamp_offset_s: {{{trial.role}: {setting:.3f}}}; tried, and the recording fits "
-        "better.",
+        "better."
     )
+    return said, result.found
 
 
 def _late(s: Setting) -> bool:

@@ -139,10 +139,11 @@ def run(
         estimates = last_pass(estimates)
     found = installation_found(parts, recording.roles, installed)
     cost = smoothed.cost if smoothed is not None else None
-    notes = (*notes, *contradictions(found))
+    tried = None
     if try_clocks and events is None and sightings is None and on_step is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
-        notes = (*clock_note(trials, config, partial(_tried, recording_path, map_path, detections)), *notes)
+        tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
+    notes = (*(() if tried is None else tried[:1]), *notes, *contradictions(found if tried is None else tried[1]))
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),

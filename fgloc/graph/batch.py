@@ -30,7 +30,6 @@ from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import chi2_bound, robust_weight
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
@@ -211,12 +210,24 @@ class BatchSmoother:
         return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def cost(self) -> float:
-        """Half the sum of squared residuals; a sighting that is left out counts as the least that would be refused."""
-        held = {id(s.measurement) for sightings in self.believed.values() for s in sightings}
-        out = [s for f in self.frames for s in (*f.sightings, *f.refused) if id(s.measurement) not in held]
-        sizes = {CornerMeasurement: 8, RangeBearingMeasurement: 2, MarkerPoseMeasurement: 3}
-        bounds = [chi2_bound(self._probability, sizes[type(s.measurement)]) for s in out]
-        return float(self._graph.error(self._values)) + 0.5 * sum(bounds)
+        """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
+
+        Sightings count by their own noise alone, and one that is left out as the least that would be refused.
+        """
+        total = float(self._of_motion().error(self._values))
+        seen = [
+            (pose, s)
+            for frame, pose in zip(self.frames, self.poses(), strict=True)
+            for s in _of_others((*frame.sightings, *frame.refused), self._moved)
+        ]
+        if not self._factors.known or not seen:
+            factors = [f for held in self.believed.values() for s in held for f in s.factors]
+            return total + sum(f.error(self._values) for f in factors)
+        observed = self._factors.observe([s.measurement for _, s in seen])
+        for one in observed.linearize(np.array([pose for pose, _ in seen]), self._theta()):
+            bound = chi2_bound(self._probability, len(one.residual))
+            total += 0.5 * (bound if one.behind else min(bound, float(one.residual @ one.residual)))
+        return total
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.
@@ -262,19 +273,23 @@ class BatchSmoother:
                 break
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
+        graph = self._of_motion()
+        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.believed[f.k]]
+        for factor in self._sighting_factors(seen):
+            graph.add(factor)
+        return graph
+
+    def _of_motion(self) -> gtsam.NonlinearFactorGraph:
+        """Priors and motions, linear about the solution."""
         graph = gtsam.NonlinearFactorGraph()
         for factor in self._priors():
             graph.add(factor)
         poses = self.poses()
-        seen = []
         for i, frame in enumerate(self.frames):
             for motion in frame.motions:
                 if motion.source in self.outliers.get(frame.k, ()):
                     motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
                 graph.add(installed_motion_factor(frame.k, motion, poses[i - 1], self._factors.installation))
-            seen += [(frame.k, poses[i], s) for s in self.believed[frame.k]]
-        for factor in self._sighting_factors(seen):
-            graph.add(factor)
         return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
