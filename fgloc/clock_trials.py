@@ -13,7 +13,10 @@ from fgloc.types import InstallationFound, RunResult, Setting
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SAME_S = 0.01
-_BETTER, _BETTER_SHARE = 4.5, 0.02  # of the cost, half a χ²: three sigmas of one parameter, and what models leave out
+_BETTER = (
+    10.0  # of the cost, a negative log-likelihood: what it changes by where sightings only come to other keyframes
+)
+_AS_GOOD = 0.02  # share of the gain that trials may lack of the best one, the earlier of them being taken
 _MODEL_S = 0.003  # what the model of a robot leaves out
 _WHEELS = ("joints", "odometry")
 
@@ -66,10 +69,10 @@ def clock_note(
         return None
     plain = again(config).cost
     done = [(trial, again(_with(config, trial))) for trial in trials]
-    costs = [(math.inf if result.cost is None else result.cost, i) for i, (_, result) in enumerate(done)]
-    least, best = min(costs)
-    if plain is None or least > plain - max(_BETTER, _BETTER_SHARE * plain) or done[best][1].found is None:
+    costs = [math.inf if result.cost is None else result.cost for _, result in done]
+    if plain is None or min(costs) > plain - _BETTER:
         return None
+    best = next(i for i, cost in enumerate(costs) if cost <= min(costs) + _AS_GOOD * (plain - min(costs)))
     trial, result = done[best]
     assert result.found is not None
     given = {str(r): offset for r, offset in config.recording.stamp_offset_s.items()}.get(trial.role, 0.0)

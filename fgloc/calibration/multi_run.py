@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import Progress, find_beside, run
-from fgloc.types import RunResult, Setting
+from fgloc.types import InstallationFound, RunResult, Setting
 
 _SIGHTINGS = ("corners", "range_bearing", "marker_pose")
 _ROUNDS = 2  # with the gains of the first, sightings are believed and refused that were not before
@@ -87,11 +87,18 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
 
 
 def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]:
+    founds = [r.found for r in results if r.found is not None]
+    return pooled(founds, {None if r.landmarks is None else r.landmarks.source for r in results}, config)
+
+
+def pooled(founds: Sequence[InstallationFound], maps: Collection[str | None], config: Config) -> tuple[Setting, ...]:
     """What several runs know together: their information added, that of the prior once.
 
-    Landmarks are left out if the runs have several maps.
+    Args:
+        founds: of each run.
+        maps: that they used; landmarks are left out if these are several.
+        config: of all runs.
     """
-    founds = [r.found for r in results if r.found is not None]
     first = founds[0]
     if len({f.wheels == "command" for f in founds}) > 1:
         raise EstimatorError(
@@ -100,7 +107,6 @@ def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]
         )
     if len(founds) == 1:
         return first.settings
-    maps = {None if r.landmarks is None else r.landmarks.source for r in results}
     names = [n for n in dict.fromkeys(n for f in founds for n in f.names) if len(maps) == 1 or not n.startswith("map.")]
     places = []
     prior = np.eye(len(names))
@@ -115,5 +121,4 @@ def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]
         information[np.ix_(rows, rows)] += posterior - np.linalg.inv(f.prior_cov[np.ix_(own, own)])
         pull[rows] += posterior @ f.mean[own]
     cov = np.asarray(np.linalg.inv(information))
-    pooled = replace(first, names=tuple(names), mean=cov @ pull, cov=cov, prior_cov=prior)
-    return settings_found(pooled, config)
+    return settings_found(replace(first, names=tuple(names), mean=cov @ pull, cov=cov, prior_cov=prior), config)

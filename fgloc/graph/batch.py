@@ -30,6 +30,7 @@ from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import chi2_bound, robust_weight
 from fgloc.types import (
+    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
@@ -212,7 +213,8 @@ class BatchSmoother:
     def cost(self) -> float:
         """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
 
-        Sightings count by their own noise alone, and one that is left out as the least that would be refused.
+        Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
+        keyframe; a sighting that is left out counts as the least that would be refused.
         """
         total = float(self._of_motion().error(self._values))
         seen = [
@@ -224,9 +226,12 @@ class BatchSmoother:
             factors = [f for held in self.believed.values() for s in held for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
         observed = self._factors.observe([s.measurement for _, s in seen])
-        for one in observed.linearize(np.array([pose for pose, _ in seen]), self._theta()):
+        lines = observed.linearize(np.array([pose for pose, _ in seen]), self._theta())
+        for (_, s), one in zip(seen, lines, strict=True):
             bound = chi2_bound(self._probability, len(one.residual))
             total += 0.5 * (bound if one.behind else min(bound, float(one.residual @ one.residual)))
+            if not isinstance(s.measurement, CornerMeasurement):
+                total += 0.5 * float(np.linalg.slogdet(s.alone.cov)[1])  # type: ignore[union-attr]
         return total
 
     def result(self) -> Smoothed:
