@@ -17,7 +17,7 @@ from fgloc.localizer import Localizer
 from fgloc.motion import load_model
 from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import Recording
-from fgloc.sensors.cameras import camera_from_info, load_camera, rescaled
+from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.images import ImageError, decode
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -177,21 +177,24 @@ def _camera(recording: Recording, config: Config, first: dict[type[Event], Event
         )
     size = _image_size(recording)
     if size is None or not camera.width or size == (camera.width, camera.height):
-        return camera
+        return corrected(camera, config.camera)
     if not config.camera.rescale:
         raise CameraError(
             f"{recording.path}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
             "calibrate at this size, or set camera.rescale: true"
         )
-    return rescaled(camera, *size)
+    return corrected(rescaled(camera, *size), config.camera)
 
 
 def mounted_up(recording: Recording, config: Config, first: dict[type[Event], Event]) -> FloatArray:
-    """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level."""
+    """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level.
+
+    Its length is ``gyro.scale``, so that rates along it are true ones.
+    """
     base, event = _base_frame(recording, config, first), first.get(ImuEvent)
     if isinstance(event, ImuEvent) and event.frame_id in recording.frames and base in recording.frames:
-        return np.asarray(recording.frames.lookup(base, event.frame_id)[2, :3])
-    return np.array([0.0, 0.0, 1.0])
+        return np.asarray(config.gyro.scale * recording.frames.lookup(base, event.frame_id)[2, :3])
+    return np.array([0.0, 0.0, config.gyro.scale])
 
 
 def _image_size(recording: Recording) -> tuple[int, int] | None:

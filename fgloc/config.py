@@ -141,12 +141,15 @@ class WheelsConfig(Section):
         le=1,
         description="rad/m: how far yaw_per_m may be off: 0.4 % of unequal radii at a track of 0.26 m",
     )
+    slowdown_sigma: float = Field(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
+    delay_sigma_s: float = Field(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
 
 
 class GyroConfig(Section):
     """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
 
     use: bool = True
+    scale: float = Field(1.0, gt=0, description="true over reported rate")
     yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
     bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
@@ -158,6 +161,11 @@ class CameraConfig(Section):
 
     file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
     rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
+    focal_scale: float = Field(1.0, gt=0, description="true focal length over that of the calibration")
+    cx_px: float | None = Field(None, description="px: principal point; None, as below: the calibration's")
+    cy_px: float | None = Field(None, description="px")
+    k1: float | None = Field(None, description="of plumb_bob; other models are taken as they are")
+    k2: float | None = None
     position_sigma_m: float = Field(
         0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
     )
@@ -257,6 +265,7 @@ class MotionConfig(Section):
         description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
     )
     use: bool = True
+    scale: float = Field(1.0, gt=0, description="this robot's distance over the model's")
     scale_sigma: float = Field(
         0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
     )
@@ -324,9 +333,6 @@ class BatchConfig(Section):
         "none",
         description="graduated non-convexity: gnc weighs wheels and landmarks anew, other motion is believed; "
         "gnc_all weighs every factor, for comparison",
-    )
-    calibrate_wheels: bool = Field(
-        False, description="find the wheels' gains from the run itself, see `fgloc calibrate`; without a learned motion"
     )
 
 

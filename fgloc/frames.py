@@ -44,6 +44,15 @@ def transform_matrix(translation: Sequence[float] | FloatArray, quaternion: Sequ
     return T
 
 
+def rotation_of(vector: Sequence[float] | FloatArray) -> FloatArray:
+    """Rotation matrix ``(3, 3)`` about a vector, by its length [rad] (Rodrigues' formula)."""
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
+    half = 0.5 * angle
+    k = math.sin(half) / angle if angle > 1e-12 else 0.5
+    return quaternion_matrix((k * x, k * y, k * z, math.cos(half)))
+
+
 def rpy_matrix(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Rotation matrix ``(3, 3)`` of fixed-axis roll, pitch, yaw [rad], as ROS and URDF use them."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))

@@ -82,7 +82,10 @@ class Localizer:
         """
         self.config = config
         self.factors = LandmarkFactors(
-            landmark_map, installation_of(config, landmark_map, landmarks.sees_corners, gyro is not None)
+            landmark_map,
+            installation_of(
+                config, landmark_map, landmarks.sees_corners, gyro is not None, has_model=learned is not None
+            ),
         )
         kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
         self.estimator: Estimator = kind(config.estimator, self.factors, keep_all)

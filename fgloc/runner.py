@@ -5,13 +5,17 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
+from fgloc.calibration.contradictions import contradictions
 from fgloc.calibration.found import found_values
+from fgloc.calibration.settings import installation_found
+from fgloc.clock_trials import clock_note, clock_trials
 from fgloc.config import Config, Role
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
@@ -34,7 +38,6 @@ from fgloc.types import (
     Step,
     Trajectory,
     TruthEvent,
-    WheelCalibration,
 )
 
 RunMode = Literal["batch", "online"]
@@ -61,6 +64,7 @@ def run(
     events: EventFilter | None = None,
     sightings: EventFilter | None = None,
     detections: Path | None = None,
+    try_clocks: bool = True,
 ) -> RunResult:
     """Localise one recording.
 
@@ -75,6 +79,7 @@ def run(
         events: filter of the recorded events (ablations).
         sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
         detections: file that remembers what was found in the images, for other runs of the same ones.
+        try_clocks: where a clock seems to be wrong, run again with it corrected, to see whether it is.
 
     Raises:
         FglocError: the input cannot be used, or no pose was ever found.
@@ -97,7 +102,8 @@ def run(
             replay.make_up(parts.localizer.finish(replay.blind))
         if isinstance(detector, RememberedDetections):
             detector.save()
-        hints = (*parts.diagnosis.notes(parts.wheels.source), *replay.attendance.missing())
+        hints = (*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing())
+        untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
         if parts.detector is not None and not parts.localizer.counts["corners"]:
             hints = (*image_hints(recording, parts.detector), *hints)
         notes = (
@@ -112,17 +118,17 @@ def run(
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
     if not replay.estimates:
-        raise EstimatorError(" ".join([_never_found(replay, rejections), *hints]))
+        raise EstimatorError(" ".join([_never_found(replay, rejections), *hints, *untried]))
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
-    wheels: WheelCalibration | None = None
     installed = parts.localizer.estimator.installed
+    smoothed = None
     if mode == "batch":
         try:
             smoothed = smooth_run(parts)
         except EstimatorError as error:
-            raise EstimatorError(" ".join([_sentence(str(error)), *hints])) from error
-        estimates, landmarks, wheels = smoothed.estimates, smoothed.landmarks, smoothed.wheels
+            raise EstimatorError(" ".join([_sentence(str(error)), *hints, *untried])) from error
+        estimates, landmarks = smoothed.estimates, smoothed.landmarks
         installed = smoothed.installation
         notes = (*notes, *smoothed.notes)
     if again := len(estimates) - len(last_pass(estimates)):
@@ -131,6 +137,13 @@ def run(
             f"The clock jumped back: {again} poses whose times came again are left out.",
         )
         estimates = last_pass(estimates)
+    found = installation_found(parts, recording.roles, installed)
+    cost = smoothed.cost if smoothed is not None else None
+    tried = None
+    if try_clocks and events is None and sightings is None and on_step is None:
+        trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
+        tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
+    notes = (*(() if tried is None else tried[:1]), *notes, *contradictions(found if tried is None else tried[1]))
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),
@@ -144,12 +157,17 @@ def run(
         landmarks=landmarks,
         spans=replay.spans(),
         source=recording_path,
-        wheels=wheels,
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),
+        found=found,
+        cost=cost,
         first_pose_s=replay.first_pose_s,
     )
+
+
+def _tried(recording: Path, map_path: Path | None, detections: Path | None, config: Config) -> RunResult:
+    return run(recording, map_path, config, "batch", detections=detections, try_clocks=False)
 
 
 class _Replay:

@@ -9,7 +9,6 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly
-from fgloc.calibration.wheel_gains import calibrate_wheels
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.slip_noise import Footing
@@ -20,7 +19,6 @@ from fgloc.types import (
     IntArray,
     LandmarkMap,
     MotionMeasurement,
-    WheelCalibration,
 )
 
 _VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
@@ -33,8 +31,8 @@ class SmoothedRun:
     estimates: list[Estimate]
     landmarks: LandmarkMap | None  # given or estimated
     notes: tuple[str, ...]
-    wheels: WheelCalibration | None
     installation: InstallationBelief
+    cost: float
 
 
 def smooth_run(parts: Assembly) -> SmoothedRun:
@@ -44,7 +42,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         parts: the run's parts; the localizer's log is read, and its motions are replaced.
 
     Raises:
-        EstimatorError: the graph cannot be solved, or holds no wheels that could be calibrated.
+        EstimatorError: the graph cannot be solved.
     """
     localizer, config = parts.localizer, parts.config
     log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
@@ -56,10 +54,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         for _ in range(config.batch.outer_iterations - 1):
             solver.replace_motions(_measure_again(parts, solver))
     notes = []
-    wheels = None
-    if config.batch.calibrate_wheels:
-        wheels = calibrate_wheels(parts, solver)
-        notes.append(f"Wheels calibrated on this run: {wheels}.")
     result = solver.result()
     estimates = [
         Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.clock_cov, float(pose[2])), frame.mode)
@@ -69,7 +63,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
-    return SmoothedRun(estimates, landmarks, tuple(notes), wheels, solver.installed())
+    return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
 
 
 def take_room_back(localizer: Localizer) -> None:

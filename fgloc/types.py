@@ -7,6 +7,7 @@ else is SI. Arrays are float64 and are not to be written to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -403,17 +404,46 @@ class Heard:
     longest_silence_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A value of the installation, as it was given and as a run found it; in the units of ``robot.yaml``."""
+
+    name: str
+    given: float
+    found: float
+    sigma: float  # of what was found
+    prior_sigma: float  # of what was given
+
+    @property
+    def off(self) -> float:
+        """How far what was given and what the measurements alone say are apart, in sigmas of both.
+
+        What was found lies between the two, by their sigmas; its expected square distance from the given value is the
+        difference of the variances.
+        """
+        spread = self.prior_sigma**2 - self.sigma**2
+        return (self.found - self.given) / math.sqrt(max(spread, 1e-6 * self.prior_sigma**2, 1e-30))
+
+    @property
+    def unpulled(self) -> float:
+        """The change that the measurements alone ask for, without the pull of the prior."""
+        share = 1.0 - (self.sigma / self.prior_sigma) ** 2 if self.prior_sigma > 0.0 else 1.0
+        return (self.found - self.given) / max(share, 0.05)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class WheelCalibration:
-    """Gains of the wheels that fit a run best."""
+class InstallationFound:
+    """The whole installation state of a run ``(n,)``, with the prior that it began from."""
 
-    names: tuple[str, ...]  # as `fgloc.config.WheelsConfig` has them
-    value: FloatArray  # (n,)
+    names: tuple[str, ...]
+    mean: FloatArray  # (n,)
     cov: FloatArray  # (n, n)
-
-    def __str__(self) -> str:
-        rows = zip(self.names, self.value.tolist(), np.sqrt(abs(np.diag(self.cov))).tolist(), strict=True)
-        return ", ".join(f"{name} {value:.4f} ± {sigma:.4f}" for name, value, sigma in rows)
+    prior_cov: FloatArray  # (n, n)
+    camera: Camera | None  # of corners, as the run used it
+    seen_by: str  # role whose stamps the sightings have
+    wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they never spoke
+    settings: tuple[Setting, ...] = ()  # all but the map's
+    landmarks: LandmarkMap | None = None  # of a known map, where they were found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -432,6 +462,7 @@ class RunResult:
     landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
     spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
     source: Path | None = None
-    wheels: WheelCalibration | None = None  # if it was asked for
+    found: InstallationFound | None = None
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
+    cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went

@@ -27,6 +27,8 @@ FILES = {
     "trajectory.png",
     "timeline.png",
     "report.html",
+    "installation.yaml",
+    "map.yaml",
 }
 
 

@@ -49,6 +49,7 @@ KEYS = [
     "step_ms",
     "factors",
     "rejections",
+    "installation",
 ]
 CONFIG = Config()
 COMMAND = 'fgloc smooth "first <run>" --out out'

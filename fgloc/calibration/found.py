@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fgloc.config import Config
+from fgloc.frames import rotation_of
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.types import Camera, FloatArray, LandmarkMap
 
@@ -49,13 +50,16 @@ def found_values(
         add("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -track)
     else:
         add("wheels.yaw_per_m", "wheels.yaw_per_m", config.wheels.yaw_per_m)
+    for name in ("slowdown", "delay_s"):
+        add(f"wheels.{name}", f"wheels.{name}", getattr(config.wheels, name))
     add("gyro.scale", "gyro.scale", 1.0, -1.0)
+    add("learned.scale", "learned.scale", 1.0)
     add("wheels.time_offset_s", "wheels.time_offset_s")
     for name in ("range_scale", "bearing_offset_rad", "time_offset_s"):
         add(f"sightings.{name}", f"sightings.{name}", 1.0 if name == "range_scale" else 0.0)
     if camera is not None and "camera" in installation.blocks:
         first = installation.blocks["camera"][0]
-        out |= _mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
+        out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
         D = np.concatenate([camera.D, np.zeros(2)])
         add("camera.focal_scale", "camera.focal", 1.0)
         add("camera.cx_px", "camera.cx_px", float(camera.K[0, 2]))
@@ -70,11 +74,11 @@ def found_values(
     return out
 
 
-def _mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
+def mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
     """Pose of the camera's body axes in the base frame; angles are small, so that sigmas are those about its axes."""
     R = camera.T_base_cam[:3, :3]
     T = camera.T_base_cam[:3, 3] + R @ mean[:3]
-    turned = R @ _rotation(mean[3:]) @ _OPTICAL.T
+    turned = R @ rotation_of(mean[3:]) @ _OPTICAL.T
     rpy = (
         np.arctan2(turned[2, 1], turned[2, 2]),
         -np.arcsin(np.clip(turned[2, 0], -1.0, 1.0)),
@@ -85,9 +89,3 @@ def _mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
     return {
         f"camera.{axis}": (float(value), float(s)) for axis, value, s in zip(_AXES, [*T, *rpy], sigmas, strict=True)
     }
-
-
-def _rotation(vector: FloatArray) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())

@@ -1,26 +1,31 @@
-"""Wheels calibrated on whole recordings of one robot, with nothing but its own sightings."""
+"""The installation calibrated on whole recordings of one robot, with nothing but its own sightings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import Progress, find_beside, run
-from fgloc.types import WheelCalibration
+from fgloc.types import InstallationFound, RunResult, Setting
 
-_DIGITS = 5
 _SIGHTINGS = ("corners", "range_bearing", "marker_pose")
 _ROUNDS = 2  # with the gains of the first, sightings are believed and refused that were not before
+_WHEELS = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # before anything was seen
+_COMMANDS = _WHEELS | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
+_FAR = 3.0  # of these sigmas that a gain may move at most
+_UNSEEN = 0.95  # share of its sigma that is left to a gain of which nothing was heard
 
 
 def calibrate(
     bags: Sequence[Path], map_path: Path | None, config: Config, progress: Progress | None = None
-) -> tuple[Config, WheelCalibration]:
-    """Find the gains of the wheels, or of commands in their place.
+) -> tuple[Config, tuple[Setting, ...]]:
+    """Find the installation, with wide priors on the gains of the wheels or of commands in their place.
 
     Args:
         bags: one or more recordings of the robot.
@@ -29,44 +34,91 @@ def calibrate(
         progress: called now and then.
 
     Returns:
-        The configuration with the gains in it, and the gains with their covariance.
+        The configuration with what was found and its sigmas, and the settings as they were given and found.
 
     Raises:
         FglocError: a recording cannot be used, or holds no wheels or no sightings.
     """
+    now = config
     for _ in range(_ROUNDS):
-        alone = config.model_copy(
-            update={
-                "motion": config.motion.model_copy(update={"use": False}),
-                "batch": config.batch.model_copy(update={"calibrate_wheels": True}),
-            }
+        settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
+        wheels = [s for s in settings if s.name.startswith("wheels.")]
+        at = {s.name: s for s in wheels}
+        values = {name.partition(".")[2]: round(s.found, 7) for name, s in at.items()}
+        now = now.model_copy(update={"wheels": now.wheels.model_copy(update=values)})
+    given = {s.name: getattr(config.wheels, s.name.partition(".")[2]) for s in wheels}
+    settings = tuple(replace(s, given=given.get(s.name, s.given)) for s in settings)
+    _check(settings)
+    return with_settings(config, settings), settings
+
+
+def _check(settings: Sequence[Setting]) -> None:
+    wheels = [s for s in settings if s.name.startswith("wheels.")]
+    if any(abs(s.found - s.given) > _FAR * s.prior_sigma for s in wheels):
+        told = ", ".join(f"{s.name.partition('.')[2]} {s.found:.4f} ± {s.sigma:.4f}" for s in wheels)
+        raise EstimatorError(
+            f"the wheels cannot be calibrated on this run: {told} is no robot's; see the rejections of `fgloc smooth`, "
+            "and begin with gains that are less far off"
         )
-        pooled = _pooled([_calibrated(bag, map_path, alone, progress) for bag in bags])
-        gains = dict(zip(pooled.names, pooled.value.round(_DIGITS).tolist(), strict=True))
-        config = config.model_copy(update={"wheels": config.wheels.model_copy(update=gains)})
-    return config, pooled
 
 
-def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Progress | None) -> WheelCalibration:
-    result = run(bag, map_path or find_beside(bag, "map.yaml"), config, "batch", progress)
-    assert result.wheels is not None  # asked for by the configuration
+def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Progress | None) -> RunResult:
+    """The bag smoothed with wide priors on the wheels; on commands if there are no wheels."""
+    map_path = map_path or find_beside(bag, "map.yaml")
+    for sigmas in (_COMMANDS,) if config.wheels.source == "command" else (_WHEELS, _COMMANDS):
+        motion, wheels = config.motion.model_copy(update={"use": False}), config.wheels.model_copy(update=sigmas)
+        alone = config.model_copy(update={"motion": motion, "wheels": wheels})
+        result = run(bag, map_path, alone, "batch", progress)
+        if result.found is not None and result.found.wheels != "command":
+            break
     if not any(result.counts.get(kind) for kind in _SIGHTINGS):
         raise EstimatorError(
             f"{bag}: no sighting of a landmark was used, and without sightings nothing tells what the wheels' gains "
             f"are; see `fgloc info {bag}`"
         )
-    return result.wheels
+    assert result.found is not None
+    radius = next((s for s in result.found.settings if s.name == "wheels.scale_v"), None)
+    if not result.found.wheels or radius is None or radius.sigma > _UNSEEN * radius.prior_sigma:
+        raise EstimatorError(
+            f"{bag}: nothing was heard of wheels, or of commands in their place, between sightings: see wheels.source "
+            f"and `fgloc info {bag}`"
+        )
+    return result
 
 
-def _pooled(found: Sequence[WheelCalibration]) -> WheelCalibration:
-    """The mean of several calibrations, each with the weight of what it knows."""
-    names = found[0].names
-    if any(other.names != names for other in found):
+def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]:
+    founds = [r.found for r in results if r.found is not None]
+    return pooled(founds, {None if r.landmarks is None else r.landmarks.source for r in results}, config)
+
+
+def pooled(founds: Sequence[InstallationFound], maps: Collection[str | None], config: Config) -> tuple[Setting, ...]:
+    """What several runs know together: their information added, that of the prior once.
+
+    Args:
+        founds: of each run.
+        maps: that they used; landmarks are left out if these are several.
+        config: of all runs.
+    """
+    first = founds[0]
+    if len({f.wheels == "command" for f in founds}) > 1:
         raise EstimatorError(
             "some of the recordings have wheels and others only commands; calibrate on those with wheels, or set "
             "wheels.source"
         )
-    information = [np.linalg.inv(wheels.cov) for wheels in found]
-    cov = np.linalg.inv(np.sum(information, axis=0))
-    told = np.sum([i @ wheels.value for i, wheels in zip(information, found, strict=True)], axis=0)
-    return WheelCalibration(names, np.asarray(cov @ told), np.asarray(cov))
+    if len(founds) == 1:
+        return first.settings
+    names = [n for n in dict.fromkeys(n for f in founds for n in f.names) if len(maps) == 1 or not n.startswith("map.")]
+    places = []
+    prior = np.eye(len(names))
+    for f in founds:
+        shared = [n for n in f.names if n in names]
+        own, rows = [f.names.index(n) for n in shared], [names.index(n) for n in shared]
+        prior[np.ix_(rows, rows)] = f.prior_cov[np.ix_(own, own)]
+        places.append((own, rows))
+    information, pull = np.linalg.inv(prior), np.zeros(len(names))
+    for f, (own, rows) in zip(founds, places, strict=True):
+        posterior = np.linalg.inv(f.cov[np.ix_(own, own)])
+        information[np.ix_(rows, rows)] += posterior - np.linalg.inv(f.prior_cov[np.ix_(own, own)])
+        pull[rows] += posterior @ f.mean[own]
+    cov = np.asarray(np.linalg.inv(information))
+    return settings_found(replace(first, names=tuple(names), mean=cov @ pull, cov=cov, prior_cov=prior), config)

@@ -6,7 +6,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import typer
 
 import fgloc
@@ -105,18 +104,17 @@ def calibrate(
     map_file: MapOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Find the gains of wheels, or of commands that stand in for them, from what the recordings saw of a map."""
+    """Find the installation: gains of wheels or commands, camera, clocks, from what the recordings saw of a map."""
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
 
     before = configured(bags[0], config, None)
     with run_bar("calibrate") as progress:
-        after, found = calibrated(bags, map_file, before, progress)
-    write_text(out, f"# {typed()}\n# {found}\n{yaml_of(after, out.parent)}")
-    told = zip(found.names, found.value.tolist(), np.sqrt(np.diag(found.cov)).tolist(), strict=True)
-    rows = [(n, f"{getattr(before.wheels, n):.4f}", f"{value:.4f} ± {sigma:.4f}") for n, value, sigma in told]
-    typer.echo(columns(("wheels", "before", "calibrated"), rows))
+        after, settings = calibrated(bags, map_file, before, progress)
+    write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
+    rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
+    typer.echo(columns(("setting", "given", "found"), rows))
     typer.echo(f"configuration: {out}")
 
 

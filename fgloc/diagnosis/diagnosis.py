@@ -116,11 +116,20 @@ class Diagnosis:
 
     # --- what is said ---
 
-    def notes(self, source: str) -> tuple[str, ...]:
+    def clock_offsets(self, source: str) -> dict[str, float]:
+        """Values of ``recording.stamp_offset_s`` by role, as the windows suggest them; to be tried."""
+        if source not in ("ticks", "odometry"):
+            return {}
+        known = {str(role): offset for role, offset in self._config.recording.stamp_offset_s.items()}
+        off = self._offsets(self._faults.constant(), source)
+        return {role: known.get(role, 0.0) - late for role, _, late, _, _ in off}
+
+    def notes(self, source: str, offsets: bool = True) -> tuple[str, ...]:
         """What does not fit together, a sentence each with its remedy.
 
         Args:
             source: where wheel motion came from: "ticks", "odometry", "command" or "".
+            offsets: tell constant offsets of clocks too; they have not been tried.
         """
         tilt = self._spotter.upright.tilt(self._place)
         if tilt is not None:
@@ -137,14 +146,28 @@ class Diagnosis:
                     "and whether they slip.",
                 )
         faults = self._faults.constant()
-        notes = [*self._clocks(faults, source), *self._first_pose()]
+        notes = [*self._clocks(faults, source, offsets), *self._first_pose()]
         believable = bool((np.abs(faults.values) < _BELIEVABLE * PRIOR_SIGMAS).all())
         if self._known is not None and believable:
             notes += [*self._scales(faults), *self._mounting(faults)]
         return tuple(notes)
 
-    def _clocks(self, faults: Pooled, source: str) -> Iterator[str]:
+    def _clocks(self, faults: Pooled, source: str, offsets: bool) -> Iterator[str]:
         if source not in ("ticks", "odometry"):  # a robot follows its commands late: that is no clock's fault
+            return
+        drifts = [*self._drifts()]
+        yield from drifts
+        if offsets and not drifts:
+            for role, name, late, sigma, others in self._offsets(faults, source):
+                yield self._offset(role, name, late, sigma, others)
+
+    def _drifts(self) -> Iterator[str]:
+        yield from self._drift(self._faults, Fault.LATE, "sightings")
+        yield from self._drift(self._gyro.pool, Turning.LATE, "gyro")
+
+    def _offsets(self, faults: Pooled, source: str) -> Iterator[tuple[Role, str, float, float, str]]:
+        """Role, name, lateness and its sigma [s], and the clocks that it is late against; none if a clock drifts."""
+        if any(self._drifts()):  # then there is no constant offset to be set
             return
         gyro = self._gyro.pool.constant()
         late, late_sigma = faults.values[Fault.LATE], faults.sigmas[Fault.LATE]
@@ -153,19 +176,13 @@ class Diagnosis:
         gyro_off = _sure(gyro, Turning.LATE, _MIN_LATE_S)
         wheels: Role = "joints" if source == "ticks" else "odometry"
         same = abs(late - gyro_late) < max(_MIN_LATE_S, 3.0 * math.hypot(late_sigma, gyro_sigma))
-        drifts = [
-            *self._drift(self._faults, Fault.LATE, "sightings"),
-            *self._drift(self._gyro.pool, Turning.LATE, "gyro"),
-        ]
-        if drifts:  # then there is no constant offset to be set
-            yield from drifts
-        elif sightings_off and gyro_off and same:
-            yield self._offset(wheels, "wheels", -gyro_late, gyro_sigma, "sightings and gyro")
+        if sightings_off and gyro_off and same:
+            yield wheels, "wheels", -float(gyro_late), float(gyro_sigma), "sightings and gyro"
         else:
             if sightings_off:
-                yield self._offset(self._seen_by, "sightings", late, late_sigma, "wheels")
+                yield self._seen_by, "sightings", float(late), float(late_sigma), "wheels"
             if gyro_off:
-                yield self._offset("imu", "gyro", gyro_late, gyro_sigma, "wheels")
+                yield "imu", "gyro", float(gyro_late), float(gyro_sigma), "wheels"
 
     def _offset(self, role: Role, name: str, late_s: float, sigma_s: float, others: str) -> str:
         known = self._config.recording.stamp_offset_s.get(role, 0.0)

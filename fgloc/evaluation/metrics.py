@@ -40,6 +40,17 @@ class StepTimes(BaseModel):
     max: float
 
 
+class FoundSetting(BaseModel):
+    """A value of the installation as given and as found, in the units of the configuration."""
+
+    model_config = ConfigDict(frozen=True)
+
+    given: float
+    prior_sigma: float
+    found: float
+    sigma: float
+
+
 class Metrics(BaseModel):
     """What ``metrics.json`` holds. Keys that need a truth are None without one."""
 
@@ -59,6 +70,14 @@ class Metrics(BaseModel):
     step_ms: StepTimes | None
     factors: dict[str, int]
     rejections: dict[str, int]
+    installation: dict[str, FoundSetting]  # by setting
+
+
+def _installation(result: RunResult) -> dict[str, FoundSetting]:
+    settings = () if result.found is None else result.found.settings
+    return {
+        s.name: FoundSetting(given=s.given, prior_sigma=s.prior_sigma, found=s.found, sigma=s.sigma) for s in settings
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,6 +252,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         step_ms=_step_times(result.step_ms),
         factors=dict(sorted(result.counts.items())),
         rejections=dict(sorted(result.rejections.items())),
+        installation=_installation(result),
     )
 
 

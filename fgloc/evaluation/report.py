@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgloc.config import Config
+from fgloc.calibration.contradictions import contradicted
+from fgloc.calibration.settings import with_settings
+from fgloc.config import Config, yaml_of
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_trajectory, png
@@ -29,11 +31,16 @@ from fgloc.recording.outputs import (
 )
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
-from fgloc.types import IntArray, Mode, RunResult
+from fgloc.sensors.maps import write_map
+from fgloc.types import InstallationFound, IntArray, Mode, RunResult
 
 _TIMELINE = (
     "What was heard; each motion source at the height of its weight, red where it was not believed; why; the "
     "sightings' fit to the prediction (1 is expected); every landmark, red where it was refused; the true errors."
+)
+_INSTALLATION = (
+    "What the run found, and how well; what it cannot tell keeps its value and sigma. A value contradicts the given "
+    "one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
 )
 _PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
 
@@ -77,8 +84,19 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
         write_json(stage / "config.json", provenance)
         write_bytes(stage / "trajectory.png", pictures["trajectory"])
         write_bytes(stage / "timeline.png", pictures["timeline"])
+        if result.found is not None and result.found.names:
+            write_text(stage / "installation.yaml", installation_yaml(result.found, config, out, command))
+            if result.found.landmarks is not None:
+                write_map(result.found.landmarks, stage / "map.yaml")
         write_text(stage / "report.html", render(result, metrics, matched, pictures, provenance))
     return metrics
+
+
+def installation_yaml(found: InstallationFound, config: Config, folder: Path, command: str) -> str:
+    """The configuration of the run with what it has found, for ``--config``; goes with the run's ``map.yaml``."""
+    rows = [f"#   {s.name}: {s.given:.6g} -> {s.found:.6g} +- {s.sigma:.2g}" for s in found.settings]
+    head = [f"# {command}", "# Given -> found +- sigma; whatever a run cannot tell keeps its value and sigma.", *rows]
+    return "\n".join(head) + "\n" + yaml_of(with_settings(config, found.settings), folder)
 
 
 def _slips(result: RunResult, config: Config) -> IntArray | None:
@@ -113,6 +131,7 @@ def render(
         picture(pictures["timeline"], "Timeline", _TIMELINE),
         "<h2>Figures</h2>",
         _figures(metrics),
+        _installation(result),
         '<div class="columns">',
         _section("Sensors", _sensors(result)),
         _section("Factors", table(("kind", "count"), metrics.factors.items(), numbers=1)),
@@ -191,6 +210,22 @@ def _sensors(result: RunResult) -> str:
         rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
         rows.append((name, heard.count, rate, f"{heard.longest_silence_s:.2f}" if heard.count > 1 else "–"))
     return table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
+
+
+def _installation(result: RunResult) -> str:
+    if result.found is None or not result.found.settings:
+        return ""
+    rows = [
+        (
+            s.name + (" (contradicts the given value)" if contradicted(s) else ""),
+            f"{s.given:.6g} ± {s.prior_sigma:.2g}",
+            f"{s.found:.6g} ± {s.sigma:.2g}",
+            f"{s.off:+.1f}",
+        )
+        for s in result.found.settings
+    ]
+    head = ("setting", "given", "found", "apart, in σ of both")
+    return f"<h2>Installation</h2><p>{escape(_INSTALLATION)}</p>{table(head, rows, numbers=3)}"
 
 
 def _landmarks(result: RunResult) -> str:

@@ -22,6 +22,7 @@ _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
+_SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
 
 
@@ -29,6 +30,8 @@ _OF_MOTION = (
     "wheels.radius",
     "wheels.track",
     "wheels.yaw_per_m",
+    "wheels.slowdown",
+    "wheels.delay_s",
     "learned.scale",
     "gyro.scale",
     "wheels.time_offset_s",
@@ -101,7 +104,7 @@ class MotionSources:
         wheels = self._wheels.measure(step)
         if wheels is not None:
             change = None
-            if "wheels.time_offset_s" in self._factors.installation.index:
+            if not self._factors.installation.index.keys().isdisjoint(("wheels.time_offset_s", "wheels.delay_s")):
                 start, end = self._wheels.twist(step, step.start_ns), self._wheels.twist(step, step.stamp_ns)
                 change = end - se2.adjoint(se2.inverse(wheels.motion)) @ start
             wheels = self._installed(wheels, change=change)
@@ -139,8 +142,9 @@ class MotionSources:
             derivatives["wheels.radius"] = np.array([rho_x, rho_y, phi])
             derivatives["wheels.track"] = -phi * by_turn
             derivatives["wheels.yaw_per_m"] = rho_x * by_turn
+            derivatives["wheels.slowdown"] = self._by_slowdown(m, rho_x, phi)
             if change is not None:
-                derivatives["wheels.time_offset_s"] = change
+                derivatives["wheels.time_offset_s"], derivatives["wheels.delay_s"] = change, -change
         if m.source == "learned":
             derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
         if turn is not None:
@@ -150,6 +154,12 @@ class MotionSources:
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
 
+    def _by_slowdown(self, m: MotionMeasurement, rho_x: float, phi: float) -> FloatArray:
+        """Derivative of the wheels' motion by ``slowdown``: it takes from the speed by the turning that is reported."""
+        wheels, seconds = self._config.wheels, max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
+        told = abs(phi) / seconds / wheels.scale_omega
+        return np.array([-told * rho_x / max(1.0 - wheels.slowdown * told, _SLOWEST), 0.0, 0.0])
+
     def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
         """The readings with the learned motion evaluated at a better velocity."""
         return replace(readings, learned=self._measure_learned(step, velocity))
@@ -158,7 +168,12 @@ class MotionSources:
         if self._learned is None:
             return None
         m = self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
-        return None if m is None else self._installed(m, self._turn if self.gyro_is_read else None)
+        if m is None:
+            return None
+        scale = self._config.motion.scale
+        if scale != 1.0:
+            m = replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
+        return self._installed(m, self._turn if self.gyro_is_read else None)
 
     def combine(
         self, readings: Readings, off: Mapping[str, str] | None = None, footing: Footing | None = None

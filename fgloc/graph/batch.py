@@ -32,6 +32,7 @@ from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
 from fgloc.graph.pose_fit import chi2_bound, robust_weight
 from fgloc.types import (
+    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
@@ -219,6 +220,30 @@ class BatchSmoother:
         marginals = self._marginals()
         return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
+    def cost(self) -> float:
+        """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
+
+        Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
+        keyframe; a sighting that is left out counts as the least that would be refused.
+        """
+        total = float(self._of_motion().error(self._values))
+        seen = [
+            (pose, s)
+            for frame, pose in zip(self.frames, self.poses(), strict=True)
+            for s in _of_others((*frame.sightings, *frame.refused), self._moved)
+        ]
+        if not self._factors.known or not seen:
+            factors = [f for held in self.believed.values() for s in held for f in s.factors]
+            return total + sum(f.error(self._values) for f in factors)
+        observed = self._factors.observe([s.measurement for _, s in seen])
+        lines = observed.linearize(np.array([pose for pose, _ in seen]), self._theta())
+        for (_, s), one in zip(seen, lines, strict=True):
+            bound = chi2_bound(self._probability, len(one.residual))
+            total += 0.5 * (bound if one.behind else min(bound, float(one.residual @ one.residual)))
+            if not isinstance(s.measurement, CornerMeasurement):
+                total += 0.5 * float(np.linalg.slogdet(s.alone.cov)[1])  # type: ignore[union-attr]
+        return total
+
     def result(self) -> Smoothed:
         """The last solution with its covariances.
 
@@ -266,19 +291,23 @@ class BatchSmoother:
                 break
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
+        graph = self._of_motion()
+        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.believed[f.k]]
+        for factor in self._sighting_factors(seen):
+            graph.add(factor)
+        return graph
+
+    def _of_motion(self) -> gtsam.NonlinearFactorGraph:
+        """Priors and motions, linear about the solution."""
         graph = gtsam.NonlinearFactorGraph()
         for factor in self._priors():
             graph.add(factor)
         poses = self.poses()
-        seen = []
         for i, frame in enumerate(self.frames):
             for motion in frame.motions:
                 if motion.source in self.outliers.get(frame.k, ()):
                     motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
                 graph.add(installed_motion_factor(frame.k, motion, poses[i - 1], self._factors.installation))
-            seen += [(frame.k, poses[i], s) for s in self.believed[frame.k]]
-        for factor in self._sighting_factors(seen):
-            graph.add(factor)
         return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:

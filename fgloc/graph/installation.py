@@ -121,6 +121,7 @@ def installation_of(
     corners: bool,
     has_gyro: bool = False,
     most: int = MOST_LANDMARKS,
+    has_model: bool = True,
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -133,15 +134,18 @@ def installation_of(
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
         most: landmarks of a map that are states; a larger map is taken as exact.
+        has_model: whether there is a learned motion.
     """
     wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
     sigmas = {
         "wheels.radius": wheels.scale_sigma,
         "wheels.track": wheels.turn_scale_sigma,
         "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
-        "gyro.scale": gyro.scale_sigma,
+        "wheels.slowdown": wheels.slowdown_sigma,
+        "wheels.delay_s": wheels.delay_sigma_s,
+        "gyro.scale": gyro.scale_sigma if has_gyro else 0.0,
         "wheels.time_offset_s": wheels.time_offset_sigma_s if has_gyro else 0.0,
-        "learned.scale": config.motion.scale_sigma,
+        "learned.scale": config.motion.scale_sigma if has_model else 0.0,
     }
     if landmark_map is None:
         return Installation(sigmas)

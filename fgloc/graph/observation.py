@@ -22,6 +22,7 @@ from fgloc.types import (
 
 _BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
 _MOST_BLURRED = 2.0
+_MOST_LOG_SCALE = 3.0  # of ranges: an estimate that diverges goes on to be refused, not to overflow
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
@@ -288,7 +289,8 @@ class PlanarBatch:
         flow = np.stack([self._twist[:, 0] - w * q[:, 1], self._twist[:, 1] + w * q[:, 0], w], 1)
         late = sensor[2] - self._offset
         co, so = np.cos(sensor[1]), np.sin(sensor[1])
-        seen = np.exp(sensor[0]) * self._point @ np.array([[co, so], [-so, co]]).T
+        scale = np.exp(np.clip(sensor[0], -_MOST_LOG_SCALE, _MOST_LOG_SCALE))
+        seen = scale * self._point @ np.array([[co, so], [-so, co]]).T
         residual = np.zeros((n, 3))
         residual[:, :2] = q + late[:, None] * flow[:, :2] - seen
         turn = np.zeros((n, 2, 2))  # of the point by a later stamp

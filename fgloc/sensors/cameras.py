@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgloc.config import CameraConfig
 from fgloc.errors import CameraError
 from fgloc.sensors.documents import Item, read_document
 from fgloc.types import Camera, CameraInfoEvent, FloatArray
@@ -83,6 +84,20 @@ def rescaled(camera: Camera, width: int, height: int) -> Camera:
     K[1, 2] += 0.5 * sy - 0.5
     note = f"The calibration for {camera.width}x{camera.height} pixels is scaled to {width}x{height}."
     return replace(camera, width=width, height=height, K=K, notes=(*camera.notes, note))
+
+
+def corrected(camera: Camera, config: CameraConfig) -> Camera:
+    """The camera with the focal length, principal point and distortion that the configuration gives."""
+    K, D = camera.K.copy(), camera.D
+    K[[0, 1], [0, 1]] *= config.focal_scale
+    if config.cx_px is not None:
+        K[0, 2] = config.cx_px
+    if config.cy_px is not None:
+        K[1, 2] = config.cy_px
+    if (config.k1 is not None or config.k2 is not None) and pinhole(camera) is camera:
+        D = np.concatenate([D, np.zeros(4)])[: max(4, len(D))]
+        D[:2] = [D[0] if config.k1 is None else config.k1, D[1] if config.k2 is None else config.k2]
+    return replace(camera, K=K, D=D)
 
 
 def pinhole(camera: Camera) -> Camera:

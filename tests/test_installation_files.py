@@ -1,0 +1,161 @@
+"""What a run found of the installation is written, read back, and makes the next run no worse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fgloc import cli
+from fgloc.calibration.contradictions import contradicted, contradictions
+from fgloc.calibration.multi_run import pooled
+from fgloc.calibration.settings import settings_found, with_settings
+from fgloc.clock_trials import clock_note, clock_trials
+from fgloc.config import Config, load_config, yaml_of
+from fgloc.sensors.cameras import corrected
+from fgloc.sensors.maps import load_map
+from fgloc.types import Camera, InstallationFound, RunResult, Setting
+
+SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "installed_run"
+
+
+def found(names: dict[str, tuple[float, float, float]], **parts) -> InstallationFound:
+    """By name: mean, sigma, sigma of the prior."""
+    mean, sigma, prior = (np.array(column) for column in zip(*names.values(), strict=True))
+    given = {"camera": None, "seen_by": "sightings", "wheels": "odometry"} | parts
+    return InstallationFound(tuple(names), mean, np.diag(sigma**2), np.diag(prior**2), **given)
+
+
+def localised(*arguments: str) -> dict[str, object]:
+    result = CliRunner().invoke(cli.app, list(arguments))
+    assert result.exit_code == 0, result.output
+    return json.loads((Path(arguments[3]) / "metrics.json").read_text())
+
+
+@pytest.mark.slow
+def test_what_a_run_found_makes_the_next_one_better(tmp_path):
+    bag, first, smoothed, again = (str(p) for p in (SAMPLE / "bag", *(tmp_path / n for n in "abc")))
+    before = localised("online", bag, "--out", first)
+    localised("smooth", bag, "--out", smoothed)
+    given = ["--config", f"{smoothed}/installation.yaml", "--map", f"{smoothed}/map.yaml"]
+    after = localised("online", bag, "--out", again, *given)
+    assert after["ate_mean_m"] <= before["ate_mean_m"]
+    for name, value in after["installation"].items():
+        assert abs(value["found"] - value["given"]) < 3.0 * np.hypot(value["sigma"], value["prior_sigma"]), name
+    refined = load_map(Path(smoothed) / "map.yaml")
+    assert all(lm.cov is not None and lm.cov.shape == (6, 6) for lm in refined.landmarks.values())
+    assert "Installation" in (Path(smoothed) / "report.html").read_text()
+
+
+def test_settings_are_those_that_undo_the_deviation(tmp_path):
+    config = Config.model_validate({"wheels": {"scale_v": 1.1, "scale_omega": 0.9, "yaw_per_m": 0.1}})
+    state = found(
+        {
+            "wheels.radius": (0.02, 0.001, 0.01),
+            "wheels.track": (0.01, 0.001, 0.01),
+            "wheels.yaw_per_m": (0.03, 0.002, 0.015),
+            "sightings.time_offset_s": (0.02, 0.001, 0.012),
+            "sightings.range_scale": (-0.01, 0.001, 0.005),
+        }
+    )
+    settings = settings_found(state, config)
+    after = with_settings(config, settings)
+    assert after.wheels.scale_v == pytest.approx(1.1 * 1.02)
+    assert after.wheels.scale_omega == pytest.approx(0.9 * 1.02 * 0.99)
+    assert after.wheels.yaw_per_m == pytest.approx(0.1 * 0.99 + 0.03 / 1.02)
+    assert after.wheels.scale_sigma == pytest.approx(0.001)
+    assert after.recording.stamp_offset_s == {"sightings": -0.02}
+    assert after.landmarks.range_scale == pytest.approx(np.exp(-0.01))
+    assert after.landmarks.range_scale_sigma == pytest.approx(0.001)
+    assert after.gyro == config.gyro  # not in the state
+
+
+def test_a_camera_is_corrected():
+    camera = Camera(
+        640, 480, "plumb_bob", np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), np.zeros(0), np.eye(4)
+    )
+    config = Config.model_validate({"camera": {"focal_scale": 1.01, "cx_px": 321.0, "k1": -0.1}})
+    made = corrected(camera, config.camera)
+    assert made.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == [505.0, 505.0, 321.0, 240.0]
+    assert made.D.tolist() == [-0.1, 0.0, 0.0, 0.0]
+    assert corrected(camera, Config().camera).D.tolist() == []
+
+
+def test_only_what_is_surely_beyond_the_prior_is_said():
+    ordinary = Setting("gyro.scale", 1.0, 1.009, 0.0005, 0.005)  # 1.8 sigmas of what a gyro may be off
+    odd = Setting("gyro.scale", 1.0, 1.03, 0.0005, 0.005)
+    unseen = Setting("gyro.scale", 1.0, 1.0001, 0.00499, 0.005)
+    pulled = Setting("stamp_offset_s.sightings", 0.0, 0.0266, 0.0099, 0.012)  # halfway between prior and measurements
+    assert [contradicted(s) for s in (ordinary, odd, unseen)] == [False, True, False]
+    assert pulled.off == pytest.approx(3.9, abs=0.1)
+    assert pulled.unpulled == pytest.approx(0.083, abs=0.001)
+    state = found({"gyro.scale": (0.03, 0.0005, 0.005)})
+    (note,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)))
+    assert "set gyro.scale: 1.03" in note
+
+
+def test_pooling_counts_the_prior_once():
+    """Three runs that each know as much as the prior: together four times as much."""
+    one = found({"wheels.radius": (0.01, 0.01 / np.sqrt(2), 0.01)})  # measured 0.02 ± 0.01
+    (setting,) = [s for s in pooled([one, one, one], {"a"}, Config()) if s.name == "wheels.scale_v"]
+    assert setting.sigma == pytest.approx(0.005)
+    assert setting.found == pytest.approx(1.0 + 0.75 * 0.02)
+
+
+def test_a_clock_is_named_only_if_its_correction_fits_better():
+    config = Config()
+    state = found({"sightings.time_offset_s": (0.08, 0.002, 0.012)})
+    state = InstallationFound(**_fields(state), settings=settings_found(state, config))
+    trials = clock_trials(state, {"sightings": -0.17}, config)  # another estimate: twice the delay
+    assert [round(t.offset_s, 2) for t in trials] == [-0.17, -0.08]
+
+    def again(best_s: float):
+        def run(tried: Config) -> RunResult:
+            offset = tried.recording.stamp_offset_s.get("sightings", 0.0)
+            cost = 100.0 + 1e4 * (offset - best_s) ** 2
+            left = found({"sightings.time_offset_s": (offset - best_s, 0.002, 0.012)})
+            known = InstallationFound(**_fields(left), settings=settings_found(left, tried))
+            empty = (None, (), (), {}, {}, (), np.zeros(0), 0.0)
+            return RunResult(*empty, found=known, cost=cost)
+
+        return run
+
+    told = clock_note(trials, config, again(-0.085))
+    assert told is not None
+    assert "0.085 ±" in told[0]
+    assert "{sightings: -0.085}" in told[0]
+    assert clock_note(trials, config, again(0.0)) is None
+    assert clock_note((), config, again(0.0)) is None
+
+
+def test_all_clocks_against_the_gyros_accuse_the_gyros():
+    config = Config()
+    state = found(
+        {"sightings.time_offset_s": (0.08, 0.002, 0.012), "wheels.time_offset_s": (0.08, 0.002, 0.01)}, wheels="joints"
+    )
+    state = InstallationFound(**_fields(state), settings=settings_found(state, config))
+    trials = clock_trials(state, {}, config)
+    assert {t.role for t in trials} == {"sightings", "joints", "imu"}
+    imu = next(t for t in trials if t.role == "imu")
+    assert imu.offset_s == pytest.approx(0.08, abs=0.005)
+    commanded = found({"sightings.time_offset_s": (0.08, 0.002, 0.012)}, wheels="command")
+    assert clock_trials(commanded, {}, config) == ()
+
+
+def test_a_configuration_written_is_read(tmp_path):
+    config = with_settings(Config(), [Setting("gyro.scale", 1.0, 1.01, 0.001, 0.005), *map(_distortion, ("k1", "k2"))])
+    path = tmp_path / "installation.yaml"
+    path.write_text(yaml_of(config, tmp_path))
+    assert load_config(path) == config
+
+
+def _distortion(name: str) -> Setting:
+    return Setting(f"camera.{name}", 0.0, 0.01, 0.001, 0.005)
+
+
+def _fields(state: InstallationFound) -> dict[str, object]:
+    names = ("names", "mean", "cov", "prior_cov", "camera", "seen_by", "wheels")
+    return {name: getattr(state, name) for name in names}
