@@ -63,8 +63,8 @@ class _Backend(Protocol):
 class _FixedLag:
     """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
 
-    def __init__(self, config: EstimatorConfig, installed: int) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed))
+    def __init__(self, config: EstimatorConfig, installed: int, careful: bool = False) -> None:
+        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed, careful))
         self._installed = False
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
@@ -95,8 +95,8 @@ class _FixedLag:
 class _Full:
     """``ISAM2`` over the whole run: landmarks may be variables; the cost grows with the run."""
 
-    def __init__(self, config: EstimatorConfig) -> None:
-        self._isam2 = gtsam.ISAM2(isam2_params(config))
+    def __init__(self, config: EstimatorConfig, careful: bool = False) -> None:
+        self._isam2 = gtsam.ISAM2(isam2_params(config, careful=careful))
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
         return list(self._isam2.update(graph, values).getNewFactorsIndices())
@@ -131,11 +131,13 @@ class IncrementalEstimator(Estimator):
         super().__init__(config, factors, keep_all)
         self._backend: _Backend | None = None
         self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
+        self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, tuple[float, list[int]]] = {}  # keyframe -> elapsed_s, slots of its motion factors
 
     def _solve(self, frame: Keyframe) -> None:
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
+            self._careful_until_s = -math.inf
             self._backend = self._new_backend()
             self._slots.clear()
         initial, predicted = self._linearization(frame), frame.belief
@@ -146,7 +148,23 @@ class IncrementalEstimator(Estimator):
             if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > _TURNED_RAD and frame.prior is None:
                 self._relinearize(frame)
         except _GTSAM_ERRORS:
-            frame.belief = predicted  # which the sightings at fault have no part in
+            frame.belief = predicted  # which the sightings have no part in
+            self._solve_carefully(frame, initial)
+            return
+        if math.isfinite(self._careful_until_s) and frame.elapsed_s > self._careful_until_s:
+            self._careful_until_s = -math.inf
+            try:
+                frame.belief = self._replayed([*self._window(frame), frame], frame.belief)
+            except _GTSAM_ERRORS:
+                self._solve_carefully(frame, frame.belief)
+
+    def _solve_carefully(self, frame: Keyframe, initial: Belief) -> None:
+        """By QR, as long as the window holds what Cholesky fails at; if that fails too, the sightings are at fault."""
+        predicted = frame.belief
+        self._careful_until_s = frame.elapsed_s + self._config.lag_s
+        try:
+            frame.belief = self._replayed([*self._window(frame), frame], initial)
+        except _GTSAM_ERRORS:
             self._rebuild(frame, predicted)
 
     def _relinearize(self, newest: Keyframe) -> None:
@@ -191,7 +209,7 @@ class IncrementalEstimator(Estimator):
             new = backend.swap(graph, slots) if frames else []
             newest.belief = self._newest(newest.k)
         except _GTSAM_ERRORS:
-            self.rebuilt += 1
+            self._careful_until_s = newest.elapsed_s + self._config.lag_s
             self._build_again(changed)
             return
         for frame in frames:
@@ -327,19 +345,23 @@ class IncrementalEstimator(Estimator):
     def _new_backend(self) -> _Backend:
         self._fresh = True
         installed = len(self._factors.installation) if self._factors.known else 0
-        return _FixedLag(self._config, installed) if self._config.kind == "fixed_lag" else _Full(self._config)
+        careful = math.isfinite(self._careful_until_s)
+        if self._config.kind == "fixed_lag":
+            return _FixedLag(self._config, installed, careful)
+        return _Full(self._config, careful)
 
 
-def isam2_params(config: EstimatorConfig, installed: int = 0) -> gtsam.ISAM2Params:
+def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = False) -> gtsam.ISAM2Params:
     """iSAM2 settings that every backend shares; see gtsam's defaults for the rest.
 
     Args:
         config: for the threshold.
         installed: parameters of the installation, in which all factors are linear: relinearizing gives the same.
+        careful: by QR; Cholesky takes a third of its time, but fails where sigmas are metres apart from millimetres:
+            at a first pose that is hardly known, and after minutes without a fix.
     """
     params = gtsam.ISAM2Params()
-    # Cholesky takes a third of QR's time; where it fails, after minutes without a fix, the window is built again.
-    params.setFactorization("CHOLESKY")
+    params.setFactorization("QR" if careful else "CHOLESKY")
     if installed:
         thresholds = gtsam.ISAM2ThresholdMap()
         thresholds.insert(("x", np.full(3, config.relinearize_threshold)))
