@@ -135,7 +135,7 @@ class BatchSmoother:
             bound = chi2_bound(self._probability, dof)
             nis = float(one.residual @ np.linalg.solve(cov, one.residual))
             if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
-                marginals = marginals or _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+                marginals = marginals or self._marginals()
                 cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
                 nis = float(one.residual @ np.linalg.solve(cov, one.residual))
             if nis <= bound:
@@ -207,7 +207,7 @@ class BatchSmoother:
         n = len(self._factors.installation)
         if not n:
             return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
-        marginals = _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+        marginals = self._marginals()
         return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def cost(self) -> float:
@@ -240,11 +240,10 @@ class BatchSmoother:
         Raises:
             EstimatorError: the graph leaves a pose undetermined.
         """
-        try:
-            return _with_deep_stack(self._result)
-        except RuntimeError as error:
-            why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
-            raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
+        return _solvable(lambda: _with_deep_stack(self._result))
+
+    def _marginals(self) -> gtsam.Marginals:
+        return _solvable(lambda: _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values)))
 
     def _result(self) -> Smoothed:
         marginals = gtsam.Marginals(self._graph, self._values)
@@ -330,6 +329,19 @@ class BatchSmoother:
 
 def _of_others(sightings: Iterable[Sighting], moved: Collection[int]) -> tuple[Sighting, ...]:
     return tuple(s for s in sightings if s.measurement.landmark_id not in moved)
+
+
+def _solvable(work: Callable[[], _T]) -> _T:
+    """Do what needs the graph's covariances.
+
+    Raises:
+        EstimatorError: the graph leaves a pose undetermined.
+    """
+    try:
+        return work()
+    except RuntimeError as error:
+        why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
+        raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
 
 
 def _with_deep_stack(work: Callable[[], _T]) -> _T:
