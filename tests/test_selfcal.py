@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fgloc.sensors.sighting_calibration import Calibration, calibration_gradient, shifted
 from robot_world import CAMERA, Chain, World, beacons, config, nees
 from scipy.stats import chi2
 
 from fgloc.graph.batch import BatchSmoother
+from fgloc.sensors.sighting_calibration import Calibration, calibration_gradient, shifted
 from fgloc.smoothing import refine
 from fgloc.types import CornerMeasurement, RangeBearingMeasurement
 
