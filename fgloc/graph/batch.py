@@ -253,14 +253,19 @@ class BatchSmoother:
         marginals = self._marginals()
         return _with_deep_stack(lambda: self._result(marginals))
 
-    def _marginals(self) -> gtsam.Marginals:
+    def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
+        """Covariances of the solution; of long stretches that hardly anything determines, by QR."""
         try:
             return _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
-        except RuntimeError as error:
-            why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
-            raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
+        except RuntimeError:
+            params = gtsam.ISAM2Params()
+            params.setFactorization("QR")
+            params.relinearizeSkip = 1
+            solver = gtsam.ISAM2(params)
+            _solvable(lambda: _with_deep_stack(lambda: solver.update(self._graph, self._values)))
+            return solver
 
-    def _result(self, marginals: gtsam.Marginals) -> Smoothed:
+    def _result(self, marginals: gtsam.Marginals | gtsam.ISAM2) -> Smoothed:
         covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
         return Smoothed(
             stamps_ns=self.stamps_ns(),
@@ -352,6 +357,19 @@ def _of_others(sightings: Iterable[Sighting], moved: Collection[int]) -> tuple[S
     return tuple(s for s in sightings if s.measurement.landmark_id not in moved)
 
 
+def _solvable(work: Callable[[], _T]) -> _T:
+    """Do what needs the graph's covariances.
+
+    Raises:
+        EstimatorError: the graph leaves a pose undetermined.
+    """
+    try:
+        return work()
+    except RuntimeError as error:
+        why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
+        raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
+
+
 def _with_deep_stack(work: Callable[[], _T]) -> _T:
     """Run in a thread of its own: GTSAM's elimination of a chain of 1e5 poses overflows the usual 8 MB of stack."""
     before = threading.stack_size(_DEEP_STACK_BYTES)
@@ -412,7 +430,7 @@ def _without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) ->
 
 
 def _landmarks(
-    believed: Mapping[int, tuple[Sighting, ...]], values: gtsam.Values, marginals: gtsam.Marginals
+    believed: Mapping[int, tuple[Sighting, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
 ) -> dict[int, Landmark]:
     landmarks = {}
     for m in (s.measurement for sightings in believed.values() for s in sightings):
