@@ -25,6 +25,7 @@ from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
 from fgloc.sensors.remembered import RememberedDetections
 from fgloc.smoothing import smooth_run
+from fgloc.threads import one_blas_thread
 from fgloc.types import (
     CornersEvent,
     Decision,
@@ -53,6 +54,9 @@ def find_beside(bag: Path, name: str) -> Path | None:
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
+@one_blas_thread
+    limits=1, user_api="blas"
+)  # matrices are small: threads that wait for one another cost ten times
 def run(
     recording_path: Path,
     map_path: Path | None,
