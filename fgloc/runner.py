@@ -55,8 +55,6 @@ def find_beside(bag: Path, name: str) -> Path | None:
 
 
 @one_blas_thread
-    limits=1, user_api="blas"
-)  # matrices are small: threads that wait for one another cost ten times
 def run(
     recording_path: Path,
     map_path: Path | None,
