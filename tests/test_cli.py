@@ -261,7 +261,7 @@ def test_demo_without_the_sample_says_where_it_is(tmp_path, monkeypatch):
 def test_bundled_sample_is_localised(tmp_path):
     code, stdout, _ = fgloc("demo", "--out", tmp_path)
     assert code == 0
-    assert "60 s of first_run" in stdout
+    assert "60 s of installed_run" in stdout
     for mode in ("batch", "online"):
         metrics = json.loads((tmp_path / mode / "metrics.json").read_text())
         assert metrics["ate_mean_m"] < 0.02

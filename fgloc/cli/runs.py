@@ -28,7 +28,7 @@ from fgloc.types import Mode, RunResult
 if TYPE_CHECKING:
     from fgloc.evaluation.metrics import Metrics
 
-SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run" / "bag"
+SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
 class Speed(StrEnum):
