@@ -141,7 +141,8 @@ class CornerBatch:
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = [m.motion_cov for m in seen]
         self._outward, self._small = _shrinking(self._pixels)
-        self._blur_s = np.array([m.blur_s for m in seen])
+        self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
+        self._noise_px = np.hypot(self._sigma, self._blur_px)
         self.rows = [8] * len(seen)
         first = installation.blocks.get("camera")
         self._camera = None if first is None else np.arange(first[0], first[0] + 12)
@@ -201,8 +202,7 @@ class CornerBatch:
         by_time = (B @ flow[..., None])[..., 0]
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
-        speed = np.sqrt((by_time**2).sum(axis=2).mean(axis=1))  # px/s
-        scale = 1.0 / np.hypot(self._sigma, self._blur_s * speed)
+        scale = 1.0 / self._noise_px
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
         )
@@ -226,10 +226,21 @@ class CornerBatch:
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
         return Stacked(residual, J, H, self._columns, behind)
 
+    def _speed(self, size_m: FloatArray) -> FloatArray:
+        """How fast the corners move in the image ``(m,)`` [px/s] where they were seen, whatever marker it is.
+
+        Not where they are expected: a marker that was misread may be expected near the image plane, where all is fast.
+        """
+        f = self._K[:, 0]
+        side = np.linalg.norm(self._pixels - np.roll(self._pixels, 1, axis=1), axis=2).max(axis=1)
+        off = np.linalg.norm((self._pixels.mean(axis=1) - self._K[:, 2:]) / self._K[:, :2], axis=1)
+        depth = f * np.maximum(size_m, 1e-3) / np.maximum(side, 1.0)
+        along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
+        return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
+
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
-        speed = np.linalg.norm(H[:, 11]) * 0.5  # of a corner in the image, in units of the noise
-        shrunk = self._outward[i, :, None] * (self._blur_s[i] * self._small[i] * speed)
+        shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
         common = [shrunk, self._jitter[i] * H[:, 11:12]]
         moved = self._moved[i]
         if moved is not None:
