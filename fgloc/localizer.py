@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -22,8 +21,6 @@ from fgloc.graph.gating import Weights
 from fgloc.graph.installation import installation_of
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.measurement_log import Belief, Sighting
-from fgloc.graph.outage_inflation import interval_scale
-from fgloc.graph.slip_noise import BLIND_S
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
 from fgloc.relocalization.global_search import Start
@@ -40,10 +37,11 @@ from fgloc.types import (
     LandmarkMap,
     LandmarkMeasurement,
     Mode,
-    MotionMeasurement,
     Readings,
     Step,
 )
+
+_WORTH_A_REVISION = 4.0  # times the scale on its covariances: a step that disagrees more than it did is weighed anew
 
 
 class Localizer:
@@ -188,7 +186,7 @@ class Localizer:
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
-        self._whereabouts.fixed(self.estimator.elapsed_s, bool(believed))
+        self._whereabouts.fixed(bool(believed))
         return self._estimate(step, belief, decisions)
 
     def _advance(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
@@ -198,13 +196,10 @@ class Localizer:
         with self.stopwatch("weigh"):
             trust = self.trust.judge(step, readings)
             decisions = self._revise(k, trust)
-            footing = self.estimator.log.footing(k, self._whereabouts.blind_s > BLIND_S)
-            motions = self.sources.combine(readings, trust.off, footing)
+            motions = self.sources.combine(readings, trust.off, trust.scale)
             if not motions:
                 motions = [self.sources.unknown(step, readings)]
                 self.rejections["motion.silent"] += 1
-            motions, scale, returned = self._return(k, step, motions, sightings)
-            decisions += returned
             predicted = self.estimator.predict(motions)
             believed, refused, weighed = self._weigh(k, step, sightings, predicted)
             place = None
@@ -240,7 +235,7 @@ class Localizer:
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
-            self._whereabouts.fixed(self.estimator.elapsed_s)
+            self._whereabouts.fixed()
         fix = belief if believed else None
         self.sources.went(readings, fix)
         self.trust.hear(readings, fix)
@@ -250,7 +245,7 @@ class Localizer:
         if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
             self._get_lost()
         frame = self.estimator.log.keyframes[k]
-        frame.readings, frame.off, frame.footing, frame.scale, frame.doubt = readings, trust.off, footing, scale, doubt
+        frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, trust.scale, doubt
         decisions += motion_decisions(
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else ""
         )
@@ -269,42 +264,26 @@ class Localizer:
         return believed, refused, decisions
 
     def _revise(self, k: int, trust: Trust) -> list[Decision]:
-        """Take back what a source, which is not believed any more, has said in the steps before this one."""
-        if trust.span < 2:
-            return []
+        """Weigh the motion of the steps before this one anew, back to where the disagreement began.
+
+        A source that is not believed any more is taken out; where neither is accused their covariances are scaled.
+        """
         log = self.estimator.log.keyframes
         changed, decisions = {}, []
         frames = (log[i] for i in range(k - trust.span + 1, k) if i in log)
-        for frame in (f for f in frames if f.prior is None and trust.accused not in f.off):
-            frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
-            frame.footing = self.estimator.log.footing(frame.k, frame.footing.blind)
+        for frame in (f for f in frames if f.prior is None):
+            if trust.accused and trust.accused not in frame.off:
+                frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
+            elif not trust.accused and trust.scale >= _WORTH_A_REVISION * frame.scale:
+                frame.scale = trust.scale
+            else:
+                continue
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
-                decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")
+                if trust.accused:
+                    decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")
         self.estimator.revise(changed)
         return decisions
-
-    def _return(
-        self,
-        k: int,
-        step: Step,
-        motions: list[MotionMeasurement],
-        sightings: Sequence[LandmarkMeasurement],
-    ) -> tuple[list[MotionMeasurement], float, list[Decision]]:
-        """After dead reckoning, let the interval's covariances grow to what the returning sightings say of it."""
-        usable = [m for m in sightings if not self.weights.quarantine.holds(m.landmark_id)]
-        where = self._whereabouts
-        adaptive = self.config.weights.adaptive and self.factors.known and not (where.lost or where.holds_given)
-        if not adaptive or not usable or not where.dark:
-            return motions, 1.0, []
-        scale, nis = interval_scale(self.estimator.predict(motions), usable, self.factors, self.config)
-        reason = "interval_nis" if scale > 1.0 else ""
-        if reason:
-            self.estimator.inflate(where.fix_elapsed_s, scale)
-            motions = [worsened(m, scale) for m in motions]
-            self.rejections["motion.interval_nis"] += 1
-        residual = math.sqrt(max(nis, 0.0))
-        return motions, scale, [Decision(k, step.stamp_ns, "interval", -1, residual, nis, 3, 1.0 / scale, reason)]
 
     def _found(self, step: Step, place: Belief, decisions: Sequence[Decision]) -> Estimate:
         """Go on from a place that nothing connects with where the robot was believed to be."""

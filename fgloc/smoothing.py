@@ -11,8 +11,6 @@ from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.installation import InstallationBelief
-from fgloc.graph.slip_noise import Footing
-from fgloc.localizer import Localizer
 from fgloc.types import (
     Estimate,
     FloatArray,
@@ -46,7 +44,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     """
     localizer, config = parts.localizer, parts.config
     log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
-    take_room_back(localizer)
     solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability, moved)
     if config.batch.robust == "gnc" and solver.outliers:
         solver.replace_motions(_without(parts, solver))
@@ -64,14 +61,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
     return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
-
-
-def take_room_back(localizer: Localizer) -> None:
-    """Room for slides in the dark is not needed where sightings of the other end show them, too."""
-    for frame in localizer.estimator.log.keyframes.values():
-        if frame.footing.blind and frame.prior is None:
-            frame.footing = Footing()
-            frame.motions = tuple(localizer.sources.combine_again(frame)) or frame.motions
 
 
 def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

@@ -18,7 +18,6 @@ from fgloc.motion.card import Kinematics
 from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.smoothing import take_room_back
 from fgloc.types import ImuEvent, OdometryEvent
 
 TRACK = 0.3
@@ -142,19 +141,6 @@ def test_fault_31_the_batch_keeps_what_the_run_has_found_out(tmp_path):
     stamps = [frame.stamp_ns for frame in localizer.estimator.log.keyframes.values()]
     errors = [np.hypot(*(pose - world.truth(t))[:2]) for t, pose in zip(stamps, result.poses, strict=True)]
     assert max(errors) < 0.05
-
-
-def test_the_batch_takes_back_the_room_that_a_slip_was_given_in_the_dark(tmp_path):
-    made = chain(tmp_path, "learned", keep_all=True)
-    made.run(failing(World(room(), seconds=14.0, blind=DARK), lambda left, right: (1.6 * left, 1.7 * right), "learned"))
-    frames = [f for f in made.localizer.estimator.log.keyframes.values() if f.prior is None]
-    online = [f.motions[0] for f in frames]
-    take_room_back(made.localizer)
-    given = [a.cov[0, 0] - f.motions[0].cov[0, 0] for a, f in zip(online, frames, strict=True)]
-    dark = [any(a < seconds(f) < b + 0.2 for a, b in DARK) for f in frames]
-    assert max(given) > 0.01**2
-    assert all(g == pytest.approx(0.0, abs=1e-15) for g, d in zip(given, dark, strict=True) if not d)
-    assert all((a.motion == f.motions[0].motion).all() for a, f in zip(online, frames, strict=True))
 
 
 @pytest.mark.parametrize("witness", ["learned", "none"])

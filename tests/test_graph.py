@@ -459,7 +459,7 @@ def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(k
     estimator.correct(Belief(np.array([0.3, 0.5, 0.0]), np.eye(3) * 1e-4), 7)
     for k in range(4, 7):
         estimator.update(k * 10**8, 0.1, step)
-    estimator.inflate(0.15, 4.0)
+    estimator.revise({2: step, 3: step})
     assert estimator.belief.pose == pytest.approx((0.6, 0.5, 0.0), abs=1e-6)
     assert estimator.update(7 * 10**8, 0.1, step).pose == pytest.approx((0.7, 0.5, 0.0), abs=1e-6)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +14,6 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.gating import Weights
 from fgloc.graph.measurement_log import Belief
 from fgloc.graph.moved_landmark_votes import Quarantine, displacement
-from fgloc.graph.outage_inflation import interval_scale
-from fgloc.graph.pose_fit import chi2_bound
 from fgloc.types import CornerMeasurement, LandmarkMap, RangeBearingMeasurement
 
 R = np.diag([0.015, 0.06]) ** 2
@@ -180,77 +177,3 @@ def test_fault_51_a_moved_marker_that_is_put_back_does_no_harm_in_a_run():
     assert not chain.localizer.weights.quarantine.displacements  # it was seen to be back
     assert [reason for _, reason in reasons[-10:]] == [""] * 10
     assert np.mean([position_error(e, late.truth(e.stamp_ns)) for e in estimates]) < 0.006
-
-
-# --- interval ---------------------------------------------------------------------------------------------------------
-
-
-def returning(miss, sigma: float, ids, seed: int = 0, world=None, wrong: int | None = None):
-    """Scale and NIS of an interval whose dead-reckoned pose is off by ``miss``."""
-    rng, world, truth = np.random.default_rng(seed), world or room(), truth_at(3.0)
-    shown = {i: moved(world.landmarks[i], 0.4, 0.4) if i == wrong else world.landmarks[i] for i in ids}
-    make = corners if world.landmarks[ids[0]].size_m else beacon
-    seen = [make(truth, lm, rng) for lm in shown.values()]
-    predicted = Belief(se2.compose(truth, se2.exp(np.asarray(miss))), np.diag([sigma, sigma, 0.5 * sigma]) ** 2)
-    return interval_scale(predicted, seen, LandmarkFactors(world), config())
-
-
-def in_view(world=None) -> list[int]:
-    return [i for i, lm in (world or room()).landmarks.items() if project(truth_at(3.0), lm) is not None]
-
-
-def test_an_interval_that_was_worse_than_it_said_is_scaled_to_what_is_expected():
-    """Its NIS with the scaled covariance is three, the number of coordinates."""
-    miss = np.array([0.3, -0.2, 0.1])
-    scale, nis = returning(miss, 0.05, in_view())
-    assert nis == pytest.approx((0.3 / 0.05) ** 2 + (0.2 / 0.05) ** 2 + (0.1 / 0.025) ** 2, rel=0.4)
-    assert scale > nis / 3.0  # what the sightings leave open does not scale
-    scaled = 0.05 * math.sqrt(scale)
-    again, expected = returning(miss, scaled, in_view())
-    assert again == 1.0
-    assert expected == pytest.approx(3.0, rel=0.01)
-
-
-def test_an_honest_interval_is_left_alone():
-    rng = np.random.default_rng(6)
-    scales = []
-    for seed in range(60):
-        miss = rng.normal(0.0, [0.05, 0.05, 0.025])
-        scale, nis = returning(miss, 0.05, in_view(), seed)
-        scales.append(scale)
-        assert scale == 1.0 or nis > chi2_bound(0.9, 3)
-    assert np.mean(np.array(scales) > 1.0) < 0.2
-    assert max(scales) < 6.0
-
-
-def test_one_landmark_may_say_less_than_several_that_agree():
-    miss = np.array([0.5, -0.3, 0.15])
-    several, _ = returning(miss, 0.03, in_view()[:3])
-    assert 16.0 < several < 400.0
-    alone, nis = returning(miss, 0.03, in_view()[:1])
-    assert alone == 1.0
-    assert nis > 48.0
-    nearer, _ = returning(0.3 * miss, 0.03, in_view()[:1])
-    assert 1.0 < nearer <= 16.0
-
-
-def test_a_place_out_of_all_proportion_scales_nothing():
-    scale, nis = returning((2.0, 1.0, 0.8), 0.01, in_view())
-    assert scale == 1.0
-    assert nis > 1200.0
-
-
-def test_sightings_that_do_not_agree_scale_nothing():
-    miss = np.array([0.3, -0.2, 0.1])
-    ids = in_view()[:2]
-    assert returning(miss, 0.05, ids)[0] > 5.0
-    scale, nis = returning(miss, 0.05, ids, wrong=ids[0])
-    assert scale == 1.0
-    assert math.isnan(nis)
-
-
-def test_sightings_that_leave_the_place_open_scale_nothing():
-    world = beacons()
-    scale, nis = returning((0.3, -0.2, 0.1), 0.05, [1], world=world)
-    assert scale == 1.0
-    assert math.isnan(nis)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -11,6 +12,11 @@ from fgloc.config import WeightsConfig
 from fgloc.types import FloatArray
 
 _CALM = 0.6  # of the alarm: below it the newest window agrees
+_LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
+_LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
+_LEAST_LEVEL = 0.25  # covariances are taken to be given too large by at most four times
+_DOF = 3.0  # expected of one window
+_ADAPTS = 0.1  # share by which a step moves the quantile
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +27,16 @@ class Verdict:
         flagged: whether the sources disagree now.
         since: on the step that raises the flag, how many of the newest steps (this one included) the disagreement
             spans; else 0.
-        nis: largest NIS of any window that ends with this step.
+        nis: largest NIS of any window that ends with this step, over what is usual.
+        span: the number of that window's steps.
+        scale: on the covariances of what is compared, where they disagree more than is expected.
     """
 
     flagged: bool
     since: int
     nis: float
+    span: int = 1
+    scale: float = 1.0
 
 
 class Disagreement:
@@ -42,6 +52,7 @@ class Disagreement:
     def __init__(self, config: WeightsConfig) -> None:
         self._config = config
         self.flagged = False
+        self._low = _LOW_EXPECTED  # quantile of the statistic
         self._steps: deque[tuple[float, FloatArray, FloatArray, FloatArray]] = deque()  # dt, value, cov, derivative
         self._length_s = 0.0
         self._calm_s = 0.0
@@ -78,16 +89,25 @@ class Disagreement:
             self._length_s -= self._steps.popleft()[0]
         nis, span = self._worst()
         if not self.flagged:
+            self._low *= math.exp(_ADAPTS * ((nis > self._low) - (1.0 - _LOW)))
+            self._low = min(max(self._low, _LEAST_LEVEL * _LOW_EXPECTED), _LOW_EXPECTED)
+        nis /= self._level
+        if not self.flagged:
             if nis <= self._config.alarm:
-                return Verdict(False, 0, nis)
+                return Verdict(False, 0, nis, span, max(1.0, nis / _DOF))
             self.flagged, self._calm_s = True, 0.0
-            return Verdict(True, span, nis)
-        self._calm_s = self._calm_s + dt if self._newest_nis() < _CALM * self._config.alarm else 0.0
+            return Verdict(True, span, nis, span)
+        self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0
         if self._calm_s >= self._config.release_s:
             self.flagged = False
             self._steps.clear()
             self._length_s = 0.0
-        return Verdict(self.flagged, 0, nis)
+        return Verdict(self.flagged, 0, nis, span)
+
+    @property
+    def _level(self) -> float:
+        """How large differences are while nothing is wrong, as a share of what their covariances say."""
+        return self._low / _LOW_EXPECTED
 
     def _worst(self) -> tuple[float, int]:
         """NIS of the least likely window that ends now, and the number of its steps."""

@@ -28,15 +28,17 @@ class Trust:
 
     Attributes:
         off: source -> why it is not believed.
-        accused: the source, of the two that were compared, that is thought to be wrong.
-        span: for how many of the newest steps, this one included; more than one where a failure is seen only now.
+        accused: the source, of the two that were compared, that is thought to be wrong; "": neither.
+        span: for how many of the newest steps, this one included, that or the scale holds.
         nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
+        scale: on their covariances where neither is left out.
     """
 
     off: Mapping[str, str] = field(default_factory=dict)
-    accused: str = "wheels"
+    accused: str = ""
     span: int = 1
     nis: float = math.nan
+    scale: float = 1.0
 
 
 class SourceTrust:
@@ -95,7 +97,8 @@ class SourceTrust:
         if not verdict.flagged:
             self._arbiter.reset()
             self._probation_s = max(self._probation_s - step.dt, 0.0)
-            return Trust(off | ({"learned": "contradicted"} if self._probation_s else {}), nis=verdict.nis)
+            contradicted = {"learned": "contradicted"} if self._probation_s else {}
+            return Trust(off | contradicted, "", verdict.span, verdict.nis, verdict.scale)
         if self._arbiter.sides_with_wheels and readings.learned is not None:
             self.flags["learned.contradicted"] += not self._probation_s
             self._probation_s = _PROBATION_S

@@ -11,7 +11,6 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Belief, Keyframe
-from fgloc.graph.slip_noise import Footing
 from fgloc.motion.joint import JointCalibration
 from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro, Turn
@@ -24,6 +23,7 @@ _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this w
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
+_LEARNED_IN_SLIP = 4.0  # on its covariance: over 1 s squared errors are 2 to 5 times it (benchmarks.installed, slip)
 
 
 _OF_MOTION = (
@@ -176,7 +176,7 @@ class MotionSources:
         return self._installed(m, self._turn if self.gyro_is_read else None)
 
     def combine(
-        self, readings: Readings, off: Mapping[str, str] | None = None, footing: Footing | None = None
+        self, readings: Readings, off: Mapping[str, str] | None = None, scale: float = 1.0
     ) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other.
 
@@ -184,13 +184,18 @@ class MotionSources:
             readings: what the sources say.
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
-            footing: at the start of the step; what the sources miss there, they miss alike, so that as many factors as
-                there are each get that many times the room.
+            scale: on the wheels' covariance, as they and their witness disagree (`SourceTrust`); on that of the learned
+                motion up to what it is worth in a slip.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        if wheels is not None:
+            wheels = worsened(wheels, scale)
         if learned is None or "learned" in off:
             learned = None
+        else:
+            slips = off.get("wheels") == "slip"
+            learned = worsened(learned, _LEARNED_IN_SLIP if slips else min(scale, _LEARNED_IN_SLIP))
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
         if wheels is not None and "wheels" in off:
@@ -201,9 +206,6 @@ class MotionSources:
             elif self._joint is not None:
                 learned = self._joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
-        if known and footing is not None and self._config.weights.adaptive:
-            room = footing.room(known[-1], off.get("wheels") == "slip")
-            known = [worsened(m, doubt=len(known) * room) for m in known]
         if gyro is not None and known:
             known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
         return known
@@ -216,8 +218,8 @@ class MotionSources:
 
     def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
-        made = self.combine(readings or frame.readings, frame.off, frame.footing)
-        return [worsened(m, frame.scale, frame.doubt) for m in made]
+        made = self.combine(readings or frame.readings, frame.off, frame.scale)
+        return [worsened(m, doubt=frame.doubt) for m in made]
 
     def disagreement(self, readings: Readings) -> Difference | None:
         """How far the wheels and the sources that witness their slip are apart over the step.
@@ -295,6 +297,8 @@ class MotionSources:
 
 def worsened(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None = None) -> MotionMeasurement:
     """The motion with its covariance scaled, and with room ``(3, 3)`` for what sightings say against it."""
+    if scale == 1.0 and doubt is None:
+        return m
     return replace(m, cov=m.cov * scale + (0.0 if doubt is None else doubt))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from fgloc.config import EstimatorConfig
 from fgloc.errors import ConfigError
 from fgloc.graph.estimator import Estimator
@@ -46,8 +44,3 @@ class ExtendedKalmanFilter(Estimator):
 
     def _begin_at(self, newest: Keyframe) -> None:
         """A filter holds nothing else."""
-
-    def _build_again(self, changed: Sequence[int]) -> None:
-        """Filter anew; the oldest belief in the log, which nothing leads to any more, stands as it was changed."""
-        if changed:
-            self._solve_again(changed)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief
-from fgloc.graph.joint import predict, widened
+from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
 from fgloc.types import MotionMeasurement
 
@@ -109,22 +108,6 @@ class Estimator(ABC):
             self._solve_again(sorted(motions))
             self._adopt(self.log.keyframes[self._k].belief)
 
-    def inflate(self, since_s: float, scale: float) -> None:
-        """Scale the covariances of all motions that ended after a time, and of the beliefs they led to.
-
-        Args:
-            since_s: of the estimator's own time.
-            scale: on the covariances.
-        """
-        inside = [f for f in self.log.since(since_s) if f.elapsed_s > since_s and f.prior is None]
-        for frame in inside:
-            frame.motions = tuple(replace(m, cov=m.cov * scale) for m in frame.motions)
-            frame.scale *= scale
-            frame.doubt = None if frame.doubt is None else frame.doubt * scale
-            frame.belief = widened(frame.belief, scale)
-        self._build_again([frame.k for frame in inside])
-        self._adopt(self.log.keyframes[self._k].belief)
-
     def correct(self, belief: Belief, landmark_id: int) -> None:
         """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
         for frame in self.log.keyframes.values():
@@ -140,10 +123,6 @@ class Estimator(ABC):
     @abstractmethod
     def _begin_at(self, newest: Keyframe) -> None:
         """Forget what led to the belief of this keyframe, which stands as it is."""
-
-    @abstractmethod
-    def _build_again(self, changed: Sequence[int]) -> None:
-        """Motions and beliefs of these keyframes (in order) have changed: take the log up as it is now."""
 
     def _take(self, frame: Keyframe) -> Belief:
         self._solve(frame)

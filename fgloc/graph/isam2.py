@@ -210,7 +210,7 @@ class IncrementalEstimator(Estimator):
             newest.belief = self._newest(newest.k)
         except _GTSAM_ERRORS:
             self._careful_until_s = newest.elapsed_s + self._config.lag_s
-            self._build_again(changed)
+            self._build_again()
             return
         for frame in frames:
             held, new = new[: len(frame.motions)], new[len(frame.motions) :]
@@ -220,9 +220,10 @@ class IncrementalEstimator(Estimator):
         if self._config.kind == "fixed_lag":
             newest.belief = self._replayed([newest], newest.belief)
         else:
-            self._build_again([newest.k])
+            self._build_again()
 
-    def _build_again(self, changed: Sequence[int]) -> None:
+    def _build_again(self) -> None:
+        """Take the log up as it is now, in a new window."""
         newest = self.log.keyframes[self._k]
         initial = newest.belief
         try:

@@ -7,7 +7,7 @@ Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -163,9 +163,3 @@ def is_linear(belief: Belief) -> bool:
     """Whether sightings are as good as linear over what the pose may be."""
     cov = belief.cov
     return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < _LINEAR_RAD**2)
-
-
-def widened(belief: Belief, scale: float) -> Belief:
-    """The belief with its pose's covariance scaled."""
-    cross = None if belief.cross is None else belief.cross * np.sqrt(scale)
-    return replace(belief, cov=belief.cov * scale, cross=cross)

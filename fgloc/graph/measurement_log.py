@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from fgloc.graph.installation import InstallationBelief
-from fgloc.graph.slip_noise import Footing
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
 
 
@@ -56,9 +55,8 @@ class Keyframe:
     mode: Mode = Mode.OK
     readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
     off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
-    footing: Footing = field(default_factory=Footing)  # at the start of the step
-    scale: float = 1.0  # on the covariances of the motions that these make ...
-    doubt: FloatArray | None = None  # ... and what was added to them
+    scale: float = 1.0  # on the covariances of sources that disagree
+    doubt: FloatArray | None = None  # added to the covariances of the motions that these make
     clock_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose, by the clock of reference
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
 
@@ -95,14 +93,6 @@ class MeasurementLog:
             if self.keyframes[oldest].elapsed_s >= horizon:
                 break
             del self.keyframes[oldest]
-
-    def footing(self, k: int, blind: bool) -> Footing:
-        """At the start of the step to keyframe ``k``: what became of it in the step before."""
-        before = self.keyframes.get(k - 1)
-        if before is None or before.step is None:
-            return Footing(blind=blind)
-        after = before.footing.then(before.off.get("wheels") == "slip", before.step.dt)
-        return replace(after, blind=blind)
 
     def since(self, elapsed_s: float) -> Iterator[Keyframe]:
         """Keyframes not older than the given time of the estimator's own clock."""

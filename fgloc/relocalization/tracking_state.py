@@ -31,7 +31,6 @@ class Whereabouts:
 
     Attributes:
         lost: nothing explains where the robot is.
-        fix_elapsed_s: the estimator's own time at the last fix.
         defied: how far ``(3,)`` from the given first pose, in its frame, sightings put the robot; None: they did not.
     """
 
@@ -44,7 +43,6 @@ class Whereabouts:
         self._known = factors.known
         self._initializer = Initializer(config, landmark_map, factors, keep_all)
         self.lost = False
-        self.fix_elapsed_s = 0.0
         self.defied: FloatArray | None = None
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
@@ -114,14 +112,9 @@ class Whereabouts:
         told = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
         return [], [*refused, *believed], told
 
-    def fixed(self, elapsed_s: float, believed: bool = True) -> None:
-        """The robot is where it is believed to be, at this time of the estimator's.
-
-        Args:
-            elapsed_s: of the estimator's own time.
-            believed: whether sightings said so.
-        """
-        self._fix_s, self.fix_elapsed_s = self._clock_s, elapsed_s
+    def fixed(self, believed: bool = True) -> None:
+        """The robot is where it is believed to be; ``believed``: sightings said so."""
+        self._fix_s = self._clock_s
         if believed:
             self.lost = False
             self._initializer.forget()
