@@ -6,6 +6,7 @@ MRCLAM 6, whose landmarks are beacons (``robot_*``).
 
 - ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios.
 - ``mechanisms.without_effect``: those whose removal worsens nothing, as `benchmarks.mechanisms_effect` defines it.
+  ``off.together.*`` is with all of these off at once.
 - ``mechanisms.constants``, ``.lines``: as `benchmarks.mechanisms_count` defines them; ``--list`` prints the constants.
 - ``rules66.*``: ATE of the textbook's pipeline with three rules over that of fgloc without learned motion, online.
 - ``*.over_before``: ATE over that of an earlier file of `benchmarks.installed`, given by ``--before``.
@@ -38,8 +39,9 @@ from benchmarks.installed_runs import floor
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_report import report, without_effect
 from benchmarks.mechanisms_robots import SOURCE
-from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, over_before, wanted
+from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, of_one, over_before, wanted
 from benchmarks.mechanisms_runs import run_all, run_plain
+from benchmarks.mechanisms_switch import Mechanism, together
 from datasets import mrclam
 from datasets.sim.camera import RenderError
 
@@ -110,6 +112,7 @@ def _of_runs(chosen: Scope, options: Options) -> Iterator[Row]:
         useless = without_effect(chosen, found)
         yield Row("mechanisms.without_effect", len(useless), n=len(chosen.mechanisms))
         print(report(chosen, found))
+        yield from _together(chosen, [BY_NAME[name] for name in useless], found, options)
     for w in rows:
         row = w.row(w.id, found)
         if options.wants(w.id):
@@ -117,6 +120,15 @@ def _of_runs(chosen: Scope, options: Options) -> Iterator[Row]:
         name = w.id.replace(".ate_mm", ".over_before")
         if w.id.endswith(".ate_mm") and before is not None and options.wants(name):
             yield over_before(name, row, before)
+
+
+def _together(chosen: Scope, useless: Sequence[Mechanism], found: Outcomes, options: Options) -> Iterator[Row]:
+    """Those without effect by themselves, all off at once: one may do the work of another one."""
+    if len(useless) < 2:
+        return
+    rows = [w for case in chosen.cases for w in of_one(chosen, together(useless), case, "together")]
+    at_once = {**found, **run_all({cell for w in rows for cell in w.cells}, options.jobs)}
+    yield from (w.row(w.id, at_once) for w in rows)
 
 
 def _wanted(w: Wanted, options: Options) -> bool:

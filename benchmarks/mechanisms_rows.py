@@ -68,7 +68,7 @@ def wanted(scope: Scope) -> Iterator[Wanted]:
     """All rows that are made of runs, but for those of `rules66`."""
     for mechanism in scope.mechanisms:
         for case in scope.cases_of(mechanism):
-            yield from _off(scope, mechanism, case)
+            yield from of_one(scope, mechanism, case)
     for case in scope.cases:
         cells = scope.cells(case)
         for mode in MODES:
@@ -94,7 +94,8 @@ def wanted(scope: Scope) -> Iterator[Wanted]:
         yield Wanted("kidnap.nees_while_lifted", lifted, lambda name, found: _lifted(name, [found[c] for c in lifted]))
 
 
-def _off(scope: Scope, mechanism: Mechanism, case: str) -> Iterator[Wanted]:
+def of_one(scope: Scope, mechanism: Mechanism, case: str, label: str = "") -> Iterator[Wanted]:
+    """Rows of one mechanism, or of several at once under a label, under one failure."""
     off, on = scope.cells(case, mechanism.name), scope.cells(case)
     modes = MODES if mechanism.batch and not case.startswith("robot_") else MODES[:1]
     for mode in modes:
@@ -103,7 +104,7 @@ def _off(scope: Scope, mechanism: Mechanism, case: str) -> Iterator[Wanted]:
             def row(name: str, found: Outcomes, mode: str = mode, figure: str = figure) -> Row:
                 return ratio(name, [found[c] for c in off], [found[c] for c in on], mode, figure)
 
-            yield Wanted(f"off.{mechanism.name}.{case}.{mode}.{row_id}", (*off, *on), row)
+            yield Wanted(f"off.{label or mechanism.name}.{case}.{mode}.{row_id}", (*off, *on), row)
 
 
 def _figure(cells: Sequence[Cell], mode: str, figure: str, unit: str) -> Callable[[str, Outcomes], Row]:

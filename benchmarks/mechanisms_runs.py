@@ -24,7 +24,7 @@ from benchmarks.installed_runs import kept, run_cell
 from benchmarks.installed_scores import Scores
 from benchmarks.mechanisms_cells import Cell, Outcome, run
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
-from benchmarks.mechanisms_switch import probes_signature
+from benchmarks.mechanisms_switch import JOIN, Mechanism, probes_signature, together
 
 _ROOT = Path(__file__).resolve().parent
 _SCORING = ("adaptive_mrclam.py", "adaptive_scores.py", "mechanisms_cells.py", "mechanisms_robots.py")
@@ -67,11 +67,19 @@ def _run_group(cells: Sequence[Cell]) -> dict[Cell, Outcome]:
 
 def outcome(cell: Cell) -> Outcome:
     """Figures of one cell; of a mechanism that does not act, those of the run with all of them on."""
+    if JOIN in cell.off:
+        with named(cell.off).off():
+            return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case)))))
     if cell.off and (probe := BY_NAME[cell.off].probe):
         on = outcome(Cell(cell.source, cell.case))
         if probe and not on.acted.get(cell.off):
             return on
     return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+
+
+def named(off: str) -> Mechanism:
+    """A mechanism, or several whose names are joined."""
+    return BY_NAME[off] if JOIN not in off else together([BY_NAME[name] for name in off.split(JOIN)])
 
 
 @cache
@@ -82,5 +90,8 @@ def _scoring() -> str:
 def file_name(cell: Cell) -> str:
     """For what is kept of a cell."""
     where = f"robot{cell.source}" if isinstance(cell.source, int) else folder(cell.source)
-    what = f"off_{cell.off}_{BY_NAME[cell.off].signature}" if cell.off else f"on_{probes_signature(MECHANISMS)}"
+    if cell.off:
+        what = f"off_{'together' if JOIN in cell.off else cell.off}_{named(cell.off).signature}"
+    else:
+        what = f"on_{probes_signature(MECHANISMS)}"
     return f"mechanisms_{what}_{cell.case}_{where}_{_scoring()}"

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from copy import copy
 from dataclasses import dataclass
 from functools import wraps
 from pkgutil import resolve_name
@@ -19,17 +20,18 @@ from typing import Any
 from unittest.mock import patch
 
 Function = Callable[..., Any]
+JOIN = "+"  # between the names of mechanisms that are switched off at once
 
 
 @dataclass(frozen=True, slots=True)
 class Returns:
-    """Replaces a function by one that returns a value whatever it is given."""
+    """Replaces a function by one that returns a copy of a value, which the caller may change."""
 
     value: Any
 
     def __call__(self, real: Any) -> Function:
         """The replacement."""
-        return lambda *args, **kwargs: self.value
+        return lambda *args, **kwargs: copy(self.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +141,13 @@ class Mechanism:
     def signature(self) -> str:
         """Changes with what its switches do."""
         return _digest(part for s in self.switches for part in (s.target, _fingerprint(s.off)))
+
+
+def together(mechanisms: Sequence[Mechanism]) -> Mechanism:
+    """All of them as one."""
+    modules = tuple(dict.fromkeys(module for m in mechanisms for module in m.modules))
+    switches = tuple(switch for m in mechanisms for switch in m.switches)
+    return Mechanism(JOIN.join(m.name for m in mechanisms), "Several at once.", modules, switches, batch=True)
 
 
 @contextmanager

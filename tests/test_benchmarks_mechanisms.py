@@ -19,7 +19,7 @@ from benchmarks.mechanisms_effect import changes, outside, ratio
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_report import report, without_effect
 from benchmarks.mechanisms_rows import Scope, over_before, wanted
-from benchmarks.mechanisms_runs import file_name, outcome
+from benchmarks.mechanisms_runs import file_name, named, outcome
 from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
 from fgloc.graph import gating
 from fgloc.graph.gating import Weights
@@ -124,6 +124,12 @@ def test_robust_weights_are_one_while_they_are_off():
     assert gating.robust_weight(1e3, 8) < 1.0
 
 
+def test_what_is_returned_may_be_changed_by_the_caller():
+    empty = Returns([])(None)
+    empty().append(1)
+    assert empty() == []
+
+
 def test_signatures_follow_what_a_switch_does():
     def one(real):
         return lambda: 1
@@ -153,6 +159,16 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
     assert outcome(Cell(3, "none", "gate")).online.ate_mm == 2.0
     assert sum("_off_" in name for name in asked) == 2
     assert file_name(Cell(3, "none", "gate")) != file_name(Cell(3, "none", "arbiter"))
+
+
+def test_several_at_once_are_all_off_and_have_one_file():
+    both = named("gate+robust_weight")
+    with both.off():
+        assert gating.robust_weight(1e3, 8) == 1.0
+        assert gating.chi2_bound(0.99, 2) == math.inf
+    name = file_name(Cell(3, "none", both.name))
+    assert "together" in name
+    assert name != file_name(Cell(3, "none", "gate+misread_ids"))
 
 
 def test_constants_are_counted_by_the_definition():
