@@ -27,7 +27,8 @@ from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_switch import JOIN, Mechanism, probes_signature, together
 
 _ROOT = Path(__file__).resolve().parent
-_SCORING = ("adaptive_mrclam.py", "adaptive_scores.py", "mechanisms_cells.py", "mechanisms_robots.py")
+_SCORING = ("adaptive_scores.py", "mechanisms_cells.py")
+_ROBOTS = ("adaptive_mrclam.py", "mechanisms_robots.py")
 
 
 def run_all(cells: Iterable[Cell], jobs: int) -> dict[Cell, Outcome]:
@@ -83,8 +84,9 @@ def named(off: str) -> Mechanism:
 
 
 @cache
-def _scoring() -> str:
-    return hashlib.sha256(b"".join((_ROOT / name).read_bytes() for name in _SCORING)).hexdigest()[:8]
+def _scoring(robots: bool) -> str:
+    names = _SCORING + _ROBOTS if robots else _SCORING
+    return hashlib.sha256(b"".join((_ROOT / name).read_bytes() for name in names)).hexdigest()[:8]
 
 
 def file_name(cell: Cell) -> str:
@@ -94,4 +96,4 @@ def file_name(cell: Cell) -> str:
         what = f"off_{'together' if JOIN in cell.off else cell.off}_{named(cell.off).signature}"
     else:
         what = f"on_{probes_signature(MECHANISMS)}"
-    return f"mechanisms_{what}_{cell.case}_{where}_{_scoring()}"
+    return f"mechanisms_{what}_{cell.case}_{where}_{_scoring(isinstance(cell.source, int))}"
