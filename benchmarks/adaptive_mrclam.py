@@ -73,13 +73,14 @@ def _run(recorded: Recorded, name: str, variant: str, robot: int) -> Figures:
 
 def chain(recorded: Recorded, name: str) -> list[dict[str, Any]]:
     """Failures of a case, as a suite of ablations describes them."""
-    return {
+    cases: dict[str, list[dict[str, Any]]] = {
         "none": [],
         "slip": [{"kind": "wheel_slip", "speed": 0.08, "yaw_rate": 0.15, "when": {"intervals": _SLIPS}}],
         "dropout": [{"kind": "dropout", "sensor": "camera", "when": {"intervals": [_DARK]}}],
         "ids30": [{"kind": "wrong_ids", "probability": 0.3}],
         "moved": [{"kind": "moved_marker", "ids": [moved_id(recorded)], "distance_m": MOVED_M}],
-    }[name]
+    }
+    return cases[name]
 
 
 def load(source: Path, robot: int, scratch: Path) -> Recorded:

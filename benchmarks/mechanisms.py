@@ -6,7 +6,7 @@ MRCLAM 6, whose landmarks are beacons (``robot_*``).
 
 - ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios.
 - ``mechanisms.without_effect``: those whose removal worsens nothing, as `benchmarks.mechanisms_effect` defines it.
-  ``off.together.*`` is with all of these off at once.
+  ``off.together.*`` is with all of these off at once, or with those that ``--together`` names.
 - ``mechanisms.constants``, ``.lines``: as `benchmarks.mechanisms_count` defines them; ``--list`` prints the constants.
 - ``rules66.*``: ATE of the textbook's pipeline with three rules over that of fgloc without learned motion, online.
 - ``*.over_before``: ATE over that of an earlier file of `benchmarks.installed`, given by ``--before``.
@@ -38,7 +38,7 @@ from benchmarks.installed_runs import Cell as InstalledCell
 from benchmarks.installed_runs import floor
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_report import report, without_effect
-from benchmarks.mechanisms_robots import SOURCE
+from benchmarks.mechanisms_robots import ROBOT_CASES, SOURCE
 from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, of_one, over_before, wanted
 from benchmarks.mechanisms_runs import run_all, run_plain
 from benchmarks.mechanisms_switch import Mechanism, together
@@ -59,6 +59,7 @@ class Options:
     prefixes: tuple[str, ...] = ("",)
     before: Path | None = None
     seeds: int | None = None
+    together: tuple[str, ...] = ()
     jobs: int = os.cpu_count() or 1
 
     def wants(self, row_id: str) -> bool:
@@ -80,8 +81,11 @@ def scope(quick: bool, options: Options) -> Scope:
 
 
 def measure(quick: bool, options: Options) -> Iterator[Row]:
-    """The rows whose ids begin with one of the prefixes."""
+    """The rows whose ids begin with one of the prefixes; of mechanisms to be off together, their rows alone."""
     chosen = scope(quick, options)
+    if options.together:
+        yield from _together(chosen, [BY_NAME[name] for name in options.together], {}, options)
+        return
     yield from (row for row in counted() if options.wants(row.id))
     try:
         yield from _of_runs(chosen, options)
@@ -123,10 +127,11 @@ def _of_runs(chosen: Scope, options: Options) -> Iterator[Row]:
 
 
 def _together(chosen: Scope, useless: Sequence[Mechanism], found: Outcomes, options: Options) -> Iterator[Row]:
-    """Those without effect by themselves, all off at once: one may do the work of another one."""
+    """Several off at once, such as those without effect by themselves: one may do the work of another one."""
     if len(useless) < 2:
         return
-    rows = [w for case in chosen.cases for w in of_one(chosen, together(useless), case, "together")]
+    robots = tuple(f"robot_{case}" for case in ROBOT_CASES) if chosen.robots else ()
+    rows = [w for case in (*chosen.cases, *robots) for w in of_one(chosen, together(useless), case, "together")]
     at_once = {**found, **run_all({cell for w in rows for cell in w.cells}, options.jobs)}
     yield from (w.row(w.id, at_once) for w in rows)
 
@@ -172,10 +177,14 @@ def parsed(argv: Sequence[str] | None = None) -> tuple[Options, bool, list[str]]
     parser.add_argument("--before", type=Path, help="an earlier --json of benchmarks.installed")
     parser.add_argument("--seeds", type=int, help="so many of the split's seeds")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--together", default="", help="names of mechanisms: only the rows with all of them off")
     parser.add_argument("--list", action="store_true", help="print the hand-set constants and end")
     known, rest = parser.parse_known_args(argv)
     prefixes = tuple(known.rows.split(","))
-    return Options(known.split, prefixes, known.before, known.seeds, known.jobs), known.list, rest
+    at_once = tuple(name for name in known.together.split(",") if name)
+    if unknown := sorted(set(at_once) - set(BY_NAME)):
+        parser.error(f"no mechanism {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
+    return Options(known.split, prefixes, known.before, known.seeds, at_once, known.jobs), known.list, rest
 
 
 if __name__ == "__main__":

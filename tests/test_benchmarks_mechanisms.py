@@ -237,5 +237,8 @@ def test_the_command_line_chooses_split_seeds_and_rows():
     assert not options.wants("off.gate_keeper.none")
     assert mechanisms.scope(False, options).seeds == (41, 42, 43)
     assert mechanisms.scope(False, replace(options, seeds=2)).seeds == (41, 42)
+    assert mechanisms.parsed(["--together", "gate,arbiter"])[0].together == ("gate", "arbiter")
+    with pytest.raises(SystemExit):
+        mechanisms.parsed(["--together", "gates"])
     quick = mechanisms.scope(True, options)
     assert (quick.seeds, quick.cases) == ((41,), mechanisms.QUICK_CASES)
