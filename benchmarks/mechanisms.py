@@ -1,8 +1,8 @@
 """What each mechanism is for: ``python -m benchmarks.mechanisms [--quick] [--json FILE] [--split validation]``.
 
 Every adaptive mechanism of fgloc (`benchmarks.mechanisms_off`) is taken away by itself, under every failure of
-`benchmarks.installed`, on simulated recordings as installed; those whose action a probe tells also on robots of
-MRCLAM 6, whose landmarks are beacons (``robot_*``).
+`benchmarks.installed`, on simulated recordings as installed, and on robots of MRCLAM 6, whose landmarks are beacons
+(``robot_*``, online).
 
 - ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios.
 - ``mechanisms.without_effect``: those whose removal worsens nothing, as `benchmarks.mechanisms_effect` defines it.
@@ -38,7 +38,7 @@ from benchmarks.installed_runs import Cell as InstalledCell
 from benchmarks.installed_runs import floor
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_report import report, without_effect
-from benchmarks.mechanisms_robots import ROBOT_CASES, SOURCE
+from benchmarks.mechanisms_robots import SOURCE
 from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, of_one, over_before, wanted
 from benchmarks.mechanisms_runs import run_all, run_plain
 from benchmarks.mechanisms_switch import Mechanism, together
@@ -130,8 +130,7 @@ def _together(chosen: Scope, useless: Sequence[Mechanism], found: Outcomes, opti
     """Several off at once, such as those without effect by themselves: one may do the work of another one."""
     if len(useless) < 2:
         return
-    robots = tuple(f"robot_{case}" for case in ROBOT_CASES) if chosen.robots else ()
-    rows = [w for case in (*chosen.cases, *robots) for w in of_one(chosen, together(useless), case, "together")]
+    rows = [w for case in chosen.all_cases for w in of_one(chosen, together(useless), case, "together")]
     at_once = {**found, **run_all({cell for w in rows for cell in w.cells}, options.jobs)}
     yield from (w.row(w.id, at_once) for w in rows)
 

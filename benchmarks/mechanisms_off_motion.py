@@ -162,6 +162,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "The gyro's bias is learned while the wheels stand.",
         ("sensors/gyro.py",),
         (Switch(f"{_GYRO}:Gyro._watch_rest", Returns(None)),),
+        Probe(f"{_GYRO}:Gyro._watch_rest", called),
         batch=True,
     ),
     Mechanism(
@@ -169,6 +170,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "The gyro's bias is learned between two fixes of the yaw.",
         ("sensors/gyro.py",),
         (Switch(f"{_GYRO}:Gyro.fix", Returns(None)),),
+        Probe(f"{_GYRO}:Gyro.fix", called),
         batch=True,
     ),
     Mechanism(
@@ -188,6 +190,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "Variance of the yaw by a wrong bias grows with the square of the time without a fix.",
         ("sensors/gyro.py",),
         (Switch(f"{_GYRO}:Gyro.measure", _never_blind),),
+        Probe(f"{_GYRO}:Gyro.measure", called),
         batch=True,
     ),
 )

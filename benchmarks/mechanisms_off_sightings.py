@@ -13,6 +13,7 @@ from benchmarks.mechanisms_switch import (
     Probe,
     Returns,
     Switch,
+    called,
     not_none,
     something,
 )
@@ -126,6 +127,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         "Noise of corners grows with the speed of the image.",
         ("sensors/landmarks.py", "graph/observation.py"),
         (Switch("fgloc.sensors.landmarks:LandmarkSensor._corner", _unblurred),),
+        Probe("fgloc.sensors.landmarks:LandmarkSensor._corner", called),
         batch=True,
     ),
 )

@@ -201,6 +201,7 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         "Batch: all sightings, the refused ones too, are gated again at the smoothed trajectory.",
         ("graph/batch.py",),
         (Switch(f"{_BATCH}._decide", Returns(None)),),
+        Probe(f"{_BATCH}._decide", called),
         batch=True,
     ),
     Mechanism(
@@ -208,6 +209,7 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         "Batch: sightings that are not in the graph are gated with the covariance of the smoothed pose.",
         ("graph/batch.py",),
         (Switch(f"{_BATCH}._judged", _certain_poses),),
+        Probe(f"{_BATCH}._judged", called),
         batch=True,
     ),
     Mechanism(
@@ -223,6 +225,7 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         "Batch: slip noise of camera outages is taken out again.",
         ("smoothing.py",),
         (Switch("fgloc.smoothing:take_room_back", Returns(None)),),
+        Probe("fgloc.smoothing:take_room_back", called),
         batch=True,
     ),
     Mechanism(

@@ -13,7 +13,7 @@ _SHOWN = 4  # changes of a mechanism, each way
 def effect(chosen: Scope, mechanism: Mechanism, found: Outcomes) -> list[Change]:
     """What taking a mechanism away does, over all failures; those that it makes worse most come first."""
     out: list[Change] = []
-    for case in chosen.cases_of(mechanism):
+    for case in chosen.all_cases:
         offs, ons = (chosen.cells(case, name) for name in (mechanism.name, ""))
         pairs: list[tuple[Outcome, Outcome]] = [(found[a], found[b]) for a, b in zip(offs, ons, strict=True)]
         if pairs:
@@ -44,8 +44,7 @@ def _acts(chosen: Scope, mechanism: Mechanism, found: Outcomes) -> str:
     if mechanism.probe is None:
         return "no probe"
     acted = {
-        case: sum(found[cell].acted.get(mechanism.name, 0) for cell in chosen.cells(case))
-        for case in chosen.cases_of(mechanism)
+        case: sum(found[cell].acted.get(mechanism.name, 0) for cell in chosen.cells(case)) for case in chosen.all_cases
     }
     return "acts in " + (", ".join(f"{case} {n}" for case, n in acted.items() if n) or "none")
 

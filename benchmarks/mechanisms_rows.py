@@ -58,16 +58,16 @@ class Scope:
         floor = FAILURES[case].floor if case in FAILURES else "unequal_radii"
         return tuple(Cell(Take("installed", floor, self.split, seed), case, off) for seed in self.seeds)
 
-    def cases_of(self, mechanism: Mechanism) -> tuple[str, ...]:
-        """Failures under which a mechanism is switched off: robots only where a probe tells that it acts there."""
-        robots = tuple(f"robot_{case}" for case in ROBOT_CASES)
-        return (*self.cases, *robots) if mechanism.probe is not None and self.robots else self.cases
+    @property
+    def all_cases(self) -> tuple[str, ...]:
+        """Failures under which mechanisms are switched off; of robots those without wheels."""
+        return (*self.cases, *(f"robot_{case}" for case in ROBOT_CASES)) if self.robots else self.cases
 
 
 def wanted(scope: Scope) -> Iterator[Wanted]:
     """All rows that are made of runs, but for those of `rules66`."""
     for mechanism in scope.mechanisms:
-        for case in scope.cases_of(mechanism):
+        for case in scope.all_cases:
             yield from of_one(scope, mechanism, case)
     for case in scope.cases:
         cells = scope.cells(case)
