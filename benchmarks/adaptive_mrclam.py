@@ -29,7 +29,7 @@ from fgloc.sensors.maps import load_map
 from fgloc.types import CommandEvent, Event, OdometryEvent, TruthEvent
 
 _ROOT = Path(__file__).resolve().parent.parent
-_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
+DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
 _MODELS = _ROOT / "fgloc" / "motion" / "models" / "mrclam"
 _LENGTH_S = 200.0
 _SLIPS = [(40.0, 46.0), (80.0, 86.0), (120.0, 126.0), (160.0, 166.0)]
@@ -40,14 +40,14 @@ _FIXED = {"weights": {"adaptive": False}}
 
 def measure(quick: bool) -> Iterator[Row]:
     """Rows of every failure; a quick run takes one robot."""
-    source = _DATA / "mrclam6"
+    source = DATA / "mrclam6"
     if not source.is_dir():
         yield from not_run([f"mrclam.{name}.over_fixed" for name in CASES], f"no {source}; set FGLOC_REAL_DATA")
         return
     found: dict[tuple[str, str], list[Figures]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         for robot in (3,) if quick else mrclam.ROBOTS:
-            recorded = _load(source, robot, Path(scratch))
+            recorded = load(source, robot, Path(scratch))
             for name in CASES:
                 for variant in ("ours", "fixed", *(("oracle",) if name == "slip" else ())):
                     found.setdefault((name, variant), []).append(_run(recorded, name, variant, robot))
@@ -68,20 +68,23 @@ def _run(recorded: Recorded, name: str, variant: str, robot: int) -> Figures:
     config = recorded.config if variant == "ours" else changed(recorded.config, _FIXED)
     if variant == "oracle":
         config = changed(config, distrusting(_SLIPS))
-    return replay(recorded, config, [failure(f) for f in _chain(recorded, name)], robot, batch=False)
+    return replay(recorded, config, [failure(f) for f in chain(recorded, name)], robot, batch=False)
 
 
-def _chain(recorded: Recorded, name: str) -> list[dict[str, Any]]:
-    return {
+def chain(recorded: Recorded, name: str) -> list[dict[str, Any]]:
+    """Failures of a case, as a suite of ablations describes them."""
+    cases: dict[str, list[dict[str, Any]]] = {
         "none": [],
         "slip": [{"kind": "wheel_slip", "speed": 0.08, "yaw_rate": 0.15, "when": {"intervals": _SLIPS}}],
         "dropout": [{"kind": "dropout", "sensor": "camera", "when": {"intervals": [_DARK]}}],
         "ids30": [{"kind": "wrong_ids", "probability": 0.3}],
         "moved": [{"kind": "moved_marker", "ids": [moved_id(recorded)], "distance_m": MOVED_M}],
-    }[name]
+    }
+    return cases[name]
 
 
-def _load(source: Path, robot: int, scratch: Path) -> Recorded:
+def load(source: Path, robot: int, scratch: Path) -> Recorded:
+    """The first minutes of a robot, converted into a folder, with an odometry that repeats the commands."""
     bag = mrclam.convert(source, robot, scratch / f"robot{robot}")
     robot_yaml, map_path = find_beside(bag, "robot.yaml"), find_beside(bag, "map.yaml")
     assert robot_yaml is not None

@@ -1,0 +1,171 @@
+"""What weighs and associates sightings, for the table of `benchmarks.mechanisms_off`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from benchmarks.mechanisms_switch import (
+    Argument,
+    Function,
+    Mechanism,
+    Probe,
+    Returns,
+    Switch,
+    called,
+    not_none,
+    something,
+)
+
+_GATE = "fgloc.graph.gating"
+_POSE_FIT = "fgloc.graph.pose_fit"
+_VOTES = "fgloc.graph.moved_landmark_votes:Quarantine"
+_NO_KERNEL = 1e6  # sigmas
+
+
+def _linear_nis(real: Function) -> Function:
+    """`correct` for the test of joint compatibility alone."""
+
+    def correct(belief: Any, known: Any, measurements: Any, factors: Any, weights: Any = None) -> Any:
+        return real(belief, known, measurements, factors, weights) if _linear_nis.testing else None  # type: ignore[attr-defined]
+
+    return correct
+
+
+def _testing(real: Function) -> Function:
+    def agreed(*args: Any) -> Any:
+        _linear_nis.testing = True  # type: ignore[attr-defined]
+        try:
+            return real(*args)
+        finally:
+            _linear_nis.testing = False  # type: ignore[attr-defined]
+
+    return agreed
+
+
+_linear_nis.testing = False  # type: ignore[attr-defined]
+
+
+def _never_released(real: Function) -> Function:
+    def fits(self: Any, sighting: Any, *args: Any) -> None:
+        if not self.holds(sighting.measurement.landmark_id):
+            real(self, sighting, *args)
+
+    return fits
+
+
+def _unblurred(real: Function) -> Function:
+    def corner(*args: Any) -> Any:
+        m = real(*args)
+        return None if m is None else replace(m, blur_s=0.0)
+
+    return corner
+
+
+OF_SIGHTINGS: tuple[Mechanism, ...] = (
+    Mechanism(
+        "robust_weight",
+        "Huber weights: sightings that agree badly with the prediction count less.",
+        ("graph/pose_fit.py", "graph/gating.py", "graph/batch.py"),
+        (Switch(f"{_GATE}:robust_weight", Returns(1.0)), Switch("fgloc.graph.batch:robust_weight", Returns(1.0))),
+        batch=True,
+    ),
+    Mechanism(
+        "fit_kernel",
+        "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not spoil the pose.",
+        ("graph/pose_fit.py",),
+        (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
+    ),
+    Mechanism(
+        "gate",
+        "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
+        ("graph/gating.py",),
+        (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
+        batch=True,
+    ),
+    Mechanism(
+        "corrected_nis",
+        "Far from linear the NIS is taken at the pose that prediction and sighting make likeliest.",
+        ("graph/gating.py", "graph/joint.py"),
+        (Switch(f"{_GATE}:correct", _linear_nis), Switch(f"{_GATE}:Weights._agreed", _testing)),
+        batch=True,
+    ),
+    Mechanism(
+        "joint_compatibility",
+        "Of sightings that exclude each other, an uncertain prediction keeps the largest set that agrees.",
+        ("graph/gating.py",),
+        (Switch(f"{_GATE}:Weights._agreed", Argument(3)),),
+        Probe(f"{_GATE}:Weights._agreed", lambda result, _, *args: result != args[3]),
+        batch=True,
+    ),
+    Mechanism(
+        "misread_ids",
+        "A refused marker where exactly one other marker of the map would be seen is taken for that other one.",
+        ("graph/gating.py", "graph/factors.py"),
+        (Switch(f"{_GATE}:Weights._read_again", Returns(())),),
+        Probe(f"{_GATE}:Weights._read_again", something),
+        batch=True,
+    ),
+    Mechanism(
+        "shared_information",
+        "Sightings of one landmark within the correlation time of its errors share their information.",
+        ("graph/gating.py",),
+        (Switch(f"{_GATE}:Weights._share_information", lambda real: lambda self, m: (m, 1.0)),),
+        Probe(f"{_GATE}:Weights._share_information", lambda result, *_: result[1] != 1.0),
+    ),
+    Mechanism(
+        "overruled_prediction",
+        "Refused sightings of two landmarks that agree on a place nearby widen the motion and are fused.",
+        ("graph/gating.py", "localizer.py"),
+        (Switch(f"{_GATE}:Weights.overruled", Returns(None)),),
+        Probe(f"{_GATE}:Weights.overruled", not_none),
+        batch=True,
+    ),
+    Mechanism(
+        "blur_noise",
+        "Noise of corners grows with the speed of the image.",
+        ("sensors/landmarks.py", "graph/observation.py"),
+        (Switch("fgloc.sensors.landmarks:LandmarkSensor._corner", _unblurred),),
+        Probe("fgloc.sensors.landmarks:LandmarkSensor._corner", called),
+        batch=True,
+    ),
+)
+
+OF_LANDMARKS: tuple[Mechanism, ...] = (
+    Mechanism(
+        "moved_votes",
+        "A landmark whose refused sightings agree on another place is named as moved and left out.",
+        ("graph/moved_landmark_votes.py",),
+        (Switch(f"{_VOTES}.disagree", Returns(None)),),
+        Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: len(quarantine) > 0),
+        batch=True,
+    ),
+    Mechanism(
+        "votes_misread_test",
+        "Refused sightings that may be misread sightings of what stands there do not count as a move.",
+        ("graph/moved_landmark_votes.py",),
+        (Switch(f"{_VOTES}._misread", Returns(False)),),
+        Probe(f"{_VOTES}._misread", something),
+        batch=True,
+    ),
+    Mechanism(
+        "votes_release",
+        "A landmark named as moved that fits its place again, time after time, is used again.",
+        ("graph/moved_landmark_votes.py",),
+        (Switch(f"{_VOTES}.fits", _never_released),),
+        Probe(
+            f"{_VOTES}.fits",
+            lambda _, held, quarantine, s, *args: held and not quarantine.holds(s.measurement.landmark_id),
+            lambda quarantine, s, *args: quarantine.holds(s.measurement.landmark_id),
+        ),
+        batch=True,
+    ),
+    Mechanism(
+        "moved_beacons",
+        "GLR over one filter for each beacon: names beacons that moved by less than the gate sees.",
+        ("graph/moved_landmark_glr.py", "faults/landmark_faults.py"),
+        (Switch("fgloc.faults.landmark_faults:Suspicion.look", Returns([])),),
+        Probe("fgloc.faults.landmark_faults:Suspicion.look", something),
+    ),
+)

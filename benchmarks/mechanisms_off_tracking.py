@@ -1,0 +1,247 @@
+"""What decides on the place, linearizes and smooths, for the table of `benchmarks.mechanisms_off`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from benchmarks.mechanisms_switch import (
+    Constant,
+    Function,
+    Mechanism,
+    Probe,
+    Returns,
+    Switch,
+    called,
+    not_none,
+    something,
+)
+from fgloc.graph.moved_landmark_votes import Quarantine
+from fgloc.types import FloatArray
+
+_GATE = "fgloc.graph.gating"
+_SEARCH = "fgloc.relocalization.global_search"
+_WHERE = "fgloc.relocalization.tracking_state:Whereabouts"
+_BATCH = "fgloc.graph.batch:BatchSmoother"
+_WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
+
+
+def _without_contrary(real: Function) -> Function:
+    return lambda self, started: real(self, replace(started, contrary=frozenset()))
+
+
+def _refusals_not_counted(real: Function) -> Function:
+    def contradicted(self: Any) -> Any:
+        with patch.object(self, "refused_in_a_row", 0):
+            return real(self)
+
+    return contradicted
+
+
+def _nothing_in_quarantine(real: Function) -> Function:
+    def contradicted(self: Any) -> Any:
+        with patch.object(self, "quarantine", Quarantine(1)):
+            return real(self)
+
+    return contradicted
+
+
+def _at_prediction(real: Function) -> Function:
+    return lambda self, frame: frame.belief
+
+
+def _never(real: Any) -> property:
+    return property(lambda self: False)
+
+
+def _always(real: Any) -> property:
+    return property(lambda self: True)
+
+
+def _empty(real: Any) -> property:
+    return property(lambda self: frozenset(), lambda self, value: None)
+
+
+def _all_landmarks(real: Function) -> Function:
+    return lambda self, log, factors, config, probability, moved=(): real(self, log, factors, config, probability)
+
+
+class _Certain:
+    """Marginal covariances of poses that are known exactly."""
+
+    def marginalCovariance(self, key: int) -> FloatArray:  # noqa: N802 (GTSAM's)
+        return np.zeros((3, 3))
+
+
+def _certain_poses(real: Function) -> Function:
+    def judged(self: Any) -> Any:
+        with patch.object(self, "_marginals", _Certain):
+            return real(self)
+
+    return judged
+
+
+OF_TRACKING: tuple[Mechanism, ...] = (
+    Mechanism(
+        "place_search",
+        "While every sighting is refused, another place that explains them is searched for on the map.",
+        ("relocalization/tracking_state.py", "relocalization/global_search.py"),
+        (Switch(f"{_WHERE}.search", Returns(None)),),
+        Probe(f"{_WHERE}.search", not_none),
+        batch=True,
+    ),
+    Mechanism(
+        "lost_by_refusals",
+        "So many refusals in a row, of two landmarks or more, make the robot lost.",
+        ("graph/gating.py", "localizer.py"),
+        (Switch(f"{_GATE}:Weights.contradicted", _refusals_not_counted),),
+        Probe(f"{_GATE}:Weights.contradicted", something),
+        batch=True,
+    ),
+    Mechanism(
+        "lost_by_quarantine",
+        "More moved landmarks than agreeing ones make the robot lost.",
+        ("graph/gating.py", "localizer.py"),
+        (Switch(f"{_GATE}:Weights.contradicted", _nothing_in_quarantine),),
+        Probe(f"{_GATE}:Weights.contradicted", something),
+        batch=True,
+    ),
+    Mechanism(
+        "lost_by_covariance",
+        "A pose too uncertain for any sighting to be judged by makes the robot lost.",
+        ("relocalization/tracking_state.py",),
+        (Switch(f"{_WHERE}.nowhere", Returns(False)),),
+        Probe(f"{_WHERE}.nowhere", something),
+        batch=True,
+    ),
+    Mechanism(
+        "given_pose_held",
+        "A given first pose holds against sightings that contradict it from the start.",
+        ("relocalization/tracking_state.py", "localizer.py"),
+        (Switch(f"{_WHERE}.holds_given", _never),),
+        Probe(f"{_WHERE}.hold", lambda _, before, where, *args: where.holds_given),
+        batch=True,
+    ),
+    Mechanism(
+        "gaussian_sum",
+        "Gaussian sum: poses before the sightings of beacons are enough to confirm a place.",
+        ("relocalization/gaussian_sum.py",),
+        (Switch(f"{_WHERE}.unconfirmed", Returns(None)),),
+        Probe(f"{_WHERE}.unconfirmed", not_none),
+    ),
+    Mechanism(
+        "start_contrary",
+        "Sightings that contradict the place where the run starts are refused in the replay from there.",
+        ("localizer.py", "relocalization/global_search.py"),
+        (Switch("fgloc.localizer:Localizer._replay", _without_contrary),),
+        Probe("fgloc.localizer:Localizer._replay", lambda _, before, self, started: started.contrary),
+        batch=True,
+    ),
+    Mechanism(
+        "start_leave_one_out",
+        "A place told by beacons must stand without any one of them.",
+        ("relocalization/global_search.py",),
+        (Switch(f"{_SEARCH}:Initializer._checked", Returns(True)),),
+        Probe(f"{_SEARCH}:Initializer._checked", lambda checked, *_: not checked),
+    ),
+    Mechanism(
+        "start_doubted",
+        "Landmarks that contradicted one another during the search do not make a place by themselves.",
+        ("relocalization/global_search.py",),
+        (Switch(f"{_SEARCH}:Initializer._doubted", _empty, made_in_init=True),),
+        Probe(f"{_SEARCH}:Initializer._solve", lambda _, before, initializer, known: initializer._doubted),
+    ),
+    Mechanism(
+        "start_rivals",
+        "A place is not taken while another one explains nearly as much.",
+        ("relocalization/global_search.py",),
+        (Switch(f"{_SEARCH}:_RIVAL_SHARE", Constant(math.inf)),),
+    ),
+    Mechanism(
+        "start_trimming",
+        "A place is fitted again to the sightings that it explains.",
+        ("relocalization/global_search.py",),
+        (Switch(f"{_SEARCH}:_TRIMS", Constant(0)),),
+    ),
+    Mechanism(
+        "jump_compelling",
+        "A place other than the tracked one has to explain nearly all, sharply, by two landmarks.",
+        ("relocalization/pose_consensus.py",),
+        (Switch("fgloc.relocalization.pose_consensus:Agreed.compelling", _always),),
+    ),
+)
+
+OF_ESTIMATION: tuple[Mechanism, ...] = (
+    Mechanism(
+        "window_relinearisation",
+        "The window is built again at its present poses after a large correction of the yaw.",
+        ("graph/isam2.py",),
+        (Switch(f"{_WINDOW}._relinearize", Returns(None)),),
+        Probe(f"{_WINDOW}._relinearize", called),
+        batch=True,
+    ),
+    Mechanism(
+        "corrected_linearisation",
+        "Far from linear a keyframe is first linearized at the pose that its sightings tell.",
+        ("graph/isam2.py", "graph/joint.py"),
+        (Switch(f"{_WINDOW}._linearization", _at_prediction),),
+        Probe(
+            f"{_WINDOW}._linearization",
+            lambda belief, before, self, frame: belief is not before,
+            lambda self, frame: frame.belief,
+        ),
+        batch=True,
+    ),
+    Mechanism(
+        "batch_regating",
+        "Batch: all sightings, the refused ones too, are gated again at the smoothed trajectory.",
+        ("graph/batch.py",),
+        (Switch(f"{_BATCH}._decide", Returns(None)),),
+        Probe(f"{_BATCH}._decide", called),
+        batch=True,
+    ),
+    Mechanism(
+        "batch_pose_sigma",
+        "Batch: sightings that are not in the graph are gated with the covariance of the smoothed pose.",
+        ("graph/batch.py",),
+        (Switch(f"{_BATCH}._judged", _certain_poses),),
+        Probe(f"{_BATCH}._judged", called),
+        batch=True,
+    ),
+    Mechanism(
+        "batch_without_moved",
+        "Batch: landmarks named as moved are left out.",
+        ("graph/batch.py", "smoothing.py"),
+        (Switch(f"{_BATCH}.__init__", _all_landmarks),),
+        Probe(f"{_BATCH}.__init__", lambda _, before, self, log, factors, config, probability, moved=(): moved),
+        batch=True,
+    ),
+    Mechanism(
+        "batch_room_removed",
+        "Batch: slip noise of camera outages is taken out again.",
+        ("smoothing.py",),
+        (Switch("fgloc.smoothing:take_room_back", Returns(None)),),
+        Probe("fgloc.smoothing:take_room_back", called),
+        batch=True,
+    ),
+    Mechanism(
+        "batch_learned_again",
+        "Batch: the learned motion is evaluated again at the smoothed velocities.",
+        ("smoothing.py",),
+        (Switch("fgloc.smoothing:_measure_again", Returns({})),),
+        Probe("fgloc.smoothing:_measure_again", something),
+        batch=True,
+    ),
+    Mechanism(
+        "gnc",
+        "Batch: graduated non-convexity decides on sightings and motions (off unless configured).",
+        ("graph/gnc.py", "graph/batch.py"),
+        (Switch(f"{_BATCH}._graduate", Returns(None)),),
+        Probe(f"{_BATCH}._graduate", called),
+        batch=True,
+    ),
+)

@@ -1,0 +1,244 @@
+"""The benchmark of mechanisms: each switch is really off inside and on again outside, and the table is well-formed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from exact import exact
+from robot_world import Chain, World, room
+
+from benchmarks import mechanisms
+from benchmarks.common import Row
+from benchmarks.installed_scores import Errors
+from benchmarks.mechanisms_cells import Cell, Outcome
+from benchmarks.mechanisms_count import constants, in_sections, in_source, lines
+from benchmarks.mechanisms_effect import changes, outside, ratio
+from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
+from benchmarks.mechanisms_report import report, without_effect
+from benchmarks.mechanisms_rows import Scope, over_before, wanted
+from benchmarks.mechanisms_runs import file_name, named, outcome
+from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
+from fgloc.graph import gating
+from fgloc.graph.gating import Weights
+from fgloc.types import LandmarkMap
+
+SOURCE = '''
+"""Says 7."""
+_FAR, _NEAR = 3.5, 1.0
+_TABLE = {1: 0.8, 2: [0.1, -4.0]}
+def f(x, k=9, n=-1):
+    y = np.zeros((3, 3))
+    return x[:3] * 6 + x[0] ** 2 - 0.5 * 1e-9 * y * True
+'''
+SECTIONS = """
+class GateConfig(Section):
+    a: float = Field(5.0, gt=3, description="9")
+    b: tuple[float, float] = (0.05, 1.0)
+    c: bool = True
+    d: Other = Other(8)
+class OtherConfig(Section):
+    e: float = 7.0
+"""
+
+
+def moved_world(seconds=12.0):
+    """A room in which one marker hangs elsewhere than the map has it."""
+    shown = dict(room().landmarks)
+    shown[2] = replace(shown[2], position=shown[2].position + np.array([0.0, 0.4, 0.0]))
+    return World(room(), seconds=seconds, shown=LandmarkMap(shown))
+
+
+def refusals(world):
+    """Reasons of a replay."""
+    estimates = Chain(exact(), room()).run(world.events())
+    return [d.reason for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
+
+
+def result(ate=1.0, nees=1.0, batch=None, **changes_):
+    errors = Errors(ate, 0.1, nees)
+    smoothed = None if batch is None else Errors(batch, 0.1, 1.0)
+    return Outcome(errors, smoothed, 100, **changes_)
+
+
+def scope(*names):
+    return Scope("validation", (41, 42), (), ("none", "slip", "kidnap"), tuple(BY_NAME[n] for n in names))
+
+
+def found_in(chosen, on, off):
+    """The same outcome in every cell with everything on, and another one with something off."""
+    return {cell: off if cell.off else on for w in wanted(chosen) for cell in w.cells}
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda m: m.name)
+def test_each_switch_replaces_what_is_there_and_puts_it_back(mechanism):
+    places = [switch.place() for switch in mechanism.switches]
+    before = [vars(holder).get(name) for holder, name in places]
+    assert before == [getattr(holder, name, None) for holder, name in places]
+    with mechanism.off():
+        assert all(vars(h)[n] is not old for (h, n), old in zip(places, before, strict=True))
+    assert [vars(holder).get(name) for holder, name in places] == before
+
+
+def test_names_are_unique_and_modules_exist():
+    assert len(BY_NAME) == len(MECHANISMS)
+    known = {
+        path.relative_to(mechanisms.mechanisms_count.PACKAGE).as_posix()
+        for path in mechanisms.mechanisms_count.PACKAGE.rglob("*.py")
+    }
+    for mechanism in MECHANISMS:
+        assert set(mechanism.modules) <= known, mechanism.name
+        assert mechanism.purpose.endswith(".")
+
+
+def test_probes_watch_what_is_there_and_put_it_back():
+    real = Weights._agreed
+    with watched(MECHANISMS) as counts:
+        assert Weights._agreed is not real
+    assert Weights._agreed is real
+    assert not counts
+
+
+def test_a_switch_of_what_is_gone_says_so():
+    with pytest.raises(AttributeError, match="delete its row"):
+        Switch("fgloc.graph.gating:Weights._never_there", Returns(None)).place()
+
+
+def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():
+    world = moved_world()
+    with watched(MECHANISMS) as counts:
+        assert "gate" in refusals(world)
+    assert counts["moved_votes"] > 0
+    assert counts["misread_ids"] == 0
+    with BY_NAME["gate"].off():
+        assert "gate" not in refusals(world)
+    with BY_NAME["moved_votes"].off():
+        assert set(refusals(world)) == {"gate", "contradicts_start"}
+
+
+def test_robust_weights_are_one_while_they_are_off():
+    with BY_NAME["robust_weight"].off():
+        assert gating.robust_weight(1e3, 8) == 1.0
+    assert gating.robust_weight(1e3, 8) < 1.0
+
+
+def test_what_is_returned_may_be_changed_by_the_caller():
+    empty = Returns([])(None)
+    empty().append(1)
+    assert empty() == []
+
+
+def test_signatures_follow_what_a_switch_does():
+    def one(real):
+        return lambda: 1
+
+    def two(real):
+        return lambda: 2
+
+    def made(off, acts=bool):
+        return Mechanism("a", "b.", (), (Switch("m:f", off),), Probe("m:f", acts))
+
+    assert made(one).signature == made(one).signature != made(two).signature
+    assert made(Returns(1)).signature != made(Returns(2)).signature
+    assert probes_signature([made(one)]) != probes_signature([made(one, lambda result, *_: not result)])
+
+
+def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
+    on = result(acted={"misread_ids": 0, "arbiter": 3})
+    asked = []
+
+    def kept(name, make):
+        asked.append(name)
+        return asdict(on if "_on_" in name else result(2.0))
+
+    monkeypatch.setattr("benchmarks.mechanisms_runs.kept", kept)
+    assert outcome(Cell(3, "none", "misread_ids")) == on
+    assert outcome(Cell(3, "none", "arbiter")).online.ate_mm == 2.0
+    assert outcome(Cell(3, "none", "gate")).online.ate_mm == 2.0
+    assert sum("_off_" in name for name in asked) == 2
+    assert file_name(Cell(3, "none", "gate")) != file_name(Cell(3, "none", "arbiter"))
+
+
+def test_several_at_once_are_all_off_and_have_one_file():
+    both = named("gate+robust_weight")
+    with both.off():
+        assert gating.robust_weight(1e3, 8) == 1.0
+        assert gating.chi2_bound(0.99, 2) == math.inf
+    name = file_name(Cell(3, "none", both.name))
+    assert "together" in name
+    assert name != file_name(Cell(3, "none", "gate+misread_ids"))
+
+
+def test_constants_are_counted_by_the_definition():
+    found = [(x.name, x.value) for x in in_source(SOURCE)]
+    assert found == [("(_FAR, _NEAR)", 3.5), ("_TABLE", 0.8), ("_TABLE", 0.1), ("_TABLE", -4.0), ("", 9.0), ("", 6.0)]
+    assert [(x.name, x.value) for x in in_sections(SECTIONS)] == [("GateConfig.a", 5.0), ("GateConfig.b", 0.05)]
+    assert len(lines()) + 1 == len(constants())
+    assert {row.id for row in mechanisms.counted()} == {f"mechanisms.{x}" for x in ("kept", "constants", "lines")}
+
+
+def test_a_change_counts_where_it_is_large_enough():
+    def worse(off, on):
+        return {c.what for c in changes("none", [(off, on)]) if c.counts and c.size > 0.0}
+
+    def better(off, on):
+        return {c.what for c in changes("none", [(off, on)]) if c.counts and c.size < 0.0}
+
+    assert worse(result(1.04), result()) == set()
+    assert worse(result(1.06), result()) == {"online.ate"} == better(result(), result(1.06))
+    assert worse(result(batch=2.0), result(batch=1.0)) == {"batch.ate"}
+    assert worse(result(nees=1.4), result(nees=0.7)) == set()
+    assert worse(result(nees=1.6), result()) == {"online.nees"} == worse(result(nees=0.5), result())
+    assert better(result(nees=2.0), result(nees=4.0)) == {"online.nees"}
+    assert worse(result(wrong_names=1), result()) == {"names"} == better(result(), result(missed_names=1))
+    assert worse(Outcome(failed="lost"), result()) == {"failed"}
+    assert worse(replace(result(), poses=90), result()) == {"poses"}
+    assert outside(1.0) == 0.0
+    assert outside(2.8) == pytest.approx(math.log(2.0))
+
+
+def test_rows_are_ratios_of_means_and_those_without_value_say_why():
+    off, on = [result(4.0), result(2.0)], [result(1.0), result(2.0)]
+    assert ratio("a", off, on, "online", "ate_mm") == Row("a", 2.0, 1.5, 2)
+    row = ratio("a", [Outcome(failed="lost"), result()], on, "online", "ate_mm")
+    assert row.value is None
+    assert "lost" in row.reason
+    assert over_before("b", Row("none.online.ate_mm", 3.0, 1.0, 2), {"none.online.ate_mm": 2.0}) == Row(
+        "b", 1.5, 0.5, 2
+    )
+    assert over_before("b", Row("none.online.ate_mm", 3.0), {}).value is None
+
+
+def test_the_table_is_well_formed_and_names_what_has_no_effect():
+    chosen = scope("gate", "robust_weight", "misread_ids")
+    on = result(batch=1.0, acted={"gate": 1}, delays_s=(0.2,), found_m=(0.05,), missed_m=(0.04, 0.01), path_m=500.0)
+    found = found_in(chosen, on, result(batch=1.0))
+    rows = [w.row(w.id, found) for w in wanted(chosen) if w.cells]
+    assert len({row.id for row in rows}) == len(rows)
+    values = {row.id: row.value for row in rows}
+    assert values["off.gate.slip.online.ate_ratio"] == 1.0
+    assert values["motion.recall_3cm"] == 0.5
+    assert values["motion.false_per_km"] == 0.0
+    assert values["none.batch.nees_over_3"] == 1.0
+    assert values["kidnap.nees_while_lifted"] is None
+    assert without_effect(chosen, found) == ["gate", "robust_weight", "misread_ids"]
+    found = found_in(chosen, on, result(1.2, batch=0.5))
+    assert without_effect(chosen, found) == []
+    assert "none.online.ate: 1 -> 1.2" in report(chosen, found)
+    assert Outcome.from_json(asdict(on)) == on
+
+
+def test_the_command_line_chooses_split_seeds_and_rows():
+    options, listing, rest = mechanisms.parsed(["--split", "validation", "--rows", "off.gate.,motion.", "--quick"])
+    assert (options.split, listing, rest) == ("validation", False, ["--quick"])
+    assert options.wants("motion.delay_s")
+    assert not options.wants("off.gate_keeper.none")
+    assert mechanisms.scope(False, options).seeds == (41, 42, 43)
+    assert mechanisms.scope(False, replace(options, seeds=2)).seeds == (41, 42)
+    assert mechanisms.parsed(["--together", "gate,arbiter"])[0].together == ("gate", "arbiter")
+    with pytest.raises(SystemExit):
+        mechanisms.parsed(["--together", "gates"])
+    quick = mechanisms.scope(True, options)
+    assert (quick.seeds, quick.cases) == ((41,), mechanisms.QUICK_CASES)
