@@ -23,7 +23,7 @@ _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this w
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
-_LEARNED_IN_SLIP = 4.0  # on its covariance: over 1 s squared errors are 2 to 5 times it (benchmarks.installed, slip)
+_LEARNED_ALONE = 4.0  # on its covariance beside wrong wheels: over 1 s of a slip squared errors are 2 to 5 times it
 
 
 _OF_MOTION = (
@@ -185,7 +185,7 @@ class MotionSources:
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
             scale: on the wheels' covariance, as they and their witness disagree (`SourceTrust`); on that of the learned
-                motion up to what it is worth in a slip.
+                motion up to what it is worth beside wrong wheels.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
@@ -194,8 +194,7 @@ class MotionSources:
         if learned is None or "learned" in off:
             learned = None
         else:
-            slips = off.get("wheels") == "slip"
-            learned = worsened(learned, _LEARNED_IN_SLIP if slips else min(scale, _LEARNED_IN_SLIP))
+            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else min(scale, _LEARNED_ALONE))
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
         if wheels is not None and "wheels" in off:
