@@ -37,9 +37,7 @@ DECIDING = (
             "joint",
             "moved_landmark_glr",
             "moved_landmark_votes",
-            "outage_inflation",
             "pose_fit",
-            "slip_noise",
         )
     ),
 )

@@ -221,14 +221,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         batch=True,
     ),
     Mechanism(
-        "batch_room_removed",
-        "Batch: slip noise of camera outages is taken out again.",
-        ("smoothing.py",),
-        (Switch("fgloc.smoothing:take_room_back", Returns(None)),),
-        Probe("fgloc.smoothing:take_room_back", called),
-        batch=True,
-    ),
-    Mechanism(
         "batch_learned_again",
         "Batch: the learned motion is evaluated again at the smoothed velocities.",
         ("smoothing.py",),

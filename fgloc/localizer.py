@@ -238,7 +238,6 @@ class Localizer:
             self._whereabouts.fixed()
         fix = belief if believed else None
         self.sources.went(readings, fix)
-        self.trust.hear(readings, fix)
         if accused:  # the pose was corrected: no motion leads from where it was thought to be
             self.sources.begin_segment()
             self.trust.reset()
@@ -266,21 +265,21 @@ class Localizer:
     def _revise(self, k: int, trust: Trust) -> list[Decision]:
         """Weigh the motion of the steps before this one anew, back to where the disagreement began.
 
-        A source that is not believed any more is taken out; where neither is accused their covariances are scaled.
+        Wheels that are wrong are left out; before that is certain, covariances are scaled.
         """
         log = self.estimator.log.keyframes
         changed, decisions = {}, []
         frames = (log[i] for i in range(k - trust.span + 1, k) if i in log)
         for frame in (f for f in frames if f.prior is None):
-            if trust.accused and trust.accused not in frame.off:
-                frame.off = {**frame.off, trust.accused: trust.off[trust.accused]}
-            elif not trust.accused and trust.scale >= _WORTH_A_REVISION * frame.scale:
+            if "wheels" in trust.off and "wheels" not in frame.off:
+                frame.off = {**frame.off, "wheels": trust.off["wheels"]}
+            elif "wheels" not in trust.off and trust.scale >= _WORTH_A_REVISION * frame.scale:
                 frame.scale = trust.scale
             else:
                 continue
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
-                if trust.accused:
+                if frame.off:
                     decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")
         self.estimator.revise(changed)
         return decisions

@@ -146,7 +146,7 @@ def test_signatures_follow_what_a_switch_does():
 
 
 def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
-    on = result(acted={"misread_ids": 0, "arbiter": 3})
+    on = result(acted={"misread_ids": 0, "doubtful_wheels": 3})
     asked = []
 
     def kept(name, make):
@@ -155,10 +155,10 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
 
     monkeypatch.setattr("benchmarks.mechanisms_runs.kept", kept)
     assert outcome(Cell(3, "none", "misread_ids")) == on
-    assert outcome(Cell(3, "none", "arbiter")).online.ate_mm == 2.0
+    assert outcome(Cell(3, "none", "doubtful_wheels")).online.ate_mm == 2.0
     assert outcome(Cell(3, "none", "gate")).online.ate_mm == 2.0
     assert sum("_off_" in name for name in asked) == 2
-    assert file_name(Cell(3, "none", "gate")) != file_name(Cell(3, "none", "arbiter"))
+    assert file_name(Cell(3, "none", "gate")) != file_name(Cell(3, "none", "doubtful_wheels"))
 
 
 def test_several_at_once_are_all_off_and_have_one_file():
@@ -237,7 +237,7 @@ def test_the_command_line_chooses_split_seeds_and_rows():
     assert not options.wants("off.gate_keeper.none")
     assert mechanisms.scope(False, options).seeds == (41, 42, 43)
     assert mechanisms.scope(False, replace(options, seeds=2)).seeds == (41, 42)
-    assert mechanisms.parsed(["--together", "gate,arbiter"])[0].together == ("gate", "arbiter")
+    assert mechanisms.parsed(["--together", "gate,doubtful_wheels"])[0].together == ("gate", "doubtful_wheels")
     with pytest.raises(SystemExit):
         mechanisms.parsed(["--together", "gates"])
     quick = mechanisms.scope(True, options)

@@ -96,22 +96,6 @@ def test_fault_31_a_stuck_or_slipping_wheel_in_the_dark(tmp_path, tell, reason, 
     assert "1 time(s)" in note
 
 
-def test_a_model_of_another_robot_does_not_overrule_sound_wheels(tmp_path):
-    world = World(room(), seconds=24.0, blind=((14.0, 20.0),))
-    other = Kinematics(scale_v=0.5, scale_omega=1.4)
-    events = failing(world, lambda left, right: (left, right), "learned")
-    judged = chain(tmp_path, "learned", kinematics=other)
-    estimates = judged.run(events)
-    accused = [d for e in estimates for d in e.decisions if d.reason == "contradicted"]
-    assert {d.kind for d in accused} == {"learned"}
-    assert min((d.stamp_ns - START_NS) * 1e-9 for d in accused) < 5.0
-    in_the_dark_s = [e for e in estimates if 14.0 < seconds(e) < 20.0]
-    assert max(position_error(e, world.truth(e.stamp_ns)) for e in in_the_dark_s) < 0.2
-    assert any("is the model this robot's?" in note for note in judged.localizer.notes)
-    assert judged.localizer.trust.flags["learned.contradicted"] == 1  # not each time that the two part again
-    assert all(d.weight == 0.0 for e in estimates[-50:] for d in e.decisions if d.kind == "learned")
-
-
 def test_fault_31_the_gyro_witnesses_a_wheel_that_stands_still(tmp_path):
     world = World(room(), seconds=14.0, blind=DARK)
     events = failing(world, lambda left, right: (0.0, right), "gyro")

@@ -10,16 +10,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgloc.config import WeightsConfig
-from fgloc.faults.fault_isolation import Arbiter
 from fgloc.faults.glr_test import Disagreement
 from fgloc.fusion.motion import MotionSources
-from fgloc.graph.measurement_log import Belief
 from fgloc.types import FloatArray, Readings, Step
 
 _MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
 _LEAST_M = 0.03  # of a wheel's travel: less says nothing
 _EVIDENCE_S = 1.0  # of travel from which a kind of failure is told
-_PROBATION_S = 20.0  # a model that sightings contradicted is believed again when it has agreed for this long
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +25,12 @@ class Trust:
 
     Attributes:
         off: source -> why it is not believed.
-        accused: the source, of the two that were compared, that is thought to be wrong; "": neither.
         span: for how many of the newest steps, this one included, that or the scale holds.
         nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
         scale: on their covariances where neither is left out.
     """
 
     off: Mapping[str, str] = field(default_factory=dict)
-    accused: str = ""
     span: int = 1
     nis: float = math.nan
     scale: float = 1.0
@@ -61,12 +56,9 @@ class SourceTrust:
         self._sources = sources
         self._track_m = track_m
         self._disagreement = Disagreement(config)
-        self._arbiter = Arbiter()
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
         self._first_ns: int | None = None  # of the run
         self._reason = "slip"
-        self._unwitnessed_s = 0.0
-        self._probation_s = 0.0  # that the witness has still to stand
 
     def begin(self, step: Step) -> None:
         """The first step of the run, or of a segment."""
@@ -77,7 +69,6 @@ class SourceTrust:
     def reset(self) -> None:
         """Nothing connects what comes with what was."""
         self._disagreement.reset()
-        self._arbiter.reset()
         self._travels.clear()
 
     def judge(self, step: Step, readings: Readings) -> Trust:
@@ -88,21 +79,13 @@ class SourceTrust:
         readings = replace(readings, **dict.fromkeys(off))
         difference = self._sources.disagreement(readings) if self._config.adaptive else None
         if difference is None:
-            return self._unwitnessed(step.dt, readings, off)
-        self._unwitnessed_s = 0.0
+            return Trust(off)
         verdict = self._disagreement.judge(
             step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
         )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
-            self._arbiter.reset()
-            self._probation_s = max(self._probation_s - step.dt, 0.0)
-            contradicted = {"learned": "contradicted"} if self._probation_s else {}
-            return Trust(off | contradicted, "", verdict.span, verdict.nis, verdict.scale)
-        if self._arbiter.sides_with_wheels and readings.learned is not None:
-            self.flags["learned.contradicted"] += not self._probation_s
-            self._probation_s = _PROBATION_S
-            return Trust({"learned": "contradicted", **off}, "learned", max(verdict.since, 1), verdict.nis)
+            return Trust(off, verdict.span, verdict.nis, verdict.scale)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -111,22 +94,7 @@ class SourceTrust:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return Trust({"wheels": reason, **off}, "wheels", max(verdict.since, 1), verdict.nis)
-
-    def hear(self, readings: Readings, fix: Belief | None) -> None:
-        """Where the step led, if sightings have told it: while sources disagree, that says which of them is wrong."""
-        if self._disagreement.flagged:
-            self._arbiter.hear(readings, fix)
-
-    def _unwitnessed(self, dt: float, readings: Readings, off: Mapping[str, str]) -> Trust:
-        """Nothing to compare the wheels with: what was thought of them a moment ago holds for a while."""
-        if readings.wheels is None or not self._disagreement.flagged:
-            return Trust(off)
-        self._unwitnessed_s += dt
-        if self._unwitnessed_s > self._config.window_s:
-            self.reset()
-            return Trust(off)
-        return Trust({"wheels": self._reason, **off})
+        return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9

@@ -16,7 +16,6 @@ _REASONS = {
     "frozen": "they stood still while the robot moved",
     "left_wheel_dead": "the left wheel's encoder stood still",
     "right_wheel_dead": "the right wheel's encoder stood still",
-    "contradicted": "sightings contradicted it; is the model this robot's?",
 }
 
 

@@ -18,7 +18,6 @@ _STILL_RATE = 0.03  # rad/s on top of what the bias may be: a robot that turns f
 _STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
 _GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
 _APART_S = 2.0  # ... and another one after at least this long
-_ALARM = 16.0  # squared sigmas
 _REST_M, _REST_RAD = 1e-3, 1e-3  # of wheel motion a second: quantization is no motion
 
 
@@ -136,9 +135,6 @@ class Gyro:
             self._learn(rate, self._config.yaw_per_sqrt_s**2 / dt + _STILL_SIGMA**2)
 
     def _learn(self, bias: float, variance: float) -> None:
-        if (bias - self.bias) ** 2 > _ALARM * (self.bias_variance + variance):  # a wrong fix, or a bias that jumped:
-            self.bias_variance *= 2.0  # the next ones will tell
-            return
         gain = self.bias_variance / (self.bias_variance + variance)
         change = gain * (bias - self.bias)
         self.bias += change
