@@ -305,8 +305,8 @@ class Localizer:
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._whereabouts.mode
-        frame.clock_cov = self._by_clock(step)
-        cov = se2.rotate_cov(belief.cov + frame.clock_cov, float(belief.pose[2]))
+        frame.told_cov = self._by_clock(step) + self._whereabouts.carried_cov(self.weights.contradicting, belief)
+        cov = se2.rotate_cov(belief.cov + frame.told_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
 
     def _by_clock(self, step: Step) -> FloatArray:

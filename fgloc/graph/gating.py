@@ -279,6 +279,11 @@ class Weights:
         scale = max(1.0, correlation_s / apart)
         return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
 
+    @property
+    def contradicting(self) -> int:
+        """How many landmarks were refused since one was believed."""
+        return len(self._refused_ids)
+
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
