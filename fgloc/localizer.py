@@ -273,7 +273,7 @@ class Localizer:
         for frame in (f for f in frames if f.prior is None):
             if "wheels" in trust.off and "wheels" not in frame.off:
                 frame.off = {**frame.off, "wheels": trust.off["wheels"]}
-            elif "wheels" not in trust.off and trust.scale >= _WORTH_A_REVISION * frame.scale:
+            elif "wheels" not in trust.off and trust.scale >= _WORTH_A_REVISION * max(frame.scale, 1.0):
                 frame.scale = trust.scale
             else:
                 continue

@@ -29,7 +29,7 @@ class Verdict:
             spans; else 0.
         nis: largest NIS of any window that ends with this step, over what is usual.
         span: the number of that window's steps.
-        scale: on the covariances of what is compared, where they disagree more than is expected.
+        scale: on the covariances of what is compared: how large differences are by the least likely window, or usually.
     """
 
     flagged: bool
@@ -94,7 +94,7 @@ class Disagreement:
         nis /= self._level
         if not self.flagged:
             if nis <= self._config.alarm:
-                return Verdict(False, 0, nis, span, max(1.0, nis / _DOF))
+                return Verdict(False, 0, nis, span, max(self._level, nis / _DOF))
             self.flagged, self._calm_s = True, 0.0
             return Verdict(True, span, nis, span)
         self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0

@@ -184,8 +184,8 @@ class MotionSources:
             readings: what the sources say.
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
-            scale: on the wheels' covariance, as they and their witness disagree (`SourceTrust`); on that of the learned
-                motion up to what it is worth beside wrong wheels.
+            scale: on the wheels' covariance, as they and their witness differ (`SourceTrust`); above 1 on that of the
+                learned motion, too, up to what it is worth beside wrong wheels.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
@@ -194,7 +194,7 @@ class MotionSources:
         if learned is None or "learned" in off:
             learned = None
         else:
-            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else min(scale, _LEARNED_ALONE))
+            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else min(max(scale, 1.0), _LEARNED_ALONE))
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
         if wheels is not None and "wheels" in off:
