@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 from tqdm import tqdm
 
-from fgloc.types import Mode
+from fgloc.types import Mode, RunResult
 
 if TYPE_CHECKING:
     from fgloc.runner import Progress
@@ -23,6 +23,11 @@ EXIT_LOST = 3
 def typed() -> str:
     """The command as the user typed it."""
     return shlex.join(["fgloc", *sys.argv[1:]])
+
+
+def exit_code(result: RunResult) -> int:
+    """0, or 3 if a part of the run is not to be trusted."""
+    return EXIT_LOST if Mode.LOST in result.modes or result.mistakes else 0
 
 
 def exit_if_lost(modes: Sequence[Mode]) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.collect import Spotter, WindowCutter
-from fgloc.diagnosis.hypotheses import explanation, pose_text
+from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
+from fgloc.diagnosis.pose_text import pose_text
 from fgloc.diagnosis.turning import GyroWitness, Turning
 from fgloc.diagnosis.upright import Tilt
 from fgloc.diagnosis.window import PRIOR_SIGMAS, PRIOR_SIGMAS_NO_MAP, Fault, Fit, Window, fit_window

@@ -1,0 +1,133 @@
+"""The check before a run: gross mistakes of map, camera, wheels, clocks and frames, each with the line that undoes it.
+
+A bounded excerpt of the recording is fitted with the set-up as given (`setup_fit`). Only where it does not fit as an
+ordinary installation would, every mistake of `setup_changes` is undone in turn and fitted too: the one with which the
+cost falls to that of a sound set-up is named. The likelihood ratio of the two set-ups is what makes it sure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc.config import Config, Role
+from fgloc.diagnosis.excerpt import Excerpt, Stretch
+from fgloc.diagnosis.setup_changes import Change, Correction, changes, correction, gross, refined
+from fgloc.diagnosis.setup_fit import Fit, Problem, Setup, tells_place
+from fgloc.types import Camera, FloatArray, LandmarkMap
+
+_SURE = 15.0  # log-likelihood ratio of a mistake: some five sigmas
+_STRAINED = 3.0  # sigmas of the prior: a parameter further off may stand in for a mistake
+_MOTION_DOF = 4.0  # of each pair of images: wheels 3, gyro 1
+_POOR = 3.0  # times the expected cost: a fit that is worse hides a mistake that is no small deviation
+_FEWEST = 20  # sightings
+_FIRST_LOOK, _FINALISTS = 3, 2  # iterations with every change; changes that are fitted to the end
+_LOOKED_AT = 2  # stretches that every change is first tried on
+_REFINED = 3  # times that what was found is taken in and fitted again
+_AGREE = 0.8  # share of the stretches in which the cost has to fall
+_SAME = 0.5  # by less the cost of a stretch that tells nothing may rise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """What the check found.
+
+    Attributes:
+        fit: of the set-up as given; None where nothing could be fitted.
+        correction: of the mistake; None if there is none, or none that is sure.
+        corrected: the fit without the mistake, or `fit`.
+        stretches: that were fitted.
+    """
+
+    fit: Fit | None
+    correction: Correction | None
+    corrected: Fit | None
+    stretches: Sequence[Stretch]
+
+
+def check_fit(
+    excerpt: Excerpt,
+    config: Config,
+    landmark_map: LandmarkMap,
+    camera: Camera,
+    imu_up: FloatArray | None,
+    image: Role,
+) -> Checked:
+    """Fit an excerpt with the set-up as given and, where that does not fit, with each mistake undone.
+
+    Args:
+        excerpt: of the recording.
+        config: as given; ``excerpt`` was read with it.
+        landmark_map: as given.
+        camera: as given.
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: there is no gyro.
+        image: role whose stamps the sightings have.
+    """
+    stretches = [s for s in excerpt.stretches(config, imu_up) if tells_place(s, landmark_map)]
+    setup = Setup(config, landmark_map, camera)
+    problem = Problem(stretches, setup, {}) if stretches else None
+    if problem is None or problem.sightings < _FEWEST:
+        return Checked(None, None, None, stretches)
+    fit = problem.solve()
+    expected = 0.5 * _MOTION_DOF * problem.pairs
+    poor = fit is None or fit.cost > _POOR * expected
+    if fit is not None and not poor and not _strained(fit):
+        return Checked(fit, None, fit, stretches)
+    has_gyro = any(s.gyro is not None for s in stretches)
+    tried = list(changes(setup, fit, excerpt.wheel_source, has_gyro))
+    last: list[Change] = []
+    if fit is not None:
+        small = [change for change in tried if change.setup is setup]
+        last = sorted(small, key=lambda change: -fit.gain(change.free))[:_FINALISTS]
+    if fit is None or poor:
+        last = [*last[:1], *[c for c in _looked_at(tried, stretches) if c not in last[:1]][:_FINALISTS]]
+    starts = None if fit is None or poor else fit.poses
+    ended = [_ended(change, stretches, starts) for change in last]
+    better = min((e for e in ended if e is not None), key=lambda e: e[1].cost, default=None)
+    if better is None or not gross(better[0], setup) or not _explains(fit, better[1], expected):
+        return Checked(fit, None, fit, stretches)
+    wheels: Role = "joints" if excerpt.wheel_source == "ticks" else "odometry"
+    said = correction(better[0], setup, excerpt.wheel_source, image, wheels)
+    return Checked(fit, said, better[1], stretches)
+
+
+def _looked_at(tried: Iterable[Change], stretches: Sequence[Stretch]) -> list[Change]:
+    """Changes in the order of their costs on the stretches with the most motion."""
+    some = sorted(stretches, key=lambda s: -float(np.abs(s.wheels).sum()))[:_LOOKED_AT]
+    looks = [(Problem(some, change.setup, change.free).solve(iterations=_FIRST_LOOK), change) for change in tried]
+    looks.sort(key=lambda look: math.inf if look[0] is None else look[0].cost)
+    return [change for _, change in looks]
+
+
+def _ended(
+    change: Change, stretches: Sequence[Stretch], poses: FloatArray | None
+) -> tuple[Change, Fit] | None:
+    """A change fitted to the end: what was found is taken in, as angles are linearized, and fitted again."""
+    last: Fit | None = None
+    for _ in range(_REFINED):
+        fit = Problem(stretches, change.setup, change.free).solve(poses)
+        if fit is None:
+            break
+        change, poses = refined(change, fit), fit.poses
+        done = last is not None and fit.cost > last.cost - _SAME
+        last = fit
+        if done or not change.linearized:
+            break
+    return None if last is None else (change, last)
+
+
+def _strained(fit: Fit) -> bool:
+    """Whether a parameter other than a marker's place is far from what was given."""
+    return any(abs(v) > _STRAINED * s for name, (v, s) in fit.values.items() if not name.startswith("map."))
+
+
+def _explains(fit: Fit | None, better: Fit, expected: float) -> bool:
+    """Whether a change surely makes a sound set-up, and so throughout the excerpt."""
+    if better.cost > _POOR * expected:
+        return False
+    if fit is None:
+        return True
+    return fit.cost - better.cost > _SURE and float(np.mean(better.costs < fit.costs + _SAME)) >= _AGREE
