@@ -172,7 +172,7 @@ MISTAKES: dict[str, Mistake] = {
     "camera_yaw_90": _mounted(0.0, 0.0, 90.0, r"camera.*right.*sightings_pose"),
     "camera_yaw_10": _mounted(0.0, 0.0, 10.0, r"camera.*right.*sightings_pose"),
     "camera_pitch_15": _mounted(0.0, 15.0, 0.0, r"camera.*sightings_pose"),
-    "joints_swapped": Mistake(r"left_joint: right_wheel_joint.*right_joint: left_wheel_joint", robot=_swap_joints),
+    "joints_swapped": Mistake(r"left_joint: left_wheel_joint.*right_joint: right_wheel_joint", robot=_swap_joints),
     "radius_1.1": _radius(1.1),
     "radius_2": _radius(2.0),
     "roll_over": Mistake(r"angle_range: (?P<value>[\d.]+)(?#6.28 6.29)", messages={"/joint_states": _roll_over}),
