@@ -3,11 +3,11 @@
 Each of `benchmarks.gross_recordings.MISTAKES` is made on three simulated recordings as installed, of a minute each, and
 `fgloc.runner.run` and `fgloc info` are asked about it.
 
-- ``gross.named``: share of mistakes that the first note of the run (or its error) names, with the line to be set within
-  2 to 25 % of the true value, and with an exit code other than 0. ``gross.info``: likewise of ``fgloc info``'s first line.
+- ``gross.named``: share of mistakes that the first note of the run (or its error) names, with the line to be set (its
+  value within 2 to 25 % of the true one) and an exit code other than 0. ``gross.info``: likewise of the first line that
+  ``fgloc info`` has to say.
 - ``gross.false``: sound runs of which a mistake is named: those without a mistake, and the bundled samples.
 - ``gross.seconds``: processor time of the run with the mistake over that of the sound run; largest and median.
-- ``gross.check_seconds``: share of a sound run's processor time that the check takes.
 """
 
 from __future__ import annotations
@@ -128,7 +128,11 @@ def _rows(sound: Sequence[Outcome], wrong: dict[str, list[Outcome]]) -> Iterator
 
 def _say(take: Take, name: str, o: Outcome, pattern: str = "") -> None:
     good = f"{names(pattern, o.first)!s:5} {names(pattern, o.info)!s:5}" if pattern else " " * 11
-    print(f"{take.seed} {name:20} {good} {o.code} {o.seconds:6.1f} s  {o.first}\n    {o.info}", file=sys.stderr, flush=True)
+    print(
+        f"{take.seed} {name:20} {good} {o.code} {o.seconds:6.1f} s  {o.first}\n    {o.info}",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

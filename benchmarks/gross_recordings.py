@@ -78,7 +78,7 @@ def _swap_joints(robot: Settings, start: tuple[float, float, float]) -> None:
 
 
 def _mirror(landmarks: Settings) -> None:
-    """y with the other sign; markers look along the mirrored direction, upright as before."""
+    """The sign of y changed; markers look along the mirrored direction, upright as before."""
     for landmark in landmarks["landmarks"]:
         x, y, z = landmark["position"]
         qx, qy, qz, qw = landmark.pop("quaternion")
@@ -166,7 +166,9 @@ MISTAKES: dict[str, Mistake] = {
     "info_scaled": Mistake(
         r"focal_scale: (?P<value>[\d.]+)(?#0.485 0.515)", messages={"/camera/camera_info": _double_k}
     ),
-    "info_distortion": Mistake(r"camera\.k1: (?P<value>-?[\d.]+)(?#-0.15 -0.09)", messages={_CAMERA[0]: _no_distortion}),
+    "info_distortion": Mistake(
+        r"camera\.k1: (?P<value>-?[\d.]+)(?#-0.15 -0.09)", messages={_CAMERA[0]: _no_distortion}
+    ),
     "camera_upside_down": _mounted(180.0, 0.0, 0.0, r"upside down.*sightings_pose"),
     "camera_quarter_roll": _mounted(90.0, 0.0, 0.0, r"camera.*viewing axis.*sightings_pose"),
     "camera_yaw_90": _mounted(0.0, 0.0, 90.0, r"camera.*right.*sightings_pose"),

@@ -150,7 +150,12 @@ def run(
     if check and not wrong.sentences and on_step is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
-    notes = (*wrong.sentences, *(() if tried is None else tried[:1]), *notes, *contradictions(found if tried is None else tried[1]))
+    notes = (
+        *wrong.notes,
+        *(() if tried is None else tried[:1]),
+        *notes,
+        *contradictions(found if tried is None else tried[1]),
+    )
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),

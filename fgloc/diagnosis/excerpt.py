@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -72,17 +72,13 @@ class Excerpt:
 
     Attributes:
         pictures: by stretch.
-        images: how many images were searched for markers.
         motion: odometry, joints and commands in order of receipt.
-        imu: ``(k, 2)`` stamp [ns] and yaw rate [rad/s].
-        truth: likewise ``(k, 4)`` stamp [ns], x, y, yaw.
+        imu, truth: likewise.
         delays: received minus stamped [s] by role.
         wheel_source: as `WheelMotion` has it, once stretches were made.
-        first_ns: stamp of the first motion event.
     """
 
     pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
-    images: int = 0
     motion: list[Event] = field(default_factory=list)
     imu: list[ImuEvent] = field(default_factory=list)
     truth: list[TruthEvent] = field(default_factory=list)
@@ -131,7 +127,6 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         last_image = event.stamp_ns
         seen = _corners(event, detector)
         if seen is not None:
-            found.images += 1
             found.pictures[int(which)].append(Picture(event.stamp_ns, seen))
     return found
 
@@ -157,9 +152,7 @@ def _corners(event: ImageEvent | CornersEvent, detector: Detector | None) -> tup
         return None
 
 
-def _stretch(
-    excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: FloatArray | None
-) -> Stretch | None:
+def _stretch(excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: FloatArray | None) -> Stretch | None:
     """One stretch; None where the motion is not known throughout."""
     start_ns = pictures[0].stamp_ns - round(MARGIN_S * 1e9)
     count = int((pictures[-1].stamp_ns - start_ns) * 1e-9 / GRID_S + MARGIN_S / GRID_S) + 1
@@ -177,22 +170,22 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     reach = 1_000_000_000
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
-    step = Step(0, 0, int(grid[0]), int(grid[-1]), **_by_kind(iter(events)))
+    step = Step(
+        0,
+        0,
+        int(grid[0]),
+        int(grid[-1]),
+        odometry=tuple(e for e in events if isinstance(e, OdometryEvent)),
+        commands=tuple(e for e in events if isinstance(e, CommandEvent)),
+        joints=tuple(e for e in events if isinstance(e, JointsEvent)),
+    )
     wheels = WheelMotion(config.wheels)
     wheels.measure(step)
     if not wheels.source:
         return None
     excerpt.wheel_source = wheels.source
-    motions = [wheels.carry(step, int(a), int(b))[0] for a, b in zip(grid[:-1], grid[1:], strict=True)]
+    motions = [wheels.carry(step, a, b)[0] for a, b in pairwise(grid.tolist())]
     return np.array([se2.log(m) for m in motions])
-
-
-def _by_kind(events: Iterator[Event]) -> Mapping[str, tuple[Event, ...]]:
-    kinds: dict[str, list[Event]] = {"odometry": [], "joints": [], "commands": []}
-    names = {OdometryEvent: "odometry", JointsEvent: "joints", CommandEvent: "commands"}
-    for event in events:
-        kinds[names[type(event)]].append(event)
-    return {name: tuple(found) for name, found in kinds.items()}
 
 
 def _gyro_increments(imu: list[ImuEvent], up: FloatArray, grid: IntArray) -> FloatArray | None:

@@ -37,14 +37,12 @@ def first_pose_sentence(config: Config, started: FloatArray) -> str | None:
     return (
         f"By the map and the sightings the run began at x {x:.2f} m, y {y:.2f} m, yaw {yaw:.2f} rad, but "
         f"estimator.initial_pose says {given[0]:.2f}, {given[1]:.2f}, {given[2]:.2f}: the map is shifted by "
-        f"{math.hypot(*apart[:2]):.2f} m and {math.degrees(abs(apart[2])):.0f}°, or the pose is wrong; shift the map or "
-        f"set estimator.initial_pose: [{x:.3f}, {y:.3f}, {yaw:.4f}]."
+        f"{math.hypot(*apart[:2]):.2f} m and {math.degrees(abs(apart[2])):.0f}°, or the pose is wrong; shift the map "
+        f"or set estimator.initial_pose: [{x:.3f}, {y:.3f}, {yaw:.4f}]."
     )
 
 
-def truth_sentence(
-    config: Config, truth: Sequence[TruthEvent], stamps_ns: IntArray, poses: FloatArray
-) -> str | None:
+def truth_sentence(config: Config, truth: Sequence[TruthEvent], stamps_ns: IntArray, poses: FloatArray) -> str | None:
     """The sentence on a truth in another frame than the map's; None if it is in the map's, or fits neither way.
 
     Args:

@@ -36,12 +36,20 @@ class Mistakes:
         config: with the mistakes undone.
         landmark_map: likewise; None: the file is taken as it is.
         detections: of the images that were searched.
+        undone: whether ``config`` and ``landmark_map`` are not as they were given.
     """
 
     sentences: tuple[str, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
     detections: Mapping[tuple[int, int], Detections] = field(default_factory=dict)
+    undone: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences, and that the run did not follow the settings as given."""
+        said = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
+        return (*self.sentences, *said)
 
 
 def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:
@@ -57,7 +65,8 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     """
     found = _Search(path, map_path, config)
     found.run()
-    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, found.detections)
+    undone = found.config != config or found.landmark_map is not None
+    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, found.detections, undone)
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
@@ -106,8 +115,8 @@ class _Search:
             rolled = roll_over(excerpt.motion, self.config)
             if rolled is not None:
                 self.sentences.append(
-                    f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in the first minute): set "
-                    f"wheels.angle_range: {rolled[0]:.4f}."
+                    f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
+                    f"set wheels.angle_range: {rolled[0]:.4f}."
                 )
                 self._change("wheels", angle_range=rolled[0])
             if parts.landmark_map is None:

@@ -12,7 +12,7 @@ OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 
 def sensor_pose(T: FloatArray, optical: bool) -> tuple[float, float, float, float, float, float]:
-    """x, y, z [m], roll, pitch, yaw [rad] of a sensor at ``T_base_sensor (4, 4)``; ``optical``: its z axis is forward."""
+    """x, y, z [m], roll, pitch, yaw [rad] of a sensor at ``T_base_sensor (4, 4)``; optical axes have z forward."""
     R = T[:3, :3] @ OPTICAL_TO_BODY.T if optical else T[:3, :3]
     roll, pitch = math.atan2(R[2, 1], R[2, 2]), math.asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
     x, y, z = T[:3, 3].tolist()

@@ -42,9 +42,7 @@ def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, Sequence[float]]
         f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
         for role, late in zip(roles, off, strict=True)
     )
-    return (
-        f"Some stamps are of another clock ({said}): set recording.received_stamps: [{', '.join([*given, *roles])}]."
-    )
+    return f"Some stamps are of another clock ({said}): set recording.received_stamps: [{', '.join([*given, *roles])}]."
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:

@@ -15,8 +15,9 @@ import numpy as np
 
 from fgloc.config import Config, Role
 from fgloc.diagnosis.excerpt import Excerpt, Stretch
-from fgloc.diagnosis.setup_changes import Change, Correction, changes, correction, gross, refined
+from fgloc.diagnosis.setup_changes import Change, changes, gross, refined
 from fgloc.diagnosis.setup_fit import Fit, Problem, Setup, tells_place
+from fgloc.diagnosis.setup_sentences import Correction, correction
 from fgloc.types import Camera, FloatArray, LandmarkMap
 
 _SURE = 15.0  # log-likelihood ratio of a mistake: some five sigmas
@@ -104,9 +105,7 @@ def _looked_at(tried: Iterable[Change], stretches: Sequence[Stretch]) -> list[Ch
     return [change for _, change in looks]
 
 
-def _ended(
-    change: Change, stretches: Sequence[Stretch], poses: FloatArray | None
-) -> tuple[Change, Fit] | None:
+def _ended(change: Change, stretches: Sequence[Stretch], poses: FloatArray | None) -> tuple[Change, Fit] | None:
     """A change fitted to the end: what was found is taken in, as angles are linearized, and fitted again."""
     last: Fit | None = None
     for _ in range(_REFINED):

@@ -13,26 +13,21 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.excerpt import GRID_S, Stretch
-from fgloc.diagnosis.window import rigid
-from fgloc.graph.installation import Installation, installation_of
+from fgloc.diagnosis.excerpt import Stretch
+from fgloc.diagnosis.setup_motion import EXTRAS, Motion, laid
+from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.graph.observation import CornerBatch
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap
 
-EXTRAS = ("size", "map_scale", "radius", "track", "yaw_per_m", "late_s", "gyro_late_s", "gyro_scale", "gyro_bias")
 _SIZE, _MAP = 0, 1
-_WHEELS = slice(2, 6)  # what the wheels' motion depends on
-_LATE, _GYRO_LATE, _GYRO_SCALE, _GYRO_BIAS = 5, 6, 7, 8
 _SIZE_SIGMA = 0.005  # share: prints are exact to a millimetre in 0.2 m
 _MAP_SIGMA = 1e-3  # share of all its distances
 _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise
-_WHEELS_FLOOR = np.array([0.001, 0.001, 0.001])  # m, m, rad: of the integration on a grid
-_GYRO_FLOOR_RAD = 0.0005
+_EXACT = 1e-6  # sigma of what is no unknown here
 _KERNEL = 9.0  # squared Cauchy constant, per degree of freedom
 _ITERATIONS = 12
-_NUDGE = 1e-6
 _FEWEST = 8  # sightings of a stretch
 _SPREAD_M = 0.4  # of the markers that they are of
 _LEAST_INFORMATION = 1e-9  # of a pose that nothing ties down
@@ -112,7 +107,7 @@ class Problem:
         self._frame: IntArray = np.array([i for i, _, _ in seen], dtype=np.int64)
         self._ids = [i for _, i, _ in seen]
         self._corners = [c for _, _, c in seen]
-        self._of_stretch = np.concatenate([np.full(len(s.pictures), k) for k, s in enumerate(stretches)])
+        self._motion = Motion(stretches, setup.turned, setup.config)
         held = LandmarkMap({i: known[i] for i in sorted(set(self._ids))}, setup.landmark_map.dictionary)
         self._held = held
         has_gyro = any(s.gyro is not None for s in stretches)
@@ -124,7 +119,6 @@ class Problem:
             CornerMeasurement(0, i, undistort_points(setup.camera, c), sigma, ideal)
             for i, c in zip(self._ids, self._corners, strict=True)
         ]
-        self._pairs = np.flatnonzero(np.diff(self._of_stretch) == 0)
 
     @property
     def sightings(self) -> int:
@@ -134,7 +128,7 @@ class Problem:
     @property
     def pairs(self) -> int:
         """How many pairs of images are tied by the motion between them."""
-        return len(self._pairs)
+        return len(self._motion.pairs)
 
     def solve(self, poses: FloatArray | None = None, iterations: int = _ITERATIONS) -> Fit | None:
         """Levenberg–Marquardt with Cauchy weights; None if the images do not tell where the robot was.
@@ -151,7 +145,9 @@ class Problem:
         state = self._linearized(poses, theta, extras)
         for _ in range(iterations):
             cost, A, b = state[0], state[1], state[2]
-            step = np.linalg.solve(A + np.diag(damping * np.diag(A) + _LEAST_INFORMATION), -b)
+            step = np.asarray(
+                np.linalg.solve(A + np.diag(damping * np.diag(A) + _LEAST_INFORMATION), -b), dtype=np.float64
+            )
             moved = self._moved(poses, theta, extras, step)
             trial = self._linearized(*moved)
             if trial[0] < cost:
@@ -171,13 +167,13 @@ class Problem:
         n, p = len(poses), len(theta)
         size = 3 * n + p + len(EXTRAS)
         A, b = np.zeros((size, size)), np.zeros(size)
-        by_stretch = np.zeros(len(self._stretches))
+        by_stretch, stretch_of = np.zeros(len(self._stretches)), self._motion.stretch_of
         # 1. Corners
         r, J, columns = self._corner_rows(poses, theta, extras)
-        squares = _add(A, b, r, J, columns, by_stretch, self._of_stretch[self._frame])
+        squares = _add(A, b, r, J, columns, by_stretch, stretch_of[self._frame])
         # 2. Wheels and gyro
-        for r, J, columns in self._motion_rows(poses, extras, 3 * n + p):
-            _add(A, b, r, J, columns, by_stretch, self._of_stretch[self._pairs])
+        for r, J, columns in self._motion.rows(poses, extras, 3 * n + p):
+            _add(A, b, r, J, columns, by_stretch, stretch_of[self._motion.pairs])
         # 3. Priors
         information = np.concatenate([self._installation.sigmas, self._sigmas]) ** -2.0
         x = np.concatenate([theta, extras])
@@ -202,85 +198,6 @@ class Problem:
         columns = np.concatenate([own, 3 * n + stack.columns, extra], axis=1)
         return np.clip(stack.residual, -1e4, 1e4), np.clip(J, -1e7, 1e7), columns
 
-    def _motion_rows(
-        self, poses: FloatArray, extras: FloatArray, first: int
-    ) -> list[tuple[FloatArray, FloatArray, IntArray]]:
-        i = self._pairs
-        a, c = poses[i], poses[i + 1]
-        cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
-        dx, dy = c[:, 0] - a[:, 0], c[:, 1] - a[:, 1]
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        turn = se2.wrap_array(c[:, 2] - a[:, 2])
-        went, sigmas, seconds = self._motions(extras)
-        r = np.column_stack([x, y, turn]) - went
-        r[:, 2] = se2.wrap_array(r[:, 2])
-        J = np.zeros((len(i), 3, 10))
-        J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
-        J[:, 0, 2], J[:, 1, 2] = y, -x
-        ct, st = np.cos(turn), np.sin(turn)
-        J[:, 0, 3], J[:, 0, 4], J[:, 1, 3], J[:, 1, 4], J[:, 2, 5] = ct, -st, st, ct, 1.0
-        for k in range(4):
-            nudged = extras.copy()
-            nudged[_WHEELS.start + k] += _NUDGE
-            J[:, :, 6 + k] = -(self._motions(nudged)[0] - went) / _NUDGE
-        ends = np.concatenate([3 * i[:, None] + np.arange(3), 3 * (i + 1)[:, None] + np.arange(3)], axis=1)
-        wheels = np.broadcast_to(first + np.arange(_WHEELS.start, _WHEELS.stop), (len(i), 4))
-        rows = [(r / sigmas, J / sigmas[:, :, None], np.concatenate([ends, wheels], axis=1))]
-        turned, by_late, has = self._turned(extras[_GYRO_LATE])
-        sigma = np.hypot(self._setup.config.gyro.yaw_per_sqrt_s * np.sqrt(seconds), _GYRO_FLOOR_RAD)
-        sigma = np.where(has, sigma, 1e9)
-        scale = 1.0 + extras[_GYRO_SCALE]
-        r = se2.wrap_array(turn - scale * turned + extras[_GYRO_BIAS] * seconds)
-        J = np.zeros((len(i), 1, 5))
-        J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3], J[:, 0, 4] = -1.0, 1.0, -scale * by_late, -turned, seconds
-        ends = np.column_stack([3 * i + 2, 3 * i + 5])
-        gyro = np.broadcast_to(first + np.array([_GYRO_LATE, _GYRO_SCALE, _GYRO_BIAS]), (len(i), 3))
-        rows.append(((r / sigma)[:, None], J / sigma[:, None, None], np.concatenate([ends, gyro], axis=1)))
-        return rows
-
-    def _motions(self, extras: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Wheel motion ``(k, 3)`` between images, its sigmas, and the time between them [s]."""
-        radius, track, pull, late = extras[_WHEELS]
-        noise = self._setup.config.wheels.noise
-        motions, sigmas, spans = [], [], []
-        for s in self._stretches:
-            steps = s.wheels @ self._setup.turned.T
-            forward = np.exp(radius) * steps[:, :2]
-            turns = np.exp(radius - track) * steps[:, 2] + pull * forward[:, 0]
-            at = s.times - late
-            x, y, yaw = (_at(at, v) for v in _path(forward, turns))
-            c, d = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-            ax, ay, turn = np.diff(x), np.diff(y), np.diff(yaw)
-            motions.append(np.column_stack([c * ax + d * ay, c * ay - d * ax, turn]))
-            dt = np.diff(s.times)
-            way = np.diff(_at(at, _summed(np.hypot(forward[:, 0], forward[:, 1]))))
-            bend = np.diff(_at(at, _summed(np.abs(turns))))
-            q = np.column_stack(
-                [
-                    noise.x_per_sqrt_m**2 * way + noise.xy_per_sqrt_rad**2 * bend + noise.xy_per_sqrt_s**2 * dt,
-                    noise.y_per_sqrt_m**2 * way + noise.xy_per_sqrt_rad**2 * bend + noise.xy_per_sqrt_s**2 * dt,
-                    noise.yaw_per_sqrt_m**2 * way + noise.yaw_per_sqrt_rad**2 * bend + noise.yaw_per_sqrt_s**2 * dt,
-                ]
-            )
-            sigmas.append(np.sqrt(q + _WHEELS_FLOOR**2))
-            spans.append(dt)
-        return np.concatenate(motions), np.concatenate(sigmas), np.concatenate(spans)
-
-    def _turned(self, late: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rotation by the gyro between images ``(k,)``, its derivative by the lateness, and where there is any."""
-        turned, slope, has = [], [], []
-        for s in self._stretches:
-            k = len(s.times) - 1
-            if s.gyro is None:
-                turned.append(np.zeros(k))
-                slope.append(np.zeros(k))
-            else:
-                angles, at = _summed(s.gyro), s.times - late
-                turned.append(np.diff(_at(at, angles)))
-                slope.append(-np.diff(_at(at, np.append(s.gyro, s.gyro[-1]) / GRID_S)))
-            has.append(np.full(k, s.gyro is not None))
-        return np.concatenate(turned), np.concatenate(slope), np.concatenate(has)
-
     def _start(self) -> FloatArray | None:
         """Poses ``(n, 3)``: each stretch of wheel motion laid rigidly onto the markers that it saw."""
         T, size = self._setup.camera.T_base_cam, np.exp(self._setup.extras[_SIZE])
@@ -290,22 +207,14 @@ class Problem:
             if found:
                 base[k] = (T[:3, :3] @ found[0][0][:3, 3] + T[:3, 3])[:2]
         places = np.array([self._held.landmarks[i].position[:2] for i in self._ids]).reshape(-1, 2)
-        radius, track, _, late = self._setup.extras[_WHEELS]
-        poses, first = [], 0
-        for s in self._stretches:
-            steps = s.wheels @ self._setup.turned.T
-            path = np.column_stack(
-                [
-                    _at(s.times - late, v)
-                    for v in _path(np.exp(radius) * steps[:, :2], np.exp(radius - track) * steps[:, 2])
-                ]
-            )
+        poses: list[FloatArray] = []
+        for k in range(len(self._stretches)):
+            path, first = self._motion.path(k, self._setup.extras), len(poses)
             own = np.isfinite(base[:, 0]) & (self._frame >= first) & (self._frame < first + len(path))
-            place = _laid(path[self._frame[own] - first], base[own], places[own])
+            place = laid(path[self._frame[own] - first], base[own], places[own])
             if place is None:
                 return None
             poses += [se2.compose(place, p) for p in path]
-            first += len(path)
         return np.array(poses)
 
     def _batch(self, size: float, scale: float) -> CornerBatch:
@@ -361,8 +270,9 @@ def _installation(config: Config, held: LandmarkMap, has_gyro: bool, free: Mappi
     """Camera and markers, without clocks and wheels, which `EXTRAS` holds."""
     plain = installation_of(config, held, corners=True, has_gyro=has_gyro, most=10_000, has_model=False)
     sigmas = dict(zip(plain.names, plain.sigmas.tolist(), strict=True))
-    kept = {n: free.get(n, s) for n, s in sigmas.items() if n.startswith(("camera.", "map."))}
-    return Installation(kept | {"camera.time_offset_s": 1e-9})
+    camera = {f"camera.{name}": sigmas.get(f"camera.{name}", _EXACT) for name in CAMERA}
+    markers = {n: s for n, s in sigmas.items() if n.startswith("map.")}
+    return Installation({n: free.get(n, s) for n, s in (camera | {"camera.time_offset_s": _EXACT} | markers).items()})
 
 
 def _extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
@@ -392,7 +302,7 @@ def _add(
     stretch: IntArray,
 ) -> FloatArray:
     """Add blocks of residuals ``(m, d)`` with Jacobians ``(m, d, c)`` and Cauchy weights; their squares ``(m,)``."""
-    squares = (r**2).sum(axis=1)
+    squares = np.asarray((r**2).sum(axis=1))
     bound = _KERNEL * r.shape[1]
     weights = 1.0 / (1.0 + squares / bound)
     np.add.at(costs, stretch, 0.5 * bound * np.log1p(squares / bound))
@@ -401,41 +311,3 @@ def _add(
     np.add.at(A, (columns[:, :, None], columns[:, None, :]), H)
     np.add.at(b, columns, np.einsum("mdi,md->mi", weighted, r))
     return squares
-
-
-def _summed(steps: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _path(forward: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Poses at the grid points from steps ``(g, 2)`` [m] and ``(g,)`` [rad]: x, y, yaw ``(g + 1,)``."""
-    yaw = _summed(turns)
-    middle = yaw[:-1] + 0.5 * turns
-    c, s = np.cos(middle), np.sin(middle)
-    x = _summed(c * forward[:, 0] - s * forward[:, 1])
-    return x, _summed(s * forward[:, 0] + c * forward[:, 1]), yaw
-
-
-def _at(times: FloatArray, values: FloatArray) -> FloatArray:
-    """Values of the grid points at some times [s]."""
-    return np.asarray(np.interp(times, np.arange(len(values)) * GRID_S, values))
-
-
-def _laid(path: FloatArray, seen: FloatArray, places: FloatArray) -> FloatArray | None:
-    """Pose ``(3,)`` of a path's start that brings what was seen from it onto the map; without the worst third."""
-    c, s = np.cos(path[:, 2]), np.sin(path[:, 2])
-    points = path[:, :2] + np.column_stack([c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] + c * seen[:, 1]])
-    weights = 1.0 / np.maximum((seen**2).sum(axis=1), 0.01)
-    place: FloatArray | None = None
-    for _ in range(3):
-        if len(points) < 4:
-            return None
-        place = rigid(points, places, weights)
-        if place is None:
-            return None
-        c0, s0 = np.cos(place[2]), np.sin(place[2])
-        off = points @ np.array([[c0, s0], [-s0, c0]]) + place[:2] - places
-        distance = np.hypot(off[:, 0], off[:, 1])
-        near = distance <= max(float(np.quantile(distance, 0.67)), 0.05)
-        points, places, weights = points[near], places[near], weights[near]
-    return place
