@@ -112,7 +112,7 @@ def run(
         hints = (*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing())
         untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
         if parts.detector is not None and not parts.localizer.counts["corners"]:
-            hints = (*image_hints(recording, parts.detector), *hints)
+            hints = (*image_hints(recording, parts.detector)[0], *hints)
         notes = (
             *hints,
             *recording.notes,

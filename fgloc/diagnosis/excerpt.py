@@ -36,7 +36,7 @@ PERIOD_S = 12.0  # from one stretch to the next
 MARGIN_S = 1.2  # wheels and gyro before and after the images, for clocks that differ
 GRID_S = 0.02
 _SPACING_S = 0.19  # images nearer to the one before are passed over
-_PATIENCE_S = 20.0  # further than this beyond the last stretch nothing is read
+_PATIENCE_S = 120.0  # so long an image is waited for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,11 +110,13 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
     last_image = 0
     end_ns: int | None = None
     for event in recording.events():
+        if end_ns is None:
+            end_ns = event.received_ns + round(_PATIENCE_S * 1e9)
+        if event.received_ns > end_ns:
+            break
         role = role_of.get(event.topic)
         if role is not None:
             found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
-        if end_ns is not None and event.received_ns > end_ns:
-            break
         if not isinstance(event, ImageEvent | CornersEvent):
             _take_motion(found, gate, event)
             continue
@@ -125,9 +127,12 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         if not (0 <= which < STRETCHES and within < STRETCH_S) or event.stamp_ns - last_image < _SPACING_S * 1e9:
             continue
         last_image = event.stamp_ns
-        seen = _corners(event, detector)
-        if seen is not None:
-            found.pictures[int(which)].append(Picture(event.stamp_ns, seen))
+        corners = _corners(event, detector)
+        passed = None if corners is None else gate.check(corners)
+        if isinstance(passed, CornersEvent):
+            found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
+        elif corners is not None:
+            found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
     return found
 
 
@@ -141,13 +146,13 @@ def _take_motion(found: Excerpt, gate: Gate, event: Event) -> None:
         found.truth.append(passed)
 
 
-def _corners(event: ImageEvent | CornersEvent, detector: Detector | None) -> tuple[MarkerCorners, ...] | None:
+def _corners(event: ImageEvent | CornersEvent, detector: Detector | None) -> CornersEvent | None:
     if isinstance(event, CornersEvent):
-        return event.sightings
+        return event
     if detector is None:
         return None
     try:
-        return detector.detect(event).sightings
+        return detector.detect(event)
     except ImageError:
         return None
 

@@ -13,7 +13,7 @@ from fgloc.assembly import Assembly, assemble, base_up
 from fgloc.config import Config, Role
 from fgloc.diagnosis.excerpt import GRID_S, Excerpt, read_excerpt, wheel_increments
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.image_checks import fitting_dictionary, image_hints
+from fgloc.diagnosis.image_checks import image_hints
 from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
 from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
@@ -97,11 +97,11 @@ class _Search:
 
     def run(self) -> None:
         """All checks, in the order in which one makes the next possible."""
-        if self._clocks():  # read anew with the other stamps
-            self._clocks()
+        if self._read_anew():
+            self._read_anew()
 
-    def _clocks(self) -> bool:
-        """The checks with the stamps as they are; whether they have to be corrected and all begun again."""
+    def _read_anew(self) -> bool:
+        """All checks with the stamps as they are; whether these were corrected and all has to begin again."""
         with open_recording(self._path, self.config.recording) as recording:
             parts = assemble(recording, self._map_path, self.config, keep_all=False)
             detector = None if parts.detector is None else NotedDetector(parts.detector, self.detections)
@@ -140,12 +140,11 @@ class _Search:
     def _images(self, recording: Recording, parts: Assembly) -> bool:
         """Say why no marker is found; whether another dictionary finds them."""
         assert parts.detector is not None
-        self.sentences += image_hints(recording, parts.detector)
-        fitting = fitting_dictionary(recording)
-        if not self.sentences or fitting is None or fitting == parts.detector.dictionary:
-            return False
-        self._change("markers", dictionary=fitting)
-        return True
+        hints, fitting = image_hints(recording, parts.detector)
+        self.sentences += hints
+        if fitting is not None:
+            self._change("markers", dictionary=fitting)
+        return fitting is not None
 
     def _fit(self, recording: Recording, excerpt: Excerpt, parts: Assembly) -> None:
         landmark_map, camera = parts.landmark_map, parts.camera

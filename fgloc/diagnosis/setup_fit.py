@@ -6,6 +6,7 @@ two set-ups can be compared by their costs. Poses of the images are free; wheels
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -13,17 +14,15 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.excerpt import Stretch
-from fgloc.diagnosis.setup_motion import EXTRAS, Motion, laid
+from fgloc.diagnosis.excerpt import Picture, Stretch
+from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
 from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.graph.observation import CornerBatch
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap
+from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap, MarkerCorners
 
 _SIZE, _MAP = 0, 1
-_SIZE_SIGMA = 0.005  # share: prints are exact to a millimetre in 0.2 m
-_MAP_SIGMA = 1e-3  # share of all its distances
 _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise
 _EXACT = 1e-6  # sigma of what is no unknown here
 _KERNEL = 9.0  # squared Cauchy constant, per degree of freedom
@@ -97,28 +96,26 @@ class Problem:
             free: prior sigmas, by name, that replace those of an ordinary installation.
         """
         self._stretches, self._setup = stretches, setup
-        known = setup.landmark_map.landmarks
-        seen = [
-            (i, m.marker_id, m.corners_px)
-            for i, p in enumerate(p for s in stretches for p in s.pictures)
-            for m in p.seen
-            if m.marker_id in known and known[m.marker_id].size_m > 0.0
-        ]
-        self._frame: IntArray = np.array([i for i, _, _ in seen], dtype=np.int64)
-        self._ids = [i for _, i, _ in seen]
-        self._corners = [c for _, _, c in seen]
-        self._motion = Motion(stretches, setup.turned, setup.config)
-        held = LandmarkMap({i: known[i] for i in sorted(set(self._ids))}, setup.landmark_map.dictionary)
-        self._held = held
-        has_gyro = any(s.gyro is not None for s in stretches)
-        self._installation = _installation(setup.config, held, has_gyro, free)
-        self._sigmas = np.array([free.get(n, s) for n, s in _extra_sigmas(setup.config, has_gyro).items()])
         ideal = pinhole(setup.camera)
         sigma = float(np.hypot(setup.config.markers.sigma_px, _SIGMA_PX))
-        self._measured = [
-            CornerMeasurement(0, i, undistort_points(setup.camera, c), sigma, ideal)
-            for i, c in zip(self._ids, self._corners, strict=True)
-        ]
+        self._motion = Motion(stretches, setup.turned, setup.config)
+        self._corners: list[FloatArray] = []
+        self._measured: list[CornerMeasurement] = []
+        frames = []
+        for i, picture in enumerate(p for s in stretches for p in s.pictures):
+            for m in usable(picture, setup.landmark_map):
+                corners = undistort_points(setup.camera, m.corners_px)
+                if np.isfinite(corners).all():
+                    frames.append(i)
+                    self._corners.append(m.corners_px)
+                    self._measured.append(CornerMeasurement(0, m.marker_id, corners, sigma, ideal))
+        self._frame: IntArray = np.array(frames, dtype=np.int64)
+        self._ids = [m.landmark_id for m in self._measured]
+        known = setup.landmark_map.landmarks
+        self._held = LandmarkMap({i: known[i] for i in sorted(set(self._ids))}, setup.landmark_map.dictionary)
+        has_gyro = any(s.gyro is not None for s in stretches)
+        self._installation = _installation(setup.config, self._held, has_gyro, free)
+        self._sigmas = np.array([free.get(n, s) for n, s in extra_sigmas(setup.config, has_gyro).items()])
 
     @property
     def sightings(self) -> int:
@@ -138,8 +135,12 @@ class Problem:
             iterations: at most so many.
         """
         poses = self._start() if poses is None else poses
-        if poses is None:
+        try:
+            return None if poses is None else self._descended(poses, iterations)
+        except np.linalg.LinAlgError:  # numbers beyond all bounds: such a set-up explains nothing
             return None
+
+    def _descended(self, poses: FloatArray, iterations: int) -> Fit:
         theta, extras = np.zeros(len(self._installation)), self._setup.extras.copy()
         damping = 1e-6
         state = self._linearized(poses, theta, extras)
@@ -257,12 +258,17 @@ class Problem:
         )
 
 
+def usable(picture: Picture, landmark_map: LandmarkMap) -> list[MarkerCorners]:
+    """Markers of the map that have a size and are seen once in an image."""
+    times = Counter(m.marker_id for m in picture.seen)
+    known = landmark_map.landmarks
+    return [m for m in picture.seen if times[m.marker_id] == 1 and m.marker_id in known and known[m.marker_id].size_m]
+
+
 def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
     """Whether the markers seen in a stretch are enough, and far enough apart, to tell where the robot was."""
-    known = landmark_map.landmarks
-    ids = [m.marker_id for p in stretch.pictures for m in p.seen if m.marker_id in known]
-    ids = [i for i in ids if known[i].size_m > 0.0]
-    places = np.array([known[i].position[:2] for i in ids]).reshape(-1, 2)
+    ids = [m.marker_id for p in stretch.pictures for m in usable(p, landmark_map)]
+    places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
     return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2
 
 
@@ -273,23 +279,6 @@ def _installation(config: Config, held: LandmarkMap, has_gyro: bool, free: Mappi
     camera = {f"camera.{name}": sigmas.get(f"camera.{name}", _EXACT) for name in CAMERA}
     markers = {n: s for n, s in sigmas.items() if n.startswith("map.")}
     return Installation({n: free.get(n, s) for n, s in (camera | {"camera.time_offset_s": _EXACT} | markers).items()})
-
-
-def _extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
-    wheels, camera = config.wheels, config.camera
-    late = float(np.hypot(camera.time_offset_sigma_s, wheels.time_offset_sigma_s))
-    sigmas = (
-        _SIZE_SIGMA,
-        _MAP_SIGMA,
-        max(wheels.scale_sigma, 1e-4),
-        max(wheels.turn_scale_sigma, 1e-4),
-        max(wheels.yaw_per_m_sigma, 1e-4),
-        late,
-        camera.time_offset_sigma_s,
-        config.gyro.scale_sigma if has_gyro else 1e-4,
-        config.gyro.bias_sigma if has_gyro else 1e-4,
-    )
-    return dict(zip(EXTRAS, sigmas, strict=True))
 
 
 def _add(

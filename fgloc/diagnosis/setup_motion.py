@@ -17,6 +17,9 @@ EXTRAS = ("size", "map_scale", "radius", "track", "yaw_per_m", "late_s", "gyro_l
 [rad/m]; how late the images' stamps are against wheels and gyro [s]; the gyro's scale and bias [rad/s]."""
 _WHEELS = slice(2, 6)  # what the wheels' motion depends on
 _GYRO_LATE, _GYRO_SCALE, _GYRO_BIAS = 6, 7, 8
+_SIZE_SIGMA = 0.005  # share: prints are exact to a millimetre in 0.2 m
+_MAP_SIGMA = 1e-3  # share of all its distances
+_HELD = 1e-4  # sigma of what is taken as exact
 _WHEELS_FLOOR = np.array([0.001, 0.001, 0.001])  # m, m, rad: of the integration on a grid
 _GYRO_FLOOR_RAD = 0.0005
 _NO_GYRO_RAD = 1e9  # sigma where there is none
@@ -137,6 +140,24 @@ class Motion:
                 slope.append(-np.diff(_at(at, np.append(s.gyro, s.gyro[-1]) / GRID_S)))
             has.append(np.full(k, s.gyro is not None))
         return np.concatenate(turned), np.concatenate(slope), np.concatenate(has)
+
+
+def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
+    """Prior sigmas of `EXTRAS` in an ordinary installation; what can be no unknown is held."""
+    wheels, camera = config.wheels, config.camera
+    late = float(np.hypot(camera.time_offset_sigma_s, wheels.time_offset_sigma_s))
+    sigmas = (
+        _SIZE_SIGMA,
+        _MAP_SIGMA,
+        max(wheels.scale_sigma, _HELD),
+        max(wheels.turn_scale_sigma, _HELD),
+        max(wheels.yaw_per_m_sigma, _HELD),
+        late,
+        camera.time_offset_sigma_s,
+        config.gyro.scale_sigma if has_gyro else _HELD,
+        config.gyro.bias_sigma if has_gyro else _HELD,
+    )
+    return dict(zip(EXTRAS, sigmas, strict=True))
 
 
 def laid(path: FloatArray, seen: FloatArray, places: FloatArray) -> FloatArray | None:

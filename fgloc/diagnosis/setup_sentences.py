@@ -16,6 +16,8 @@ from fgloc.diagnosis.setup_fit import Setup
 from fgloc.diagnosis.setup_motion import EXTRAS
 from fgloc.types import FloatArray, LandmarkMap
 
+_SAID_DEG = 1.0  # degrees: less is not put into words
+_LEVEL = 0.2  # horizontal part of a viewing axis: less looks straight up or down and has no roll
 _ABOUT_DEG = 20.0  # degrees within which a camera counts as upside down, or as looking backward
 
 
@@ -118,7 +120,7 @@ def _lens(change: Change, given: Setup) -> Correction:
     else:
         what = "has the wrong focal length"
     said = (
-        f"The camera's calibration {what}: {before.K[0, 0]:.1f} px is given and {after.K[0, 0]:.1f} px seen; {line}, or "
+        f"The camera's calibration {what}: {before.K[0, 0]:.1f} px given, {after.K[0, 0]:.1f} px seen; {line}, or "
         "better calibrate it."
     )
     return Correction(said, _set(given.config, "camera", **values), given.landmark_map)
@@ -137,30 +139,29 @@ def _mounting(change: Change, given: Setup) -> Correction:
 
 
 def _turned(before: FloatArray, after: FloatArray) -> str:
-    """How a camera looks, against its transform."""
-    ahead = after[:3, 2]
-    flat = math.hypot(ahead[0], ahead[1]) > 0.2 and math.hypot(before[0, 2], before[1, 2]) > 0.2
-    if not flat:
-        angle = math.degrees(angle_of(before[:3, :3].T @ after[:3, :3]))
-        return f"is turned by {angle:.0f}° against its transform"
-    yaw = math.degrees(
-        math.remainder(
-            math.atan2(ahead[1], ahead[0]) - math.atan2(before[1, 2], before[0, 2]),
-            2.0 * math.pi,
-        )
-    )
-    pitch = math.degrees(math.asin(float(np.clip(ahead[2], -1, 1))) - math.asin(float(np.clip(before[2, 2], -1, 1))))
-    roll = math.degrees(math.remainder(_roll(after) - _roll(before), 2.0 * math.pi))
-    said = []
-    if abs(roll) > 1.0:
+    """How a camera at ``after (4, 4)`` is turned against its transform ``before (4, 4)``, in words."""
+    ahead, given = after[:3, 2], before[:3, 2]
+    if min(math.hypot(ahead[0], ahead[1]), math.hypot(given[0], given[1])) < _LEVEL:
+        return f"is turned by {math.degrees(angle_of(before[:3, :3].T @ after[:3, :3])):.0f}° against its transform"
+    yaw = _degrees(math.atan2(ahead[1], ahead[0]) - math.atan2(given[1], given[0]))
+    pitch = _degrees(math.asin(float(np.clip(ahead[2], -1, 1))) - math.asin(float(np.clip(given[2], -1, 1))))
+    roll = _degrees(_roll(after) - _roll(before))
+    turned, looks = [], []
+    if abs(roll) > _SAID_DEG:
         down = abs(abs(roll) - 180.0) < _ABOUT_DEG
-        said.append("is mounted upside down" if down else f"is turned by {abs(roll):.0f}° about its viewing axis")
-    if abs(yaw) > 1.0:
-        side = f"{abs(yaw):.1f}° further {'left' if yaw > 0 else 'right'}"
-        said.append(f"looks {'backward' if abs(abs(yaw) - 180.0) < _ABOUT_DEG else side}")
-    if abs(pitch) > 1.0:
-        said.append(f"looks {abs(pitch):.1f}° further {'up' if pitch > 0 else 'down'}")
-    return f"{' and '.join(said) or 'is turned'} against its transform"
+        turned.append("is mounted upside down" if down else f"is turned by {abs(roll):.0f}° about its viewing axis")
+    if abs(abs(yaw) - 180.0) < _ABOUT_DEG:
+        turned.append("looks backward")
+    elif abs(yaw) > _SAID_DEG:
+        looks.append(f"{abs(yaw):.1f}° further {'left' if yaw > 0 else 'right'}")
+    if abs(pitch) > _SAID_DEG:
+        looks.append(f"{abs(pitch):.1f}° further {'up' if pitch > 0 else 'down'}")
+    said = [f"{' and '.join(turned)} against its transform"] if turned else []
+    return " and ".join([*said, *([f"looks {' and '.join(looks)} than its transform says"] if looks else [])])
+
+
+def _degrees(angle: float) -> float:
+    return math.degrees(math.remainder(angle, 2.0 * math.pi))
 
 
 def _roll(T: FloatArray) -> float:
