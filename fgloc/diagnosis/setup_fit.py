@@ -111,8 +111,7 @@ class Problem:
                     self._measured.append(CornerMeasurement(0, m.marker_id, corners, sigma, ideal))
         self._frame: IntArray = np.array(frames, dtype=np.int64)
         self._ids = [m.landmark_id for m in self._measured]
-        known = setup.landmark_map.landmarks
-        self._held = LandmarkMap({i: known[i] for i in sorted(set(self._ids))}, setup.landmark_map.dictionary)
+        self._held = LandmarkMap({i: setup.landmark_map.landmarks[i] for i in sorted(set(self._ids))})
         has_gyro = any(s.gyro is not None for s in stretches)
         self._installation = _installation(setup.config, self._held, has_gyro, free)
         self._sigmas = np.array([free.get(n, s) for n, s in extra_sigmas(setup.config, has_gyro).items()])
@@ -145,7 +144,7 @@ class Problem:
         damping = 1e-6
         state = self._linearized(poses, theta, extras)
         for _ in range(iterations):
-            cost, A, b = state[0], state[1], state[2]
+            cost, A, b = state[:3]
             step = np.asarray(
                 np.linalg.solve(A + np.diag(damping * np.diag(A) + _LEAST_INFORMATION), -b), dtype=np.float64
             )
