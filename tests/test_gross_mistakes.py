@@ -24,7 +24,7 @@ from fgloc.frames import rpy_matrix, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
-from fgloc.types import JointsEvent, LandmarkMap, TruthEvent
+from fgloc.types import ImuEvent, JointsEvent, LandmarkMap, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
@@ -161,6 +161,18 @@ def test_fault_19_late_images(looked):
     pictures = [[Picture(p.stamp_ns + late, p.seen) for p in row] for row in looked.excerpt.pictures]
     found = looked.check(excerpt=dataclasses.replace(looked.excerpt, pictures=pictures)).correction
     assert value(r"stamp_offset_s: \{image:", found.sentence) == pytest.approx(-0.25, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kind", "role"), [(JointsEvent, "joints"), (ImuEvent, "imu")], ids=["wheels_early", "gyro_early"]
+)
+def test_fault_19_clocks_of_wheels_and_gyro(looked, kind, role):
+    def shifted(events):
+        return [dataclasses.replace(e, stamp_ns=e.stamp_ns - 200_000_000) if isinstance(e, kind) else e for e in events]
+
+    motion, imu = shifted(looked.excerpt.motion), shifted(looked.excerpt.imu)
+    found = looked.check(excerpt=dataclasses.replace(looked.excerpt, motion=motion, imu=imu)).correction
+    assert value(rf"stamp_offset_s: \{{{role}:", found.sentence) == pytest.approx(0.2, abs=0.03)
 
 
 # --- by the messages alone ---

@@ -38,11 +38,13 @@ class Change:
         kind: of the mistake.
         setup: with the mistake undone, where it is a definite one.
         free: prior sigmas of what it leaves to be found.
+        has_gyro: whether lateness against the gyro can be told; of clocks.
     """
 
     kind: str
     setup: Setup
     free: Mapping[str, float] = field(default_factory=dict)
+    has_gyro: bool = False
 
     @property
     def linearized(self) -> bool:
@@ -74,7 +76,8 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
         yield Change("ids", replace(setup, landmark_map=swapped(setup.landmark_map, a, b)))
     moving = source in ("ticks", "odometry")
     for start in (0.0, 0.6, -0.6):
-        yield Change("image_clock", _with(setup, late_s=start, gyro_late_s=start), {"late_s": 1.0, "gyro_late_s": 1.0})
+        both = {"late_s": 1.0, "gyro_late_s": 1.0}
+        yield Change("image_clock", _with(setup, late_s=start, gyro_late_s=start), both, has_gyro)
         if has_gyro:
             yield Change("gyro_clock", _with(setup, gyro_late_s=start), {"gyro_late_s": 1.0})
         if has_gyro and moving:
@@ -122,6 +125,8 @@ def gross(change: Change, given: Setup) -> bool:
     values = dict(zip(EXTRAS, setup.extras.tolist(), strict=True))
     if kind in ("size", "map_scale", "radius", "track"):
         return bool(abs(values[kind]) > _LEAST[kind])
+    if kind == "image_clock" and change.has_gyro and abs(values["late_s"] - values["gyro_late_s"]) > _LEAST["late"]:
+        return False  # then it is wheels or gyro that are late
     if kind.endswith("_clock"):
         return bool(abs(values["gyro_late_s" if kind == "gyro_clock" else "late_s"]) > _LEAST["late"])
     if kind in ("focal", "resolution"):

@@ -25,8 +25,9 @@ _STRAINED = 3.0  # sigmas of the prior: a parameter further off may stand in for
 _MOTION_DOF = 4.0  # of each pair of images: wheels 3, gyro 1
 _POOR = 3.0  # times the expected cost: a fit that is worse hides a mistake that is no small deviation
 _EXPLAINED = 0.9  # share of the cost above the expected that a mistake explains where the motion stays noisy
+_SEEN_RIGHT = 4.0  # median squared residual of the markers above which the poses are not to be compared with anything
 _FEWEST = 20  # sightings
-_FIRST_LOOK, _FINALISTS = 3, 2  # iterations with every change; changes that are fitted to the end
+_FIRST_LOOK, _FINALISTS = 3, 3  # iterations with every change; changes that are fitted to the end
 _LOOKED_AT = 2  # stretches that every change is first tried on
 _REFINED = 3  # times that what was found is taken in and fitted again
 _RISE = 0.15  # share of what is gained by which the costs of single stretches may rise: slipping wheels do not last
@@ -40,7 +41,7 @@ class Checked:
     Attributes:
         fit: of the set-up as given; None where nothing could be fitted.
         correction: of the mistake; None if there is none, or none that is sure.
-        corrected: the fit without the mistake, or `fit`.
+        corrected: the fit without the mistake, or `fit`; None where neither tells the poses.
         stretches: that were fitted.
     """
 
@@ -80,20 +81,24 @@ def check_fit(
         return Checked(fit, None, fit, stretches)
     has_gyro = any(s.gyro is not None for s in stretches)
     tried = list(changes(setup, fit, excerpt.wheel_source, has_gyro))
-    last: list[Change] = []
-    if fit is not None:
-        small = [change for change in tried if change.setup is setup]
-        last = sorted(small, key=lambda change: -fit.gain(change.free))[:_FINALISTS]
+    last = _small(tried, setup, fit) if fit is not None else []
     if fit is None or poor:
         last = [*last[:1], *[c for c in _looked_at(tried, stretches) if c not in last[:1]][:_FINALISTS]]
     starts = None if fit is None or poor else fit.poses
-    ended = [_ended(change, stretches, starts) for change in last]
-    better = min((e for e in ended if e is not None), key=lambda e: e[1].cost, default=None)
-    if better is None or not gross(better[0], setup) or not _explains(fit, better[1], expected):
-        return Checked(fit, None, fit, stretches)
+    ended = [e for e in (_ended(change, stretches, starts) for change in last) if e is not None]
+    sure = [e for e in ended if gross(e[0], setup) and _explains(fit, e[1], expected)]
+    if not sure:
+        return Checked(fit, None, fit if fit is not None and fit.misfit < _SEEN_RIGHT else None, stretches)
+    change, better = min(sure, key=lambda e: e[1].cost)
     wheels: Role = "joints" if excerpt.wheel_source == "ticks" else "odometry"
-    said = correction(better[0], setup, excerpt.wheel_source, image, wheels)
-    return Checked(fit, said, better[1], stretches)
+    said = correction(change, setup, excerpt.wheel_source, image, wheels)
+    return Checked(fit, said, better, stretches)
+
+
+def _small(tried: Iterable[Change], setup: Setup, fit: Fit) -> list[Change]:
+    """Changes that are deviations only, those first that would lower the cost of a fit the most."""
+    small = [change for change in tried if change.setup is setup]
+    return sorted(small, key=lambda change: -fit.gain(change.free))[:_FINALISTS]
 
 
 def _looked_at(tried: Iterable[Change], stretches: Sequence[Stretch]) -> list[Change]:
