@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from fgloc import cli
 from fgloc.assembly import assemble, base_up
 from fgloc.cli.terminal import EXIT_LOST, exit_code
-from fgloc.config import Config, load_config
+from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.excerpt import Picture, read_excerpt
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.gross_mistakes import inspect_all
 from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
 from fgloc.diagnosis.setup_changes import mirrored, swapped
 from fgloc.diagnosis.setup_check import check_fit
@@ -264,7 +265,9 @@ def test_a_run_names_the_mistake_first_and_is_made_without_it(looked, tmp_path):
     assert metrics.nees_over_3 < 3.0
 
 
-def test_info_names_the_mistake_first(looked):
+def test_info_names_the_mistake_first(looked, tmp_path):
     config = looked.wheels(left_joint="right_wheel_joint", right_joint="left_wheel_joint")
-    info = inspect_all(SAMPLE / "bag", SAMPLE / "map.yaml", config)
-    assert "right wheel are exchanged" in info.findings[0]
+    (tmp_path / "robot.yaml").write_text(yaml_of(config, tmp_path))
+    arguments = ["--map", str(SAMPLE / "map.yaml"), "--config", str(tmp_path / "robot.yaml")]
+    shown = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), *arguments])
+    assert "What looks wrong:\n  - The left and the right wheel are exchanged: set wheels.left_joint:" in shown.output

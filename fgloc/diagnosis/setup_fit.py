@@ -140,8 +140,7 @@ class Problem:
             return None
 
     def _descended(self, poses: FloatArray, iterations: int) -> Fit:
-        theta, extras = np.zeros(len(self._installation)), self._setup.extras.copy()
-        damping = 1e-6
+        theta, extras, damping = np.zeros(len(self._installation)), self._setup.extras.copy(), 1e-6
         state = self._linearized(poses, theta, extras)
         for _ in range(iterations):
             cost, A, b = state[:3]
