@@ -56,7 +56,6 @@ class Metrics(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    mistakes: tuple[str, ...]  # of the set-up, in sentences
     duration_s: float
     keyframes: int
     first_pose_s: float | None  # None: the place on the map was never known
@@ -72,6 +71,7 @@ class Metrics(BaseModel):
     factors: dict[str, int]
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
+    mistakes: tuple[str, ...]  # of the set-up, in sentences
 
 
 def _installation(result: RunResult) -> dict[str, FoundSetting]:
@@ -239,7 +239,6 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         errors, covs = matched.errors, matched.covs
         honest = (float(np.mean(nees(errors, covs))) / 3.0, {str(k): coverage(errors, covs, k) for k in (1, 2, 3)})
     return Metrics(
-        mistakes=result.mistakes,
         duration_s=duration,
         keyframes=len(stamps),
         first_pose_s=result.first_pose_s,
@@ -255,6 +254,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         factors=dict(sorted(result.counts.items())),
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
+        mistakes=result.mistakes,
     )
 
 
