@@ -2,7 +2,7 @@
 # Another interpreter: `make demo PYTHON=python3.12`. No CUDA build of torch: see CONTRIBUTING.md.
 PYTHON ?= python3
 JOBS ?= 2
-BENCHMARKS ?= steps real sim identification adaptive ablation
+BENCHMARKS ?= steps real sim identification adaptive ablation gross
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 BIN := .venv/bin

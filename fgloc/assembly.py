@@ -63,8 +63,21 @@ class Assembly:
     notes: tuple[str, ...]
 
 
-def assemble(recording: Recording, map_path: Path | None, config: Config, keep_all: bool) -> Assembly:
+def assemble(
+    recording: Recording,
+    map_path: Path | None,
+    config: Config,
+    keep_all: bool,
+    landmark_map: LandmarkMap | None = None,
+) -> Assembly:
     """Build and check the parts.
+
+    Args:
+        recording: to be run.
+        map_path: map; None: landmarks are estimated.
+        config: all settings.
+        keep_all: as `Localizer` has it.
+        landmark_map: the map as it is to be used, if not as the file has it.
 
     Raises:
         RecordingError: nothing in the recording says how the robot moves, or a frame is missing.
@@ -76,7 +89,8 @@ def assemble(recording: Recording, map_path: Path | None, config: Config, keep_a
             f"{recording.path}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
             f"{', '.join(f'{t.name} ({t.message_type})' for t in recording.topics) or 'none'}"
         )
-    landmark_map = load_map(map_path, config.markers.default_size_m) if map_path is not None else None
+    if landmark_map is None and map_path is not None:
+        landmark_map = load_map(map_path, config.markers.default_size_m)
     notes = list(landmark_map.notes) if landmark_map is not None else []
     if not {"odometry", "joints", "command"} & set(recording.roles):
         notes.append(
@@ -195,6 +209,13 @@ def mounted_up(recording: Recording, config: Config, first: dict[type[Event], Ev
     if isinstance(event, ImuEvent) and event.frame_id in recording.frames and base in recording.frames:
         return np.asarray(config.gyro.scale * recording.frames.lookup(base, event.frame_id)[2, :3])
     return np.array([0.0, 0.0, config.gyro.scale])
+
+
+def base_up(recording: Recording, config: Config) -> FloatArray | None:
+    """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
+    if "imu" not in recording.roles or not config.gyro.use:
+        return None
+    return mounted_up(recording, config, _first_events(recording))
 
 
 def _image_size(recording: Recording) -> tuple[int, int] | None:

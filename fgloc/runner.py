@@ -17,13 +17,14 @@ from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
 from fgloc.clock_trials import clock_note, clock_trials
 from fgloc.config import Config, Role
+from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import Attendance
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
-from fgloc.sensors.remembered import RememberedDetections
+from fgloc.sensors.remembered import FoundBefore, RememberedDetections
 from fgloc.smoothing import smooth_run
 from fgloc.threads import one_blas_thread
 from fgloc.types import (
@@ -66,7 +67,7 @@ def run(
     events: EventFilter | None = None,
     sightings: EventFilter | None = None,
     detections: Path | None = None,
-    try_clocks: bool = True,
+    check: bool = True,
 ) -> RunResult:
     """Localise one recording.
 
@@ -81,17 +82,21 @@ def run(
         events: filter of the recorded events (ablations).
         sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
         detections: file that remembers what was found in the images, for other runs of the same ones.
-        try_clocks: where a clock seems to be wrong, run again with it corrected, to see whether it is.
+        check: look for gross mistakes of the set-up first, and run with those undone that are sure; afterwards, where a
+            clock seems to be wrong, run again with it corrected, to see whether it is. Not done on filtered events.
 
     Raises:
         FglocError: the input cannot be used, or no pose was ever found.
     """
     began = time.perf_counter()
+    check = check and events is None and sightings is None
+    wrong = find_mistakes(recording_path, map_path, config) if check else Mistakes((), config)
+    config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
-        parts = assemble(recording, map_path, config, keep_all=mode == "batch" or map_path is None)
-        detector: Detector | None = parts.detector
+        parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
+        detector: Detector | None = None if parts.detector is None else FoundBefore(parts.detector, wrong.detections)
         if parts.detector is not None and detections is not None:
-            detector = RememberedDetections(detections, parts.detector)
+            detector = RememberedDetections(detections, FoundBefore(parts.detector, wrong.detections))
         replay = _Replay(parts, recording.roles, detector, recording.duration_s, progress, pace, sightings)
         for step in replay.steps(recording.events() if events is None else events(recording.events())):
             start = time.perf_counter()
@@ -107,7 +112,7 @@ def run(
         hints = (*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing())
         untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
         if parts.detector is not None and not parts.localizer.counts["corners"]:
-            hints = (*image_hints(recording, parts.detector), *hints)
+            hints = (*image_hints(recording, parts.detector)[0], *hints)
         notes = (
             *hints,
             *recording.notes,
@@ -120,7 +125,7 @@ def run(
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
     if not replay.estimates:
-        raise EstimatorError(" ".join([_never_found(replay, rejections), *hints, *untried]))
+        raise EstimatorError(" ".join([*wrong.sentences, _never_found(replay, rejections), *hints, *untried]))
     estimates = replay.estimates
     landmarks: LandmarkMap | None = parts.landmark_map
     installed = parts.localizer.estimator.installed
@@ -129,7 +134,7 @@ def run(
         try:
             smoothed = smooth_run(parts)
         except EstimatorError as error:
-            raise EstimatorError(" ".join([_sentence(str(error)), *hints, *untried])) from error
+            raise EstimatorError(" ".join([*wrong.sentences, _sentence(str(error)), *hints, *untried])) from error
         estimates, landmarks = smoothed.estimates, smoothed.landmarks
         installed = smoothed.installation
         notes = (*notes, *smoothed.notes)
@@ -142,10 +147,15 @@ def run(
     found = installation_found(parts, recording.roles, installed)
     cost = smoothed.cost if smoothed is not None else None
     tried = None
-    if try_clocks and events is None and sightings is None and on_step is None:
+    if check and not wrong.sentences and on_step is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
-    notes = (*(() if tried is None else tried[:1]), *notes, *contradictions(found if tried is None else tried[1]))
+    notes = (
+        *wrong.notes,
+        *(() if tried is None else tried[:1]),
+        *notes,
+        *contradictions(found if tried is None else tried[1]),
+    )
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),
@@ -165,11 +175,13 @@ def run(
         found=found,
         cost=cost,
         first_pose_s=replay.first_pose_s,
+        mistakes=wrong.sentences,
+        config=config,
     )
 
 
 def _tried(recording: Path, map_path: Path | None, detections: Path | None, config: Config) -> RunResult:
-    return run(recording, map_path, config, "batch", detections=detections, try_clocks=False)
+    return run(recording, map_path, config, "batch", detections=detections, check=False)
 
 
 class _Replay:

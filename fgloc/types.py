@@ -12,9 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -466,3 +470,5 @@ class RunResult:
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
     cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
+    mistakes: tuple[str, ...] = ()  # of the set-up, gross and sure; the first notes too
+    config: Config | None = None  # as the run used it: with the mistakes undone

@@ -42,15 +42,21 @@ def short_bag(folder: Path, pictures, change) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("change", "settings", "expected"),
-    [
-        (lambda image: image, {"markers": {"dictionary": "DICT_6X6_50"}}, "DICT_4X4_50"),
-        (lambda image: 255 - image, {}, "inverted"),
-        (lambda image: image[:, ::-1], {}, "mirrored"),
-    ],
-    ids=["fault_42_wrong_dictionary", "fault_47_inverted_print", "fault_45_mirrored_image"],
+    ("change", "expected"),
+    [(lambda image: 255 - image, "^The markers are seen inverted"), (lambda image: image[:, ::-1], "seen mirrored")],
+    ids=["fault_47_inverted_print", "fault_45_mirrored_image"],
 )
-def test_what_hides_the_markers_is_named(tmp_path, pictures, change, settings, expected):
+def test_what_hides_the_markers_is_named_first(tmp_path, pictures, change, expected):
     bag = short_bag(tmp_path, pictures, change)
     with pytest.raises(EstimatorError, match=expected):
-        run(bag, SAMPLE / "map.yaml", Config.model_validate(settings), "online")
+        run(bag, SAMPLE / "map.yaml", Config(), "online")
+
+
+def test_fault_42_wrong_dictionary_is_named_and_the_fitting_one_taken(tmp_path, pictures):
+    bag = short_bag(tmp_path, pictures, lambda image: image)
+    wrong = Config.model_validate({"markers": {"dictionary": "DICT_6X6_50"}})
+    result = run(bag, SAMPLE / "map.yaml", wrong, "online")
+    assert result.notes[0].endswith("set markers.dictionary: DICT_4X4_50.")
+    assert result.mistakes == result.notes[:1]
+    assert result.config.markers.dictionary == "DICT_4X4_50"
+    assert result.counts["corners"]

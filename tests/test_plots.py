@@ -50,6 +50,7 @@ KEYS = [
     "factors",
     "rejections",
     "installation",
+    "mistakes",
 ]
 CONFIG = Config()
 COMMAND = 'fgloc smooth "first <run>" --out out'

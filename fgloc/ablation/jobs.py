@@ -169,6 +169,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
     if cell.start == "truth":
         config = _start_at_truth(cell.bag, config)
+    plain = job.folder is not None and not cell.chain  # in a sweep all runs of a recording have one set-up
     with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
         map_file = cell.map
         if landmark_map is not None:
@@ -183,10 +184,11 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
             map_file,
             config,
             cell.mode,
-            events=lambda events: spoil(cell.chain, "recorded", events, scenes),
-            sightings=lambda events: spoil(cell.chain, "sightings", events, scenes),
+            events=None if plain else lambda events: spoil(cell.chain, "recorded", events, scenes),
+            sightings=None if plain else lambda events: spoil(cell.chain, "sightings", events, scenes),
             detections=out / "detections" / f"{job.images}.npz" if job.folder is None else None,
         )
+    config = result.config or config
     metrics = compute_metrics(result, config)
     if job.folder is not None:
         owner = owner_path(out, job.folder)
@@ -200,6 +202,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     return {
         "figures": _figures(metrics),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
+        "mistakes": result.mistakes,
         "touched": touched,
         "track": _track(result, config),
     }

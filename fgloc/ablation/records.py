@@ -41,6 +41,7 @@ class Record(BaseModel):
     error: str = ""  # of a refused run the message, of a crashed one the traceback
     figures: dict[str, Any] = {}  # of Metrics, without times
     modes: dict[str, float] = {}  # mode -> share of the poses
+    mistakes: tuple[str, ...] = ()  # of the set-up
     touched: dict[str, int] = {}  # events that the failures changed, by kind
     track: Track | None = None
     cost: Cost

@@ -68,7 +68,7 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
     for sigmas in (_COMMANDS,) if config.wheels.source == "command" else (_WHEELS, _COMMANDS):
         motion, wheels = config.motion.model_copy(update={"use": False}), config.wheels.model_copy(update=sigmas)
         alone = config.model_copy(update={"motion": motion, "wheels": wheels})
-        result = run(bag, map_path, alone, "batch", progress)
+        result = run(bag, map_path, alone, "batch", progress, check=False)
         if result.found is not None and result.found.wheels != "command":
             break
     if not any(result.counts.get(kind) for kind in _SIGHTINGS):

@@ -21,9 +21,9 @@ from fgloc.cli.options import (
     configured,
 )
 from fgloc.cli.sweeps import smooth_many
-from fgloc.cli.terminal import EXIT_LOST, columns, exit_if_lost, number, run_bar, typed
+from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, typed
 from fgloc.errors import RecordingError
-from fgloc.types import Mode, RunResult
+from fgloc.types import RunResult
 
 if TYPE_CHECKING:
     from fgloc.evaluation.metrics import Metrics
@@ -50,20 +50,20 @@ def demo(
             "run `make demo` there"
         )
     runs: list[tuple[str, Metrics]] = []
-    lost = False
+    code = 0
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
         result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
         runs.append((mode, metrics))
-        lost = lost or Mode.LOST in result.modes
+        code = code or exit_code(result)
     typer.echo(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
     typer.echo(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
     typer.echo("")
     for mode, _ in runs:
         typer.echo(f"{mode:<8}{out / mode / 'report.html'}")
-    if lost:
-        raise typer.Exit(EXIT_LOST)
+    if code:
+        raise typer.Exit(code)
 
 
 def smooth(
@@ -139,7 +139,7 @@ def _localise(
     config = resolved(configured(bag, config_file, model), map_path)
     with run_bar(mode) as progress:
         result = run(bag, map_path, config, mode, progress, pace)
-    return result, write_results(result, config, out, command, sha256_of(bag))
+    return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
 def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
@@ -150,10 +150,13 @@ def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
+    for mistake in result.mistakes:
+        typer.echo(f"mistake: {mistake}")
     typer.echo(columns(None, rows))
     for note in result.notes:
-        typer.echo(f"note: {note}")
-    exit_if_lost(result.modes)
+        if note not in result.mistakes:
+            typer.echo(f"note: {note}")
+    exit_unless_trusted(result)
 
 
 def _demo_row(mode: str, metrics: Metrics) -> tuple[str, ...]:

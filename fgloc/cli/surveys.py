@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
-from fgloc.cli.terminal import columns, exit_if_lost, run_bar
+from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar
 from fgloc.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _of_points(bag: Path, out: Path, settings: Config) -> None:
         raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
     write_map(result.landmarks, out)
     typer.echo(f"{len(result.landmarks)} landmarks in {out}")
-    exit_if_lost(result.modes)
+    exit_unless_trusted(result)
 
 
 def _tell(found: Survey, out: Path) -> None:

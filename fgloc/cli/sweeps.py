@@ -65,12 +65,17 @@ def smooth_many(
     for name in plan.names:
         if name in errors:
             typer.echo(f"{name}: {errors[name]}", err=True)
+    for name, record in by_name.items():
+        for mistake in record.mistakes:
+            typer.echo(f"{name}: {mistake}", err=True)
     typer.echo(f"reports: {out / '*' / 'report.html'}")
     if errors:
         typer.echo(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
-    if any(record.modes.get("LOST") for record in by_name.values()):
+    lost = any(record.modes.get("LOST") for record in by_name.values())
+    if lost:
         typer.echo("LOST for part of a run: do not trust it there", err=True)
+    if lost or any(record.mistakes for record in by_name.values()):
         raise typer.Exit(EXIT_LOST)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 from tqdm import tqdm
 
-from fgloc.types import Mode
+from fgloc.types import Mode, RunResult
 
 if TYPE_CHECKING:
     from fgloc.runner import Progress
@@ -25,12 +25,20 @@ def typed() -> str:
     return shlex.join(["fgloc", *sys.argv[1:]])
 
 
-def exit_if_lost(modes: Sequence[Mode]) -> None:
-    """End with code 3 if a part of the run is not to be trusted."""
-    lost = sum(mode is Mode.LOST for mode in modes)
+def exit_code(result: RunResult) -> int:
+    """0, or 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+    return EXIT_LOST if Mode.LOST in result.modes or result.mistakes else 0
+
+
+def exit_unless_trusted(result: RunResult) -> None:
+    """End with code 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+    lost = sum(mode is Mode.LOST for mode in result.modes)
     if lost:
-        typer.echo(f"LOST for {lost} of {len(modes)} poses: do not trust them", err=True)
-        raise typer.Exit(EXIT_LOST)
+        typer.echo(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
+    if result.mistakes:
+        typer.echo("the set-up is wrong, as the first note says: correct it and run again", err=True)
+    if code := exit_code(result):
+        raise typer.Exit(code)
 
 
 @contextmanager

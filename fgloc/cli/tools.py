@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from fgloc.cli.options import Bag, ConfigOption, configured
+from fgloc.cli.options import Bag, ConfigOption, MapOption, configured
 from fgloc.cli.terminal import columns
 
 
@@ -19,11 +19,14 @@ class Align(StrEnum):
     SE2 = "se2"
 
 
-def info(bag: Bag, config: ConfigOption = None) -> None:
-    """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong."""
-    from fgloc.recording.info import format_info, inspect
+def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
+    """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong, also with the map."""
+    from fgloc.diagnosis.gross_mistakes import inspect_all
+    from fgloc.recording.info import format_info
+    from fgloc.runner import find_beside
 
-    typer.echo(format_info(inspect(bag, configured(bag, config, None))), nl=False)
+    map_path = map_file or find_beside(bag, "map.yaml")
+    typer.echo(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)
 
 
 def evaluate(

@@ -10,7 +10,6 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.upright import UprightWitness
 from fgloc.diagnosis.window import Spots, Window
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.pnp import marker_pose_candidates
@@ -43,11 +42,7 @@ class Spot:
 
 
 class Spotter:
-    """Turns sightings events into places in the sensor's own axes.
-
-    Attributes:
-        upright: what the markers say of the camera's tilt.
-    """
+    """Turns sightings events into places in the sensor's own axes."""
 
     def __init__(
         self, config: Config, landmark_map: LandmarkMap | None, sensor: LandmarkSensor, T_base_sensor: FloatArray
@@ -57,7 +52,6 @@ class Spotter:
         self._map = landmark_map
         self._sensor = sensor
         self._place = T_base_sensor
-        self.upright = UprightWitness()
 
     def spots(self, event: SightingsEvent, at_s: float) -> Iterator[Spot]:
         """What was seen where."""
@@ -71,7 +65,6 @@ class Spotter:
                 if not found:
                     continue
                 T = found[0][0]
-                self.upright.see(T, landmark)
                 point = T[:3, 3]
                 sigma_rad = m.sigma_px / float(m.camera.K[0, 0])
                 side_px = float(np.linalg.norm(m.corners_px - np.roll(m.corners_px, 1, axis=0), axis=1).max())

@@ -10,10 +10,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.collect import Spotter, WindowCutter
-from fgloc.diagnosis.hypotheses import explanation, pose_text
+from fgloc.diagnosis.frame_checks import first_pose_sentence
+from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
 from fgloc.diagnosis.turning import GyroWitness, Turning
-from fgloc.diagnosis.upright import Tilt
 from fgloc.diagnosis.window import PRIOR_SIGMAS, PRIOR_SIGMAS_NO_MAP, Fault, Fit, Window, fit_window
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.types import Camera, FloatArray, LandmarkMap, MotionMeasurement, Step
@@ -131,9 +131,6 @@ class Diagnosis:
             source: where wheel motion came from: "ticks", "odometry", "command" or "".
             offsets: tell constant offsets of clocks too; they have not been tried.
         """
-        tilt = self._spotter.upright.tilt(self._place)
-        if tilt is not None:
-            return (_tilted(tilt),)
         if self._known is not None and self._gross_count > _GROSS_SHARE * max(self._tried, 3):
             found = explanation(self._gross, self._place, self._known, self._camera)
             share = f"in {self._gross_count} of {self._tried} stretches of the run"
@@ -246,31 +243,9 @@ class Diagnosis:
 
     def _first_pose(self) -> Iterator[str]:
         """A first pose that was given and is not where the sightings put it: one of the two frames is shifted."""
-        given = self._config.estimator.initial_pose
-        if given is None or self._started is None:
-            return
-        apart = se2.log(se2.between(given, self._started))
-        allowed = _SURE * np.array(self._config.estimator.initial_sigmas) + (0.1, 0.1, 0.1)
-        if (np.abs(apart) > allowed).any():
-            x, y, yaw = self._started
-            yield (
-                f"By the map and the sightings the run began at x {x:.2f} m, y {y:.2f} m, yaw {yaw:.2f} rad, but "
-                f"estimator.initial_pose says {given[0]:.2f}, {given[1]:.2f}, {given[2]:.2f}: the map is shifted by "
-                f"{math.hypot(*apart[:2]):.2f} m and {math.degrees(abs(apart[2])):.0f}°, or the pose is wrong."
-            )
-
-
-def _tilted(tilt: Tilt) -> str:
-    roll, pitch = round(math.degrees(tilt.roll)), round(math.degrees(tilt.pitch))
-    how = []
-    if abs(roll) > 3:
-        how.append("upside down" if abs(abs(roll) - 180) < 20 else f"turned by {roll}° about its viewing axis")
-    if abs(pitch) > 3:
-        how.append(f"pitched {'up' if pitch > 0 else 'down'} by {abs(pitch)}°")
-    return (
-        f"By the markers the camera is {' and '.join(how)} against its transform: correct it, or set "
-        f"{pose_text(tilt.place, optical=True)}."
-    )
+        said = None if self._started is None else first_pose_sentence(self._config, self._started)
+        if said is not None:
+            yield said
 
 
 def _sure(pooled: Pooled, i: int, least: float) -> bool:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgloc.diagnosis.pose_text import OPTICAL_TO_BODY, pose_text
 from fgloc.diagnosis.window import Fit, Window, fit_window, spread_ratio
 from fgloc.types import FloatArray
 
-_OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _FITS = 2.0  # median whitened residual of a window that an explanation fits
 _SHARE = 0.7  # of the windows that an explanation must fit
 
@@ -53,15 +53,6 @@ def explanation(windows: Sequence[Window], T_base_sensor: FloatArray, known: Kno
     return None if best is None else best[1]
 
 
-def pose_text(T: FloatArray, optical: bool) -> str:
-    """``recording.sightings_pose`` of a sensor at ``T (4, 4)``, as it is written in the configuration."""
-    R = T[:3, :3] @ _OPTICAL_TO_BODY.T if optical else T[:3, :3]
-    roll, pitch = math.atan2(R[2, 1], R[2, 2]), math.asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    values = ", ".join(f"{round(v, 4) + 0.0:g}" for v in (*T[:3, 3], roll, pitch, yaw))
-    return f"recording.sightings_pose: [{values}]"
-
-
 def _hypotheses(camera: bool) -> list[Hypothesis]:
     def mounted(T: FloatArray) -> str:
         return f"correct the transform, or set {pose_text(T, camera)}"
@@ -75,10 +66,10 @@ def _hypotheses(camera: bool) -> list[Hypothesis]:
         Hypothesis(
             f"the {what}'s transform is given without the optical axes' rotation (z forward, x right, y down)",
             mounted,
-            place=_turned(_OPTICAL_TO_BODY),
+            place=_turned(OPTICAL_TO_BODY),
         ),
         Hypothesis(
-            f"the {what}'s transform has the optical axes' rotation twice", mounted, place=_turned(_OPTICAL_TO_BODY.T)
+            f"the {what}'s transform has the optical axes' rotation twice", mounted, place=_turned(OPTICAL_TO_BODY.T)
         ),
         Hypothesis(f"the {what}'s transform is inverted (parent and child exchanged)", mounted, place=_inverted),
         Hypothesis(

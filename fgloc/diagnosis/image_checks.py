@@ -13,17 +13,20 @@ _IMAGES = 5  # looked at, spread over the recording
 _SCANNED = 200
 
 
-def image_hints(recording: Recording, detector: MarkerDetector) -> tuple[str, ...]:
-    """One sentence for each thing that would explain it: another dictionary, mirrored images, inverted prints."""
+def image_hints(recording: Recording, detector: MarkerDetector) -> tuple[tuple[str, ...], str | None]:
+    """One sentence for each thing that would explain it: another dictionary, mirrored images, inverted prints.
+
+    Returns:
+        The sentences; and the dictionary, if it is another one.
+    """
     images = _some_images(recording)
     hints = list(dict.fromkeys(hint for image in images for hint in detector.diagnose(image)))
-    if not any(detector.find(image) for image in images):
-        fitting = suggest_dictionary(images)
-        if fitting is not None and fitting != detector.dictionary:
-            hints.append(
-                f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary, or the map's."
-            )
-    return tuple(hints)
+    fitting = None if any(detector.find(image) for image in images) else suggest_dictionary(images)
+    if fitting is None or fitting == detector.dictionary:
+        return tuple(hints), None
+    said = f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
+
+    return (*hints, said), fitting
 
 
 def fitting_dictionary(recording: Recording) -> str | None:

@@ -149,7 +149,7 @@ class _Problem:
             local = np.stack([np.bincount(slots, seen[:, k]) / counts for k in (0, 1)], axis=1).ravel()
             return _Problem(window, arms, along, sensor, None, slots, local, PRIOR_SIGMAS_NO_MAP**-2.0)
         landmarks = np.array([known[int(i)] for i in spots.ids])
-        place = _rigid(seen, landmarks, spots.sigmas[:, 1] ** -2.0)
+        place = rigid(seen, landmarks, spots.sigmas[:, 1] ** -2.0)
         return (
             None
             if place is None
@@ -234,7 +234,7 @@ def _in_path(poses: FloatArray, points: FloatArray) -> FloatArray:
     return np.column_stack([x, poses[:, 1] + s * points[:, 0] + c * points[:, 1]])
 
 
-def _rigid(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray | None:
+def rigid(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray | None:
     """Pose ``(3,)`` that takes source points to target points; None where these lie too close together.
 
     Source: Arun, Huang, Blostein, "Least-squares fitting of two 3-D point sets", PAMI 9(5), 1987, in the plane.

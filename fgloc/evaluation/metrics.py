@@ -71,6 +71,7 @@ class Metrics(BaseModel):
     factors: dict[str, int]
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
+    mistakes: tuple[str, ...]  # of the set-up, in sentences
 
 
 def _installation(result: RunResult) -> dict[str, FoundSetting]:
@@ -253,6 +254,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         factors=dict(sorted(result.counts.items())),
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
+        mistakes=result.mistakes,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -11,6 +12,9 @@ import numpy as np
 from fgloc.recording.outputs import atomic_file
 from fgloc.sensors.markers import Detector
 from fgloc.types import CornersEvent, ImageEvent, MarkerCorners
+
+Detections = tuple[MarkerCorners, ...]
+"""Of one image."""
 
 
 class RememberedDetections:
@@ -78,3 +82,35 @@ def _write(path: Path, known: dict[bytes, tuple[MarkerCorners, ...]]) -> None:
             ids=np.array([s.marker_id for s in found], dtype=np.int64),
             corners=np.array([s.corners_px for s in found], dtype=float).reshape(len(found), 4, 2),
         )
+
+
+class NotedDetector:
+    """Searches images and notes what it found, for a run that comes to the same images."""
+
+    def __init__(self, detector: Detector, found: dict[tuple[int, int], Detections]) -> None:
+        """Note into ``found``, by receive time and number of bytes."""
+        self._detector, self._found = detector, found
+
+    def detect(self, event: ImageEvent) -> CornersEvent:
+        """The markers of one image; raises as the detector does."""
+        key = event.received_ns, len(event.data)
+        if key not in self._found:
+            self._found[key] = self._detector.detect(event).sightings
+        return _event(event, self._found[key])
+
+
+class FoundBefore:
+    """Searches only images in which nothing was found before."""
+
+    def __init__(self, detector: Detector, found: Mapping[tuple[int, int], Detections]) -> None:
+        """Take what a `NotedDetector` of the same dictionary has found."""
+        self._detector, self._found = detector, found
+
+    def detect(self, event: ImageEvent) -> CornersEvent:
+        """The markers of one image; raises as the detector does."""
+        known = self._found.get((event.received_ns, len(event.data)))
+        return self._detector.detect(event) if known is None else _event(event, known)
+
+
+def _event(event: ImageEvent, sightings: Detections) -> CornersEvent:
+    return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)

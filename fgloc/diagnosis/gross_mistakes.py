@@ -1,0 +1,191 @@
+"""Gross mistakes of a recording's set-up, found before the run in bounded time, with the settings that undo them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.assembly import Assembly, assemble, base_up
+from fgloc.config import Config, Role
+from fgloc.diagnosis.excerpt import GRID_S, Excerpt, read_excerpt, wheel_increments
+from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
+from fgloc.diagnosis.image_checks import image_hints
+from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
+from fgloc.diagnosis.setup_check import Checked, check_fit
+from fgloc.errors import FglocError
+from fgloc.recording.info import RecordingInfo, inspect
+from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensors.remembered import Detections, NotedDetector
+from fgloc.types import FloatArray, LandmarkMap
+
+_MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
+_FEWEST_IMAGES = 5
+_MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mistakes:
+    """What is wrong with a set-up.
+
+    Attributes:
+        sentences: one for each mistake, with the line to be set; none on a sound set-up.
+        config: with the mistakes undone.
+        landmark_map: likewise; None: the file is taken as it is.
+        detections: of the images that were searched.
+        undone: whether ``config`` and ``landmark_map`` are not as they were given.
+    """
+
+    sentences: tuple[str, ...]
+    config: Config
+    landmark_map: LandmarkMap | None = None
+    detections: Mapping[tuple[int, int], Detections] = field(default_factory=dict)
+    undone: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences, and that the run did not follow the settings as given."""
+        said = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
+        return (*self.sentences, *said)
+
+
+def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:
+    """Check an excerpt of a recording against what is said of map, camera, wheels, clocks and frames.
+
+    Args:
+        path: recording.
+        map_path: map; None: only what needs none is checked.
+        config: as given.
+
+    Raises:
+        FglocError: the input cannot be used, as `fgloc.runner.run` would say too.
+    """
+    found = _Search(path, map_path, config)
+    found.run()
+    undone = found.config != config or found.landmark_map is not None
+    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, found.detections, undone)
+
+
+def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
+    """What `inspect` reports of a recording, with the gross mistakes first among the findings.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    info = inspect(path, config)
+    if info.problems:
+        return info
+    try:
+        sentences = find_mistakes(path, map_path, config).sentences
+    except FglocError as error:
+        sentences = (str(error),)
+    return replace(info, findings=(*sentences, *info.findings))
+
+
+class _Search:
+    """One search: reads the excerpt, again where a mistake of clocks or dictionary made it useless."""
+
+    def __init__(self, path: Path, map_path: Path | None, config: Config) -> None:
+        self._path, self._map_path = path, map_path
+        self.config = config
+        self.landmark_map: LandmarkMap | None = None
+        self.sentences: list[str] = []
+        self.detections: dict[tuple[int, int], Detections] = {}
+
+    def run(self) -> None:
+        """All checks, in the order in which one makes the next possible."""
+        if self._read_anew():
+            self._read_anew()
+
+    def _read_anew(self) -> bool:
+        """All checks with the stamps as they are; whether these were corrected and all has to begin again."""
+        with open_recording(self._path, self.config.recording) as recording:
+            parts = assemble(recording, self._map_path, self.config, keep_all=False)
+            detector = None if parts.detector is None else NotedDetector(parts.detector, self.detections)
+            excerpt = read_excerpt(recording, self.config, detector)
+            roles = other_clocks(excerpt.delays)
+            given = self.config.recording.received_stamps
+            if roles and not set(roles) <= set(given):
+                self.sentences.append(clock_sentence(roles, excerpt.delays, given))
+                self._change("recording", received_stamps=(*given, *roles))
+                return True
+            rolled = roll_over(excerpt.motion, self.config)
+            if rolled is not None:
+                self.sentences.append(
+                    f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
+                    f"set wheels.angle_range: {rolled[0]:.4f}."
+                )
+                self._change("wheels", angle_range=rolled[0])
+            if parts.landmark_map is None:
+                return False
+            if self._unseen(excerpt, parts) and not self._images(recording, parts):
+                return False
+            if self.config.markers.dictionary != parts.config.markers.dictionary:
+                self.detections.clear()
+                parts = assemble(recording, self._map_path, self.config, keep_all=False)
+                assert parts.detector is not None
+                excerpt = read_excerpt(recording, self.config, NotedDetector(parts.detector, self.detections))
+            self._fit(recording, excerpt, parts)
+        return False
+
+    def _unseen(self, excerpt: Excerpt, parts: Assembly) -> bool:
+        """Whether images were searched and next to none shows a marker of the map."""
+        assert parts.landmark_map is not None
+        shown = [any(m.marker_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
+        return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+
+    def _images(self, recording: Recording, parts: Assembly) -> bool:
+        """Say why no marker is found; whether another dictionary finds them."""
+        assert parts.detector is not None
+        hints, fitting = image_hints(recording, parts.detector)
+        self.sentences += hints
+        if fitting is not None:
+            self._change("markers", dictionary=fitting)
+        return fitting is not None
+
+    def _fit(self, recording: Recording, excerpt: Excerpt, parts: Assembly) -> None:
+        landmark_map, camera = parts.landmark_map, parts.camera
+        if camera is None or landmark_map is None:
+            return
+        image: Role = "image" if parts.detector is not None else "sightings"
+        up = base_up(recording, self.config)
+        checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
+        if checked.correction is not None:
+            self.sentences.append(checked.correction.sentence)
+            self.config, changed = checked.correction.config, checked.correction.landmark_map
+            self.landmark_map = None if changed is landmark_map else changed
+        if checked.corrected is not None:
+            self._frames(excerpt, checked)
+
+    def _frames(self, excerpt: Excerpt, checked: Checked) -> None:
+        assert checked.corrected is not None
+        poses = checked.corrected.poses
+        stamps = np.array([p.stamp_ns for s in checked.stretches for p in s.pictures], dtype=np.int64)
+        started = self._started(excerpt, int(stamps[0]), poses[0])
+        said = None if started is None else first_pose_sentence(self.config, started)
+        if said is not None:
+            self.sentences.append(said)
+            self._change("estimator", initial_pose=None)
+        said = truth_sentence(self.config, excerpt.truth, stamps, poses)
+        if said is not None:
+            self.sentences.append(said)
+            self._change("truth", align="se2")
+
+    def _started(self, excerpt: Excerpt, stamp_ns: int, pose: FloatArray) -> FloatArray | None:
+        """The pose at the run's start ``(3,)``, by the wheels, if that was not long before."""
+        first = min((e.stamp_ns for e in excerpt.motion), default=stamp_ns)
+        if self.config.estimator.initial_pose is None or not 0 <= stamp_ns - first < _MOST_TRAVEL_S * 1e9:
+            return None
+        grid = np.append(np.arange(first, stamp_ns, round(GRID_S * 1e9)), stamp_ns)
+        steps = wheel_increments(excerpt, self.config, grid) if len(grid) > 1 else None
+        travelled = np.zeros(3)
+        for step in () if steps is None else steps:
+            travelled = se2.compose(travelled, se2.exp(step))
+        return se2.compose(pose, se2.inverse(travelled))
+
+    def _change(self, section: str, **values: object) -> None:
+        part = getattr(self.config, section).model_copy(update=values)
+        self.config = self.config.model_copy(update={section: part})

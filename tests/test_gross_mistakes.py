@@ -1,0 +1,273 @@
+"""Gross mistakes of a set-up are named before the run, each with the line to be set, and none of a sound one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fgloc import cli
+from fgloc.assembly import assemble, base_up
+from fgloc.cli.terminal import EXIT_LOST, exit_code
+from fgloc.config import Config, load_config, yaml_of
+from fgloc.diagnosis.excerpt import Picture, read_excerpt
+from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
+from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
+from fgloc.diagnosis.setup_changes import mirrored, swapped
+from fgloc.diagnosis.setup_check import check_fit
+from fgloc.evaluation.metrics import compute_metrics
+from fgloc.frames import rpy_matrix, yaw_quaternion
+from fgloc.recording.reader import open_recording
+from fgloc.runner import run
+from fgloc.sensors.maps import load_map, write_map
+from fgloc.types import ImuEvent, JointsEvent, LandmarkMap, TruthEvent
+
+SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+SAMPLE = SAMPLES / "installed_run"
+START_NS = 1_700_000_000_000_000_000
+
+
+class Looked:
+    """An excerpt of a recording with its set-up."""
+
+    def __init__(self, folder: Path, stretches: int) -> None:
+        self.config = load_config(folder / "robot.yaml")
+        with open_recording(folder / "bag", self.config.recording) as recording:
+            parts = assemble(recording, folder / "map.yaml", self.config, keep_all=False)
+            self.excerpt = read_excerpt(recording, self.config, parts.detector)
+            self.up = base_up(recording, self.config)
+        self.excerpt.pictures = self.excerpt.pictures[:stretches]
+        self.landmarks, self.camera = parts.landmark_map, parts.camera
+
+    def check(self, config=None, landmarks=None, camera=None, excerpt=None):
+        """The check with some of the set-up replaced."""
+        return check_fit(
+            excerpt or self.excerpt,
+            config or self.config,
+            landmarks or self.landmarks,
+            camera or self.camera,
+            self.up,
+            "image",
+        )
+
+    def wheels(self, **values) -> Config:
+        """The configuration with these values of the wheels."""
+        return self.config.model_copy(update={"wheels": self.config.wheels.model_copy(update=values)})
+
+
+@pytest.fixture(scope="module")
+def looked():
+    return Looked(SAMPLE, stretches=3)
+
+
+def sized(landmarks: LandmarkMap, factor: float) -> LandmarkMap:
+    """The map with other sizes."""
+    known = {i: dataclasses.replace(m, size_m=factor * m.size_m) for i, m in landmarks.landmarks.items()}
+    return dataclasses.replace(landmarks, landmarks=known)
+
+
+def value(pattern: str, sentence: str) -> float:
+    """The number that a sentence has behind a pattern."""
+    found = re.search(pattern + r" (-?[\d.]+\d)", sentence)
+    assert found, sentence
+    return float(found[1])
+
+
+# --- by the fit of the excerpt ---
+
+
+@pytest.mark.parametrize("name", ["installed_run", "patches_run"])
+def test_a_sound_set_up_is_not_accused(name, looked):
+    checked = (looked if name == "installed_run" else Looked(SAMPLES / name, stretches=5)).check()
+    assert checked.fit is not None
+    assert checked.correction is None
+
+
+@pytest.mark.parametrize("factor", [0.95, 0.8])
+def test_fault_40_wrong_marker_size(looked, factor):
+    found = looked.check(landmarks=sized(looked.landmarks, factor)).correction
+    assert value("set size:", found.sentence) == pytest.approx(0.2, rel=0.02)
+    assert next(iter(found.landmark_map.landmarks.values())).size_m == pytest.approx(0.2, rel=0.02)
+
+
+def test_fault_40_calibration_of_another_resolution(looked):
+    K = looked.camera.K * [[2.0], [2.0], [1.0]]
+    found = looked.check(camera=dataclasses.replace(looked.camera, K=K)).correction
+    assert value("camera.focal_scale:", found.sentence) == pytest.approx(0.5, abs=0.01)
+    assert found.config.camera.cx_px == pytest.approx(looked.camera.K[0, 2], abs=5.0)
+
+
+def test_fault_40_calibration_without_distortion(looked):
+    plain = dataclasses.replace(looked.camera, D=np.zeros(5))
+    found = looked.check(camera=plain).correction
+    assert value("camera.k1:", found.sentence) == pytest.approx(looked.camera.D[0], abs=0.03)
+    assert found.config.camera.k2 == pytest.approx(looked.camera.D[1], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        (rpy_matrix(0.0, 0.0, math.pi), "upside down"),
+        (rpy_matrix(0.0, math.radians(12.0), 0.0), "further left"),  # its transform says: 12 degrees to the right
+        (rpy_matrix(math.radians(15.0), 0.0, 0.0), "further down"),  # likewise up
+    ],
+    ids=["upside_down", "yawed", "pitched"],
+)
+def test_fault_46_turned_camera(looked, turn, words):
+    T = looked.camera.T_base_cam.copy()
+    T[:3, :3] = T[:3, :3] @ turn  # about the optical axes
+    found = looked.check(camera=dataclasses.replace(looked.camera, T_base_cam=T)).correction
+    assert words in found.sentence
+    true = looked.camera.T_base_cam[:3, :3]
+    off = rpy_matrix(*found.config.recording.sightings_pose[3:]).T @ true @ rpy_matrix(-math.pi / 2, 0, -math.pi / 2).T
+    assert math.acos(min(1.0, 0.5 * (np.trace(off) - 1.0))) < math.radians(1.5)
+
+
+def test_exchanged_wheels(looked):
+    given = looked.config.wheels
+    found = looked.check(looked.wheels(left_joint=given.right_joint, right_joint=given.left_joint)).correction
+    assert f"wheels.left_joint: {given.left_joint} and wheels.right_joint: {given.right_joint}" in found.sentence
+    assert found.config.wheels == given
+
+
+@pytest.mark.parametrize("factor", [1.1, 2.0])
+def test_wrong_radius(looked, factor):
+    found = looked.check(looked.wheels(left_radius=0.05 * factor, right_radius=0.05 * factor)).correction
+    assert value("wheels.left_radius:", found.sentence) == pytest.approx(0.05, rel=0.03)
+    assert found.config.wheels.right_radius == pytest.approx(0.05, rel=0.03)
+
+
+def test_fault_52_mirrored_map(looked):
+    found = looked.check(landmarks=mirrored(looked.landmarks)).correction
+    assert found.sentence.startswith("The map is mirrored")
+    for i, m in looked.landmarks.landmarks.items():
+        np.testing.assert_allclose(found.landmark_map.landmarks[i].corners(), m.corners(), atol=1e-9)
+
+
+def test_exchanged_ids(looked):
+    seen = [m.marker_id for row in looked.excerpt.pictures for p in row for m in p.seen]
+    a, b = sorted(sorted(set(seen), key=seen.count)[-2:])
+    found = looked.check(landmarks=swapped(looked.landmarks, a, b)).correction
+    assert f"exchange ids {a} and {b} in the map" in found.sentence
+    np.testing.assert_array_equal(found.landmark_map.landmarks[a].position, looked.landmarks.landmarks[a].position)
+
+
+def test_fault_19_late_images(looked):
+    late = 250_000_000
+    pictures = [[Picture(p.stamp_ns + late, p.seen) for p in row] for row in looked.excerpt.pictures]
+    found = looked.check(excerpt=dataclasses.replace(looked.excerpt, pictures=pictures)).correction
+    assert value(r"stamp_offset_s: \{image:", found.sentence) == pytest.approx(-0.25, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kind", "role"), [(JointsEvent, "joints"), (ImuEvent, "imu")], ids=["wheels_early", "gyro_early"]
+)
+def test_fault_19_clocks_of_wheels_and_gyro(looked, kind, role):
+    def shifted(events):
+        return [dataclasses.replace(e, stamp_ns=e.stamp_ns - 200_000_000) if isinstance(e, kind) else e for e in events]
+
+    motion, imu = shifted(looked.excerpt.motion), shifted(looked.excerpt.imu)
+    found = looked.check(excerpt=dataclasses.replace(looked.excerpt, motion=motion, imu=imu)).correction
+    assert value(rf"stamp_offset_s: \{{{role}:", found.sentence) == pytest.approx(0.2, abs=0.03)
+
+
+# --- by the messages alone ---
+
+
+def joints(angles: np.ndarray) -> list[JointsEvent]:
+    """Messages of two wheels that turn alike."""
+    names, none = ("left_wheel", "right_wheel"), np.zeros(0)
+    return [
+        JointsEvent(START_NS + k * 20_000_000, 0, "/joint_states", names, np.array([a, a]), none, none)
+        for k, a in enumerate(angles)
+    ]
+
+
+@pytest.mark.parametrize("size", [2.0 * math.pi, 10.0])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_fault_25_roll_over(size, direction):
+    angles = direction * np.cumsum(0.2 + 0.1 * np.sin(np.arange(600) / 40.0))
+    found = roll_over(joints(np.mod(angles, size)), Config())
+    assert found is not None
+    assert found[0] == pytest.approx(size, rel=0.01)
+
+
+def test_fault_25_an_encoder_that_restarts_does_not_roll_over():
+    angles = np.cumsum(0.2 + 0.1 * np.sin(np.arange(600) / 40.0))
+    angles[200:] -= angles[200]
+    angles[450:] -= angles[450]
+    assert roll_over(joints(angles), Config()) is None
+    assert roll_over(joints(np.mod(angles, 6.0)), Config.model_validate({"wheels": {"angle_range": 6.0}})) is None
+
+
+def test_stamps_of_another_clock():
+    delays = {"joints": [0.003] * 9, "odometry": [0.002] * 9, "imu": [0.001] * 9, "image": [0.04] * 9}
+    assert other_clocks(delays) == ()
+    assert other_clocks({role: [d + 3600.0 for d in ds] for role, ds in delays.items()}) == ()  # the recorder's own
+    delays["imu"] = [-1000.0] * 9
+    assert other_clocks(delays) == ("imu",)
+    said = clock_sentence(("imu",), delays, ("image",))
+    assert "imu are 1000 s ahead" in said
+    assert "recording.received_stamps: [image, imu]" in said
+
+
+# --- frames ---
+
+
+def test_fault_52_map_shifted_against_the_given_first_pose():
+    config = Config.model_validate({"estimator": {"initial_pose": [0.0, 0.0, 0.0]}})
+    assert first_pose_sentence(config, np.array([0.2, -0.2, 0.1])) is None
+    said = first_pose_sentence(config, np.array([2.0, -1.0, 0.0]))
+    assert "the map is shifted by 2.24 m" in said
+    assert "estimator.initial_pose: [2.000, -1.000, 0.0000]" in said
+    assert first_pose_sentence(Config(), np.array([2.0, -1.0, 0.0])) is None
+
+
+def test_truth_in_another_frame():
+    t = np.linspace(0.0, 20.0, 101)
+    path = np.column_stack([2.0 * np.sin(0.3 * t), np.cos(0.5 * t), 0.1 * t])
+    stamps = START_NS + (t * 1e9).astype(np.int64)
+    c, s = math.cos(0.7), math.sin(0.7)
+
+    def truth(points: np.ndarray) -> list[TruthEvent]:
+        return [
+            TruthEvent(int(k), int(k), "/truth", "world", np.append(p, 0.0), yaw_quaternion(0.0))
+            for k, p in zip(stamps, points, strict=True)
+        ]
+
+    moved = path[:, :2] @ np.array([[c, s], [-s, c]]) + [3.0, -1.0]
+    said = truth_sentence(Config(), truth(moved), stamps[1:-1], path[1:-1])
+    assert "set truth.align: se2" in said
+    assert truth_sentence(Config(), truth(path[:, :2] + 0.1), stamps[1:-1], path[1:-1]) is None
+    aligned = Config.model_validate({"truth": {"align": "se2"}})
+    assert truth_sentence(aligned, truth(moved), stamps[1:-1], path[1:-1]) is None
+    elsewhere = np.random.default_rng(0).normal(size=(len(t), 2))  # fits neither way: not a matter of frames
+    assert truth_sentence(Config(), truth(elsewhere), stamps[1:-1], path[1:-1]) is None
+
+
+# --- all of it ---
+
+
+def test_a_run_names_the_mistake_first_and_is_made_without_it(looked, tmp_path):
+    write_map(sized(load_map(SAMPLE / "map.yaml"), 0.95), tmp_path / "map.yaml")
+    result = run(SAMPLE / "bag", tmp_path / "map.yaml", looked.config, "online")
+    assert "set size: 0." in result.notes[0]
+    assert result.mistakes == result.notes[:1]
+    assert exit_code(result) == EXIT_LOST
+    metrics = compute_metrics(result, result.config)
+    assert metrics.mistakes == result.mistakes
+    assert metrics.ate_mean_m < 0.02
+    assert metrics.nees_over_3 < 3.0
+
+
+def test_info_names_the_mistake_first(looked, tmp_path):
+    config = looked.wheels(left_joint="right_wheel_joint", right_joint="left_wheel_joint")
+    (tmp_path / "robot.yaml").write_text(yaml_of(config, tmp_path))
+    arguments = ["--map", str(SAMPLE / "map.yaml"), "--config", str(tmp_path / "robot.yaml")]
+    shown = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), *arguments])
+    assert "What looks wrong:\n  - The left and the right wheel are exchanged: set wheels.left_joint:" in shown.output
