@@ -236,12 +236,4 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         Probe("fgloc.smoothing:_measure_again", something),
         batch=True,
     ),
-    Mechanism(
-        "gnc",
-        "Batch: graduated non-convexity decides on sightings and motions (off unless configured).",
-        ("graph/gnc.py", "graph/batch.py"),
-        (Switch(f"{_BATCH}._graduate", Returns(None)),),
-        Probe(f"{_BATCH}._graduate", called),
-        batch=True,
-    ),
 )

@@ -329,11 +329,6 @@ class BatchConfig(Section):
 
     outer_iterations: int = Field(2, ge=1, description="learned motion is re-evaluated at the smoothed velocities")
     max_iterations: int = Field(50, ge=1, description="of Levenberg–Marquardt, each")
-    robust: Literal["none", "gnc", "gnc_all"] = Field(
-        "none",
-        description="graduated non-convexity: gnc weighs wheels and landmarks anew, other motion is believed; "
-        "gnc_all weighs every factor, for comparison",
-    )
 
 
 class TruthConfig(Section):

@@ -120,7 +120,6 @@ def sighting_factors(
     lines: Sequence[Linearized],
     pose: FloatArray,
     theta: FloatArray,
-    share: float = 1.0,
 ) -> list[gtsam.NonlinearFactor]:
     """One factor for all sightings of one image, linear about a pose and an installation.
 
@@ -130,7 +129,6 @@ def sighting_factors(
         lines: the same, linearized there.
         pose: ``(3,)``.
         theta: ``(n,)``.
-        share: of their information.
     """
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*pose))
@@ -142,7 +140,7 @@ def sighting_factors(
     made = []
     for members in images.values():
         r, J, H, cov = stacked([lines[i] for i in members], len(theta), [sightings[i].weight for i in members])
-        W = math.sqrt(share) * sighting_whitening(cov)
+        W = sighting_whitening(cov)
         blocks = {pose_key(k): W @ J}
         if len(theta):
             blocks[INSTALLATION] = W @ H
