@@ -65,13 +65,6 @@ def _unblurred(real: Function) -> Function:
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
-        "robust_weight",
-        "Huber weights: sightings that agree badly with the prediction count less.",
-        ("graph/pose_fit.py", "graph/gating.py", "graph/batch.py"),
-        (Switch(f"{_GATE}:robust_weight", Returns(1.0)), Switch("fgloc.graph.batch:robust_weight", Returns(1.0))),
-        batch=True,
-    ),
-    Mechanism(
         "fit_kernel",
         "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not spoil the pose.",
         ("graph/pose_fit.py",),

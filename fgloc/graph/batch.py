@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TypeVar
 
@@ -28,7 +28,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.pose_fit import chi2_bound, robust_weight
+from fgloc.graph.pose_fit import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
@@ -110,7 +110,7 @@ class BatchSmoother:
                 break
 
     def _judged(self) -> dict[int, tuple[Sighting, ...]]:
-        """All sightings that the solution finds likely enough, with their robust weights."""
+        """All sightings that the solution finds likely enough."""
         seen = [
             (frame.k, pose, s)
             for frame, pose in zip(self.frames, self.poses(), strict=True)
@@ -126,15 +126,14 @@ class BatchSmoother:
         for (k, _, s), one in zip(seen, lines, strict=True):
             if one.behind or np.abs(one.residual).max() > _ABSURD:
                 continue
-            cov, dof = one.noise(), len(one.residual)
-            bound = chi2_bound(self._probability, dof)
+            cov, bound = one.noise(), chi2_bound(self._probability, len(one.residual))
             nis = _squared(one.residual, cov)
             if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
                 marginals = marginals or self._marginals()
                 cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
                 nis = _squared(one.residual, cov)
             if nis <= bound:
-                kept[k] = (*kept[k], replace(s, weight=robust_weight(nis, dof)))
+                kept[k] = (*kept[k], s)
         return kept
 
     def _leave_out_unlikely(self) -> None:

@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.moved_landmark_votes import Quarantine
-from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, robust_weight
+from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit
 from fgloc.types import (
     CornerMeasurement,
     Decision,
@@ -70,8 +70,6 @@ class Weights:
             measurements, shared, self._judge(measurements, predicted), strict=True
         ):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if dof and not reason:
-                sighting = dataclasses.replace(sighting, weight=robust_weight(nis, dof))
             if not reason:
                 fitting.append(sighting)
             elif reason == "gate":
