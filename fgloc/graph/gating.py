@@ -163,12 +163,12 @@ class Weights:
     def _compare(self, k: int, fitting: Sequence[Sighting], gated: Sequence[Sighting], predicted: Belief) -> None:
         """Others were believed, now or just before: what disagrees beside them may have been moved.
 
-        Without them, in the dark say, the prediction is too little known to say that a landmark is back in its place.
+        Without them, in the dark say, the prediction is too little known to be held against a landmark.
         """
         if not self._config.weights.adaptive or not self._factors.known:
             return
         for sighting in fitting:
-            self.quarantine.fits(sighting, k, predicted.pose, self._factors)
+            self.quarantine.fits(sighting.measurement.landmark_id)
         self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
