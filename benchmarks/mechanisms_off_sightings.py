@@ -123,7 +123,7 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
         "A landmark whose refused sightings agree on another place is named as moved and left out.",
         ("graph/moved_landmark_votes.py",),
         (Switch(f"{_VOTES}.disagree", Returns(None)),),
-        Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: len(quarantine) > 0),
+        Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: bool(quarantine.displacements)),
         batch=True,
     ),
     Mechanism(

@@ -20,7 +20,6 @@ from benchmarks.mechanisms_switch import (
     not_none,
     something,
 )
-from fgloc.graph.moved_landmark_votes import Quarantine
 from fgloc.types import FloatArray
 
 _GATE = "fgloc.graph.gating"
@@ -32,22 +31,6 @@ _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
 
 def _without_contrary(real: Function) -> Function:
     return lambda self, started: real(self, replace(started, contrary=frozenset()))
-
-
-def _refusals_not_counted(real: Function) -> Function:
-    def contradicted(self: Any) -> Any:
-        with patch.object(self, "refused_in_a_row", 0):
-            return real(self)
-
-    return contradicted
-
-
-def _nothing_in_quarantine(real: Function) -> Function:
-    def contradicted(self: Any) -> Any:
-        with patch.object(self, "quarantine", Quarantine(1)):
-            return real(self)
-
-    return contradicted
 
 
 def _at_prediction(real: Function) -> Function:
@@ -92,22 +75,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         ("relocalization/tracking_state.py", "relocalization/global_search.py"),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
-        batch=True,
-    ),
-    Mechanism(
-        "lost_by_refusals",
-        "So many refusals in a row, of two landmarks or more, make the robot lost.",
-        ("graph/gating.py", "localizer.py"),
-        (Switch(f"{_GATE}:Weights.contradicted", _refusals_not_counted),),
-        Probe(f"{_GATE}:Weights.contradicted", something),
-        batch=True,
-    ),
-    Mechanism(
-        "lost_by_quarantine",
-        "More moved landmarks than agreeing ones make the robot lost.",
-        ("graph/gating.py", "localizer.py"),
-        (Switch(f"{_GATE}:Weights.contradicted", _nothing_in_quarantine),),
-        Probe(f"{_GATE}:Weights.contradicted", something),
         batch=True,
     ),
     Mechanism(

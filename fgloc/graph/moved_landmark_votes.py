@@ -52,10 +52,6 @@ class Quarantine:
         """Landmarks in quarantine and how far ``(2,)`` [m], in the map, they seem to stand from their place."""
         return {i: np.median(case.places, axis=0) for i, case in sorted(self._cases.items()) if case.held}
 
-    def __len__(self) -> int:
-        """How many landmarks are in quarantine."""
-        return sum(case.held for case in self._cases.values())
-
     def forget(self) -> None:
         """What was held against landmarks was held against them from a wrong place."""
         self._cases.clear()
