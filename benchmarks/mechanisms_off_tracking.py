@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
@@ -43,10 +42,6 @@ def _never(real: Any) -> property:
 
 def _always(real: Any) -> property:
     return property(lambda self: True)
-
-
-def _empty(real: Any) -> property:
-    return property(lambda self: frozenset(), lambda self, value: None)
 
 
 def _all_landmarks(real: Function) -> Function:
@@ -114,19 +109,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         ("relocalization/global_search.py",),
         (Switch(f"{_SEARCH}:Initializer._checked", Returns(True)),),
         Probe(f"{_SEARCH}:Initializer._checked", lambda checked, *_: not checked),
-    ),
-    Mechanism(
-        "start_doubted",
-        "Landmarks that contradicted one another during the search do not make a place by themselves.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:Initializer._doubted", _empty, made_in_init=True),),
-        Probe(f"{_SEARCH}:Initializer._solve", lambda _, before, initializer, known: initializer._doubted),
-    ),
-    Mechanism(
-        "start_rivals",
-        "A place is not taken while another one explains nearly as much.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:_RIVAL_SHARE", Constant(math.inf)),),
     ),
     Mechanism(
         "start_trimming",
