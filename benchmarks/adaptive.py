@@ -55,7 +55,6 @@ VARIANTS: dict[str, Variant] = {
     "cauchy": Variant(NOMINAL | {"estimator": {"motion_kernel": "cauchy"}}),
     "dcs": Variant(NOMINAL | {"estimator": {"motion_kernel": "dcs"}}),
     "ekf": Variant(FIXED | {"estimator": {"kind": "ekf"}}),
-    "gnc": Variant(NOMINAL | {"batch": {"robust": "gnc_all"}}, batch=True),
 }
 PEERS = ("huber", "cauchy", "dcs", "ekf")
 QUICK_CASES, QUICK_VARIANTS = ("slip", "dark30"), ("ours", "fixed", "oracle")
@@ -173,9 +172,7 @@ def _peers(found: Found) -> Iterator[Row]:
     """Ours over each peer, and over the best of them in the case where that is worst for us."""
     worst: list[float] = []
     for name in CASES:
-        ours = found.get((name, "ours"))
         compared = [_over(found, f"peers.{name}.over_{peer}", name, peer) for peer in PEERS]
-        compared.append(_ratio(f"peers.{name}.batch_over_gnc", ours, found.get((name, "gnc")), _batch, _batch))
         yield from compared
         worst += [row.value for row in compared if row.value is not None]
     if worst:

@@ -47,7 +47,7 @@ from datasets.sim.camera import RenderError
 
 RULES = "corners_rules"
 RULES_CASES = ("none", "slip", "mu01", "dark30", "ids30", "moved", "frozen", "onewheel")
-QUICK_CASES, QUICK_MECHANISMS = ("none", "slip"), ("disagreement_test", "robust_weight")
+QUICK_CASES, QUICK_MECHANISMS = ("none", "slip"), ("disagreement_test", "misread_ids")
 _SEEDS: dict[Split, tuple[int, ...]] = {"validation": SEEDS["validation"][:3], "test": SEEDS["test"]}
 
 

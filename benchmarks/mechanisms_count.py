@@ -32,7 +32,6 @@ DECIDING = (
         for name in (
             "batch",
             "gating",
-            "gnc",
             "isam2",
             "joint",
             "moved_landmark_glr",

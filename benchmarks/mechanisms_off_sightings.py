@@ -47,14 +47,6 @@ def _testing(real: Function) -> Function:
 _linear_nis.testing = False  # type: ignore[attr-defined]
 
 
-def _never_released(real: Function) -> Function:
-    def fits(self: Any, sighting: Any, *args: Any) -> None:
-        if not self.holds(sighting.measurement.landmark_id):
-            real(self, sighting, *args)
-
-    return fits
-
-
 def _unblurred(real: Function) -> Function:
     def corner(*args: Any) -> Any:
         m = real(*args)
@@ -64,13 +56,6 @@ def _unblurred(real: Function) -> Function:
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
-    Mechanism(
-        "robust_weight",
-        "Huber weights: sightings that agree badly with the prediction count less.",
-        ("graph/pose_fit.py", "graph/gating.py", "graph/batch.py"),
-        (Switch(f"{_GATE}:robust_weight", Returns(1.0)), Switch("fgloc.graph.batch:robust_weight", Returns(1.0))),
-        batch=True,
-    ),
     Mechanism(
         "fit_kernel",
         "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not spoil the pose.",
@@ -138,7 +123,7 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
         "A landmark whose refused sightings agree on another place is named as moved and left out.",
         ("graph/moved_landmark_votes.py",),
         (Switch(f"{_VOTES}.disagree", Returns(None)),),
-        Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: len(quarantine) > 0),
+        Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: bool(quarantine.displacements)),
         batch=True,
     ),
     Mechanism(
@@ -147,18 +132,6 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
         ("graph/moved_landmark_votes.py",),
         (Switch(f"{_VOTES}._misread", Returns(False)),),
         Probe(f"{_VOTES}._misread", something),
-        batch=True,
-    ),
-    Mechanism(
-        "votes_release",
-        "A landmark named as moved that fits its place again, time after time, is used again.",
-        ("graph/moved_landmark_votes.py",),
-        (Switch(f"{_VOTES}.fits", _never_released),),
-        Probe(
-            f"{_VOTES}.fits",
-            lambda _, held, quarantine, s, *args: held and not quarantine.holds(s.measurement.landmark_id),
-            lambda quarantine, s, *args: quarantine.holds(s.measurement.landmark_id),
-        ),
         batch=True,
     ),
     Mechanism(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
@@ -20,7 +19,6 @@ from benchmarks.mechanisms_switch import (
     not_none,
     something,
 )
-from fgloc.graph.moved_landmark_votes import Quarantine
 from fgloc.types import FloatArray
 
 _GATE = "fgloc.graph.gating"
@@ -34,22 +32,6 @@ def _without_contrary(real: Function) -> Function:
     return lambda self, started: real(self, replace(started, contrary=frozenset()))
 
 
-def _refusals_not_counted(real: Function) -> Function:
-    def contradicted(self: Any) -> Any:
-        with patch.object(self, "refused_in_a_row", 0):
-            return real(self)
-
-    return contradicted
-
-
-def _nothing_in_quarantine(real: Function) -> Function:
-    def contradicted(self: Any) -> Any:
-        with patch.object(self, "quarantine", Quarantine(1)):
-            return real(self)
-
-    return contradicted
-
-
 def _at_prediction(real: Function) -> Function:
     return lambda self, frame: frame.belief
 
@@ -60,10 +42,6 @@ def _never(real: Any) -> property:
 
 def _always(real: Any) -> property:
     return property(lambda self: True)
-
-
-def _empty(real: Any) -> property:
-    return property(lambda self: frozenset(), lambda self, value: None)
 
 
 def _all_landmarks(real: Function) -> Function:
@@ -92,22 +70,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         ("relocalization/tracking_state.py", "relocalization/global_search.py"),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
-        batch=True,
-    ),
-    Mechanism(
-        "lost_by_refusals",
-        "So many refusals in a row, of two landmarks or more, make the robot lost.",
-        ("graph/gating.py", "localizer.py"),
-        (Switch(f"{_GATE}:Weights.contradicted", _refusals_not_counted),),
-        Probe(f"{_GATE}:Weights.contradicted", something),
-        batch=True,
-    ),
-    Mechanism(
-        "lost_by_quarantine",
-        "More moved landmarks than agreeing ones make the robot lost.",
-        ("graph/gating.py", "localizer.py"),
-        (Switch(f"{_GATE}:Weights.contradicted", _nothing_in_quarantine),),
-        Probe(f"{_GATE}:Weights.contradicted", something),
         batch=True,
     ),
     Mechanism(
@@ -147,19 +109,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         ("relocalization/global_search.py",),
         (Switch(f"{_SEARCH}:Initializer._checked", Returns(True)),),
         Probe(f"{_SEARCH}:Initializer._checked", lambda checked, *_: not checked),
-    ),
-    Mechanism(
-        "start_doubted",
-        "Landmarks that contradicted one another during the search do not make a place by themselves.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:Initializer._doubted", _empty, made_in_init=True),),
-        Probe(f"{_SEARCH}:Initializer._solve", lambda _, before, initializer, known: initializer._doubted),
-    ),
-    Mechanism(
-        "start_rivals",
-        "A place is not taken while another one explains nearly as much.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:_RIVAL_SHARE", Constant(math.inf)),),
     ),
     Mechanism(
         "start_trimming",
@@ -226,14 +175,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         ("smoothing.py",),
         (Switch("fgloc.smoothing:_measure_again", Returns({})),),
         Probe("fgloc.smoothing:_measure_again", something),
-        batch=True,
-    ),
-    Mechanism(
-        "gnc",
-        "Batch: graduated non-convexity decides on sightings and motions (off unless configured).",
-        ("graph/gnc.py", "graph/batch.py"),
-        (Switch(f"{_BATCH}._graduate", Returns(None)),),
-        Probe(f"{_BATCH}._graduate", called),
         batch=True,
     ),
 )

@@ -63,12 +63,10 @@ class Switch:
     Attributes:
         target: ``package.module:name`` or ``package.module:Class.name``.
         off: makes the replacement of what is there.
-        made_in_init: the name is an attribute that only instances have.
     """
 
     target: str
     off: Callable[[Any], Any]
-    made_in_init: bool = False
 
     def place(self) -> tuple[Any, str]:
         """The object that holds what is replaced, and its name there.
@@ -78,7 +76,7 @@ class Switch:
         """
         owner, _, name = self.target.rpartition("." if "." in self.target.partition(":")[2] else ":")
         holder = resolve_name(owner)
-        if not self.made_in_init and not hasattr(holder, name):
+        if not hasattr(holder, name):
             raise AttributeError(f"{self.target} does not exist; is the mechanism gone? Then delete its row")
         return holder, name
 
@@ -86,7 +84,7 @@ class Switch:
     def replaced(self) -> Iterator[None]:
         """The replacement stands while this holds."""
         holder, name = self.place()
-        with patch.object(holder, name, self.off(getattr(holder, name, None)), create=self.made_in_init):
+        with patch.object(holder, name, self.off(getattr(holder, name))):
             yield
 
 

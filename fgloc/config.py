@@ -286,9 +286,6 @@ class EstimatorConfig(Section):
     initial_sigmas: tuple[float, float, float] = (0.05, 0.05, 0.05)
     initialise_s: float = Field(5.0, gt=0, description="how long to collect sightings for the first pose")
     gate_probability: float = Field(0.9999, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
-    lost_after: int = Field(
-        20, gt=0, description="consecutive rejected sightings, of two landmarks or more, that mean LOST"
-    )
     dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
         "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
@@ -329,11 +326,6 @@ class BatchConfig(Section):
 
     outer_iterations: int = Field(2, ge=1, description="learned motion is re-evaluated at the smoothed velocities")
     max_iterations: int = Field(50, ge=1, description="of Levenberg–Marquardt, each")
-    robust: Literal["none", "gnc", "gnc_all"] = Field(
-        "none",
-        description="graduated non-convexity: gnc weighs wheels and landmarks anew, other motion is believed; "
-        "gnc_all weighs every factor, for comparison",
-    )
 
 
 class TruthConfig(Section):

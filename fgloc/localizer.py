@@ -241,8 +241,6 @@ class Localizer:
         if accused:  # the pose was corrected: no motion leads from where it was thought to be
             self.sources.begin_segment()
             self.trust.reset()
-        if self.factors.known and self.weights.contradicted() and not self._whereabouts.holds_given:
-            self._get_lost()
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, trust.scale, doubt
         decisions += motion_decisions(
@@ -293,12 +291,10 @@ class Localizer:
         self.rejections["motion.jump"] += 1
         self.sources.begin_segment()
         self.trust.reset()
-        self.weights.forget_refusals()
         estimate = self._start(step, place, ())
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 
     def _get_lost(self) -> None:
-        self.weights.forget_refusals()
         self.weights.quarantine.forget()
         self._whereabouts.get_lost()
 

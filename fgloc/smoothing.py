@@ -45,8 +45,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     localizer, config = parts.localizer, parts.config
     log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
     solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability, moved)
-    if config.batch.robust == "gnc" and solver.outliers:
-        solver.replace_motions(_without(parts, solver))
     if parts.learned is not None and parts.learned.reads_velocity:
         for _ in range(config.batch.outer_iterations - 1):
             solver.replace_motions(_measure_again(parts, solver))
@@ -61,17 +59,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
     return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
-
-
-def _without(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:
-    """Motions of the keyframes with outliers, made as if these sources had been switched off online."""
-    changed = {}
-    for frame in solver.frames:
-        if frame.k in solver.outliers:
-            frame.off = {**dict.fromkeys(solver.outliers[frame.k], "outlier"), **frame.off}
-            if motions := parts.localizer.sources.combine_again(frame):
-                changed[frame.k] = tuple(motions)
-    return changed
 
 
 def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

@@ -21,7 +21,7 @@ from benchmarks.mechanisms_report import report, without_effect
 from benchmarks.mechanisms_rows import Scope, over_before, wanted
 from benchmarks.mechanisms_runs import file_name, named, outcome
 from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
-from fgloc.graph import gating
+from fgloc.graph import gating, pose_fit
 from fgloc.graph.gating import Weights
 from fgloc.types import LandmarkMap
 
@@ -118,12 +118,6 @@ def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():
         assert set(refusals(world)) == {"gate", "contradicts_start"}
 
 
-def test_robust_weights_are_one_while_they_are_off():
-    with BY_NAME["robust_weight"].off():
-        assert gating.robust_weight(1e3, 8) == 1.0
-    assert gating.robust_weight(1e3, 8) < 1.0
-
-
 def test_what_is_returned_may_be_changed_by_the_caller():
     empty = Returns([])(None)
     empty().append(1)
@@ -162,9 +156,9 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
 
 
 def test_several_at_once_are_all_off_and_have_one_file():
-    both = named("gate+robust_weight")
+    both = named("gate+fit_kernel")
     with both.off():
-        assert gating.robust_weight(1e3, 8) == 1.0
+        assert pose_fit.cauchy_k(None, None) > 1e3
         assert gating.chi2_bound(0.99, 2) == math.inf
     name = file_name(Cell(3, "none", both.name))
     assert "together" in name
@@ -212,7 +206,7 @@ def test_rows_are_ratios_of_means_and_those_without_value_say_why():
 
 
 def test_the_table_is_well_formed_and_names_what_has_no_effect():
-    chosen = scope("gate", "robust_weight", "misread_ids")
+    chosen = scope("gate", "fit_kernel", "misread_ids")
     on = result(batch=1.0, acted={"gate": 1}, delays_s=(0.2,), found_m=(0.05,), missed_m=(0.04, 0.01), path_m=500.0)
     found = found_in(chosen, on, result(batch=1.0))
     rows = [w.row(w.id, found) for w in wanted(chosen) if w.cells]
@@ -223,7 +217,7 @@ def test_the_table_is_well_formed_and_names_what_has_no_effect():
     assert values["motion.false_per_km"] == 0.0
     assert values["none.batch.nees_over_3"] == 1.0
     assert values["kidnap.nees_while_lifted"] is None
-    assert without_effect(chosen, found) == ["gate", "robust_weight", "misread_ids"]
+    assert without_effect(chosen, found) == ["gate", "fit_kernel", "misread_ids"]
     found = found_in(chosen, on, result(1.2, batch=0.5))
     assert without_effect(chosen, found) == []
     assert "none.online.ate: 1 -> 1.2" in report(chosen, found)

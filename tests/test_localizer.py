@@ -276,7 +276,7 @@ def test_fault_51_a_moved_marker_alone_in_view_does_not_carry_the_robot_away():
     chain = Chain(config(), world_map)
     estimates = chain.run(events)
     refused = [e.stamp_ns for e in estimates for d in e.decisions if d.landmark_id == 12 and d.reason]
-    assert len(refused) > config().estimator.lost_after + 10
+    assert len(refused) > 30
     assert modes(estimates) == [Mode.OK, Mode.DEAD_RECKONING]
     assert chain.localizer.counts["prior"] == 1
     for e in estimates:

@@ -6,8 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TypeVar
 
@@ -27,10 +26,9 @@ from fgloc.graph.factors import (
     sighting_factors,
     sighting_whitening,
 )
-from fgloc.graph.gnc import LEAST_WEIGHT, Candidate, graduate
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.pose_fit import chi2_bound, robust_weight
+from fgloc.graph.pose_fit import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
@@ -66,13 +64,11 @@ class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
     The first solution holds what was believed online; then every sighting is looked at again, and those that the
-    smoothed trajectory finds less likely than ``1 - gate_probability`` are left out. With ``config.robust``
-    graduated non-convexity decides instead, over sightings and motions at once.
+    smoothed trajectory finds less likely than ``1 - gate_probability`` are left out.
 
     Attributes:
         frames: the keyframes.
         believed: the sightings in the graph, by keyframe.
-        outliers: motion sources that are not believed, by keyframe; their factors say next to nothing.
     """
 
     def __init__(
@@ -95,14 +91,10 @@ class BatchSmoother:
         self._config = config
         self._probability = gate_probability
         self._moved = moved
-        self.outliers: dict[int, frozenset[str]] = {}
         self.believed = {frame.k: _of_others(frame.sightings, moved) for frame in self.frames}
         self._values = _initial(self.frames, self.believed, self._factors)
         self._optimize()
-        if self._config.robust != "none":
-            self._graduate()
-            self._optimize()
-        elif factors.known:
+        if factors.known:
             self._decide()
         else:
             self._leave_out_unlikely()
@@ -118,7 +110,7 @@ class BatchSmoother:
                 break
 
     def _judged(self) -> dict[int, tuple[Sighting, ...]]:
-        """All sightings that the solution finds likely enough, with their robust weights."""
+        """All sightings that the solution finds likely enough."""
         seen = [
             (frame.k, pose, s)
             for frame, pose in zip(self.frames, self.poses(), strict=True)
@@ -134,15 +126,14 @@ class BatchSmoother:
         for (k, _, s), one in zip(seen, lines, strict=True):
             if one.behind or np.abs(one.residual).max() > _ABSURD:
                 continue
-            cov, dof = one.noise(), len(one.residual)
-            bound = chi2_bound(self._probability, dof)
+            cov, bound = one.noise(), chi2_bound(self._probability, len(one.residual))
             nis = _squared(one.residual, cov)
             if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
                 marginals = marginals or self._marginals()
                 cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
                 nis = _squared(one.residual, cov)
             if nis <= bound:
-                kept[k] = (*kept[k], replace(s, weight=robust_weight(nis, dof)))
+                kept[k] = (*kept[k], s)
         return kept
 
     def _leave_out_unlikely(self) -> None:
@@ -152,50 +143,6 @@ class BatchSmoother:
             for k, held in self.believed.items()
         }
         self._optimize()
-
-    def _graduate(self) -> None:
-        """Decide by graduated non-convexity which sightings and motions are believed.
-
-        The online estimator's own doubts stay: a source that it switched off is not in the log's motions.
-        """
-        sources = None if self._config.robust == "gnc_all" else {"wheels"}  # None: all
-        inliers = gtsam.NonlinearFactorGraph()
-        motions: list[tuple[int, str]] = []
-        sightings: list[tuple[int, Sighting]] = []
-        candidates: list[Candidate] = []
-        for factor in self._priors():
-            inliers.add(factor)
-        poses = self.poses()
-        for i, frame in enumerate(self.frames):
-            for m in frame.motions:
-                factor = installed_motion_factor(frame.k, m, poses[i - 1], self._factors.installation)
-                if sources is not None and m.source not in sources:
-                    inliers.add(factor)
-                    continue
-                motions.append((frame.k, m.source))
-                made = partial(self._weighted_motion, frame.k, m, poses[i - 1])
-                candidates.append(Candidate((factor,), chi2_bound(self._probability, 3), made))
-        for frame, pose in zip(self.frames, poses, strict=True):
-            for s in _of_others((*frame.sightings, *frame.refused), self._moved):
-                factors = tuple(self._sighting_factors([(frame.k, pose, s)]))
-                if factors:
-                    sightings.append((frame.k, s))
-                    bound = chi2_bound(self._probability, sum(factor.dim() for factor in factors))
-                    again = partial(self._sighting_factors, [(frame.k, pose, s)]) if self._factors.known else None
-                    candidates.append(Candidate(factors, bound, again))
-        weights, self._values = graduate(inliers, candidates, self._values, self._solve)
-        trusted = (weights >= 0.5).tolist()
-        doubted = [key for key, good in zip(motions, trusted, strict=False) if not good]
-        self.outliers = {k: frozenset(s for key, s in doubted if key == k) for k, _ in doubted}
-        self.believed = {frame.k: () for frame in self.frames}
-        for (k, sighting), good in zip(sightings, trusted[len(motions) :], strict=True):
-            if good:
-                self.believed[k] = (*self.believed[k], sighting)
-
-    def _weighted_motion(
-        self, k: int, m: MotionMeasurement, before: FloatArray, weight: float
-    ) -> tuple[gtsam.NonlinearFactor]:
-        return (installed_motion_factor(k, replace(m, cov=m.cov / weight), before, self._factors.installation),)
 
     def stamps_ns(self) -> IntArray:
         """Times of the keyframes ``(n,)``."""
@@ -209,7 +156,6 @@ class BatchSmoother:
         """Take other motion measurements for these keyframes, and solve again from the last solution."""
         for frame in self.frames:
             frame.motions = motions.get(frame.k, frame.motions)
-        self.outliers = {k: held for k, held in self.outliers.items() if k not in motions}
         self._optimize()
 
     def installed(self) -> InstallationBelief:
@@ -310,8 +256,6 @@ class BatchSmoother:
         poses = self.poses()
         for i, frame in enumerate(self.frames):
             for motion in frame.motions:
-                if motion.source in self.outliers.get(frame.k, ()):
-                    motion = replace(motion, cov=motion.cov / LEAST_WEIGHT)
                 graph.add(installed_motion_factor(frame.k, motion, poses[i - 1], self._factors.installation))
         return graph
 
@@ -324,10 +268,8 @@ class BatchSmoother:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
 
-    def _sighting_factors(
-        self, seen: Sequence[tuple[int, FloatArray, Sighting]], share: float = 1.0
-    ) -> Iterator[gtsam.NonlinearFactor]:
-        """Of sightings with their keyframes and poses, keyframes in order; a share of them if the map is known."""
+    def _sighting_factors(self, seen: Sequence[tuple[int, FloatArray, Sighting]]) -> Iterator[gtsam.NonlinearFactor]:
+        """Of sightings with their keyframes and poses, keyframes in order."""
         if not self._factors.known or not seen:
             for _, _, s in seen:
                 yield from s.factors
@@ -339,7 +281,7 @@ class BatchSmoother:
             kept = [(pose, s, one) for (_, pose, s), one in group if not one.behind]
             if kept:
                 sightings, ahead = [s for _, s, _ in kept], [one for _, _, one in kept]
-                yield from sighting_factors(k, sightings, ahead, kept[0][0], theta, share)
+                yield from sighting_factors(k, sightings, ahead, kept[0][0], theta)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         params = gtsam.LevenbergMarquardtParams()

@@ -120,17 +120,15 @@ def sighting_factors(
     lines: Sequence[Linearized],
     pose: FloatArray,
     theta: FloatArray,
-    share: float = 1.0,
 ) -> list[gtsam.NonlinearFactor]:
     """One factor for all sightings of one image, linear about a pose and an installation.
 
     Args:
         k: keyframe.
-        sightings: with their robust weights.
+        sightings: made there.
         lines: the same, linearized there.
         pose: ``(3,)``.
         theta: ``(n,)``.
-        share: of their information.
     """
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*pose))
@@ -141,8 +139,8 @@ def sighting_factors(
         images.setdefault(sighting.measurement.stamp_ns, []).append(i)
     made = []
     for members in images.values():
-        r, J, H, cov = stacked([lines[i] for i in members], len(theta), [sightings[i].weight for i in members])
-        W = math.sqrt(share) * sighting_whitening(cov)
+        r, J, H, cov = stacked([lines[i] for i in members], len(theta))
+        W = sighting_whitening(cov)
         blocks = {pose_key(k): W @ J}
         if len(theta):
             blocks[INSTALLATION] = W @ H
@@ -150,23 +148,19 @@ def sighting_factors(
     return made
 
 
-def stacked(
-    lines: Sequence[Linearized], n: int, weights: Sequence[float] | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def stacked(lines: Sequence[Linearized], n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Residual ``(d,)``, Jacobians ``(d, 3)`` and ``(d, n)``, noise covariance ``(d, d)`` of sightings of one image."""
     r = np.concatenate([one.residual for one in lines])
     J = np.vstack([one.J for one in lines])
-    H, spread = np.zeros((len(r), n)), np.ones(len(r))
+    H = np.zeros((len(r), n))
     row, most = 0, max(one.shared.shape[1] for one in lines)
     shared = np.zeros((len(r), most))
-    for i, one in enumerate(lines):
+    for one in lines:
         d = len(one.residual)
         H[row : row + d, one.columns] = one.H
         shared[row : row + d, : one.shared.shape[1]] = one.shared
-        if weights is not None:
-            spread[row : row + d] = 1.0 / weights[i]
         row += d
-    return r, J, H, np.diag(spread) + shared @ shared.T
+    return r, J, H, np.eye(len(r)) + shared @ shared.T
 
 
 def _whitening(cov: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import Belief, Sighting
 from fgloc.graph.moved_landmark_votes import Quarantine
-from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit, robust_weight
+from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit
 from fgloc.types import (
     CornerMeasurement,
     Decision,
@@ -24,7 +24,6 @@ from fgloc.types import (
 
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
-_LATELY_NS = 20_000_000_000
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -34,7 +33,6 @@ class Weights:
 
     Attributes:
         rejections: refused sightings by reason.
-        refused_in_a_row: sightings refused since the last one believed.
         contrary: sightings, by stamp and landmark, that contradict the place where the run starts: not to be believed.
     """
 
@@ -45,8 +43,6 @@ class Weights:
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
         self.contrary: frozenset[tuple[int, int]] = frozenset()
-        self.refused_in_a_row = 0
-        self._refused_ids: set[int] = set()
         self._believed_ns = 0  # the newest keyframe at which something was believed
         self.quarantine = Quarantine(config.weights.quarantine_after)
 
@@ -70,8 +66,6 @@ class Weights:
             measurements, shared, self._judge(measurements, predicted), strict=True
         ):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if dof and not reason:
-                sighting = dataclasses.replace(sighting, weight=robust_weight(nis, dof))
             if not reason:
                 fitting.append(sighting)
             elif reason == "gate":
@@ -100,7 +94,6 @@ class Weights:
                 )
             )
         if believed:
-            self.forget_refusals()
             self._believed_ns = stamp_ns
             for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
@@ -110,10 +103,6 @@ class Weights:
                 decisions.append(decision)
         if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
-        if not believed:
-            contrary = [d.landmark_id for d in decisions if d.reason != "quarantined"]
-            self.refused_in_a_row += len(contrary)
-            self._refused_ids.update(contrary)
         return believed, refused, decisions
 
     def _read_again(
@@ -165,12 +154,12 @@ class Weights:
     def _compare(self, k: int, fitting: Sequence[Sighting], gated: Sequence[Sighting], predicted: Belief) -> None:
         """Others were believed, now or just before: what disagrees beside them may have been moved.
 
-        Without them, in the dark say, the prediction is too little known to say that a landmark is back in its place.
+        Without them, in the dark say, the prediction is too little known to be held against a landmark.
         """
         if not self._config.weights.adaptive or not self._factors.known:
             return
         for sighting in fitting:
-            self.quarantine.fits(sighting, k, predicted.pose, self._factors)
+            self.quarantine.fits(sighting.measurement.landmark_id)
         self.quarantine.disagree(gated, k, predicted.pose, self._factors)
 
     def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
@@ -190,7 +179,6 @@ class Weights:
             return None
         self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
         self.rejections += Counter()  # drops the zeros
-        self.refused_in_a_row -= sum(d.reason != "quarantined" for d in decisions)
         return fit
 
     def _judge(self, measurements: Sequence[LandmarkMeasurement], predicted: Belief) -> list[tuple[float, int, str]]:
@@ -287,24 +275,3 @@ class Weights:
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
-        self.forget_refusals()
-
-    def contradicted(self) -> bool:
-        """Whether so much was refused, and so little believed, that the robot must be elsewhere.
-
-        One landmark alone does not say so, however often it is seen: it may have been moved. Nor do two or more in
-        quarantine, unless fewer than they agree: then it is not they that are in the wrong place.
-        """
-        if self.refused_in_a_row >= self._config.estimator.lost_after and len(self._refused_ids) > 1:
-            return True
-        held = len(self.quarantine)
-        return held > 1 and held >= len(self._agreeing(_LATELY_NS))
-
-    def _agreeing(self, lately_ns: int) -> set[int]:
-        """Landmarks believed in this last time."""
-        return {i for i, stamp_ns in self._last_used_ns.items() if stamp_ns > self._believed_ns - lately_ns}
-
-    def forget_refusals(self) -> None:
-        """Count refusals anew."""
-        self.refused_in_a_row = 0
-        self._refused_ids.clear()

@@ -182,8 +182,7 @@ class IncrementalEstimator(Estimator):
             return frame.belief
         known = frame.belief.installation or self.installed
         measurements = [s.measurement for s in frame.sightings]
-        weights = [s.weight for s in frame.sightings]
-        corrected = correct(frame.belief, known, measurements, self._factors, weights)
+        corrected = correct(frame.belief, known, measurements, self._factors)
         return frame.belief if corrected is None else corrected[0]
 
     def _newest(self, k: int) -> Belief:

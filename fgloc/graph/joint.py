@@ -99,9 +99,9 @@ def joint_cov(belief: Belief, known: InstallationBelief) -> FloatArray:
     return P
 
 
-def innovation(P: FloatArray, lines: Sequence[Linearized], weights: Sequence[float] | None = None) -> Innovation:
+def innovation(P: FloatArray, lines: Sequence[Linearized]) -> Innovation:
     """The innovation of sightings, linearized at the belief whose joint covariance ``P`` is."""
-    residual, J, H, noise = stacked(lines, len(P) - 3, weights)
+    residual, J, H, noise = stacked(lines, len(P) - 3)
     both = np.hstack([J, H])
     return Innovation(residual, both, noise, both @ P @ both.T + noise)
 
@@ -121,7 +121,6 @@ def correct(
     known: InstallationBelief,
     measurements: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
-    weights: Sequence[float] | None = None,
 ) -> tuple[Belief, float] | None:
     """Pose and installation that prediction and sightings make likeliest, by Gauss-Newton.
 
@@ -138,7 +137,7 @@ def correct(
         lines = observed.linearize(pose, theta)
         if any(one.behind for one in lines):
             return None
-        found = innovation(P, lines, weights)
+        found = innovation(P, lines)
         try:
             factor = cho_factor(found.cov, check_finite=False)
         except np.linalg.LinAlgError:  # corners hardly in front of the camera

@@ -35,7 +35,6 @@ class Sighting:
     measurement: LandmarkMeasurement
     alone: LandmarkMeasurement  # before sightings near in time shared their information
     cauchy_k: float | None
-    weight: float = 1.0  # of the robust kernel, on the information
     factors: tuple[gtsam.NonlinearFactor, ...] = ()  # of a landmark that is a variable
 
 

@@ -29,7 +29,6 @@ class _Case:
     places: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     distances: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # that it was seen from [m]
     held: bool = False
-    fitted: int = 0  # sightings in a row that fitted although it was held
     refused: int = 0  # sightings
     before: Counter[int] = field(default_factory=Counter)  # sightings of each landmark that had fitted until then
 
@@ -37,8 +36,7 @@ class _Case:
 class Quarantine:
     """Counts, for every landmark, how often it was refused while others were believed.
 
-    Wrong ids scatter: only a landmark whose refused sightings agree on another place has been moved. One that fits
-    again, time after time, is believed again.
+    Wrong ids scatter: only a landmark whose refused sightings agree on another place has been moved.
 
     Source: design.md §6.5.
     """
@@ -54,10 +52,6 @@ class Quarantine:
         """Landmarks in quarantine and how far ``(2,)`` [m], in the map, they seem to stand from their place."""
         return {i: np.median(case.places, axis=0) for i, case in sorted(self._cases.items()) if case.held}
 
-    def __len__(self) -> int:
-        """How many landmarks are in quarantine."""
-        return sum(case.held for case in self._cases.values())
-
     def forget(self) -> None:
         """What was held against landmarks was held against them from a wrong place."""
         self._cases.clear()
@@ -72,20 +66,11 @@ class Quarantine:
         case = self._cases.get(landmark_id)
         return case is not None and case.held
 
-    def fits(self, sighting: Sighting, k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
-        """A sighting agreed with the prediction; arguments as those of `disagree`."""
-        landmark_id = sighting.measurement.landmark_id
+    def fits(self, landmark_id: int) -> None:
+        """A sighting of this landmark agreed with the prediction."""
         self._fitted[landmark_id] += 1
         case = self._cases.get(landmark_id)
-        if case is None:
-            return
-        if case.held:
-            # One that is seen too badly to be refused is no sign that it is back in its place.
-            place, moved = displacement(sighting, pose, factors), np.median(case.places, axis=0)
-            back = place is not None and math.hypot(*place) < math.hypot(*(place - moved))
-            case.fitted = case.fitted + 1 if back else 0
-            if case.fitted > 2 * self._after:
-                del self._cases[landmark_id]
+        if case is None or case.held:
             return
         case.score -= _BELIEVED_COUNTS
         if case.score <= 0.0:
@@ -105,7 +90,6 @@ class Quarantine:
             if landmark_id not in self._cases:
                 self._cases[landmark_id] = _Case(before=self._fitted.copy())
             case = self._cases[landmark_id]
-            case.fitted = 0
             if case.held:
                 continue
             case.score += 1.0

@@ -18,7 +18,6 @@ from fgloc.graph.observation import CornerBatch, PlanarBatch, Stacked
 from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
-_HUBER = 0.95
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
 
 
@@ -143,9 +142,3 @@ def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArra
     """Cauchy's costs of squared whitened residuals, as if they were those of two-dimensional sightings."""
     pairs = dof / 2.0
     return np.asarray(k**2 * np.log1p(square / pairs / k**2) * pairs)
-
-
-def robust_weight(nis: float, dof: int) -> float:
-    """Huber's weight of a sighting with this squared Mahalanobis distance: 1 up to what one in twenty exceeds."""
-    bound = chi2_bound(_HUBER, dof)
-    return 1.0 if nis <= bound else math.sqrt(bound / nis)

@@ -16,7 +16,7 @@ from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Belief
 from fgloc.graph.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
 from fgloc.relocalization.gaussian_sum import GaussianSum
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, REDUNDANT, Agreed, SightingKey, apart
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, Agreed, SightingKey, apart
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
@@ -34,7 +34,6 @@ from fgloc.types import (
 _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
 ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
-_RIVAL_SHARE = 0.7  # of what the best place explains: a place that explains less is no rival
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
 _HEARD = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
@@ -96,7 +95,6 @@ class Initializer:
         self._earlier: list[Collected] = []  # with keep_all: before those, since the segment began
         self._first = False  # whether the segment has had no pose yet
         self.hypotheses = GaussianSum(config, landmark_map)
-        self._doubted: frozenset[int] = frozenset()  # landmarks that contradicted one another
         self._since_ns: int | None = None  # the first sighting of the search
         self.waiting = True
 
@@ -116,7 +114,7 @@ class Initializer:
         self._earlier.clear()
         self.hypotheses.reset()
         self._first = False
-        self._doubted, self._since_ns = frozenset(), None
+        self._since_ns = None
 
     def collect(
         self,
@@ -126,7 +124,7 @@ class Initializer:
         readings: Readings | None = None,
         known: bool = False,
     ) -> Start | None:
-        """Add a step; return the start once one place explains what was seen and no other does.
+        """Add a step; return the start once one place explains what was seen.
 
         Args:
             step: the next one.
@@ -187,19 +185,10 @@ class Initializer:
             if len(places) < _MAX_PLACES and all(apart(fit.pose, other) for other in places):
                 places.append(fit.pose)
         found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
-        found.sort(key=lambda agreed: (-agreed.share, agreed.fit.cost))
         if not found:
             return None
-        best = found[0]
-        rivals = [other for other in found[1:] if apart(best.fit.pose, other.fit.pose)]
-        if best.redundancy < REDUNDANT and not known:
-            if best.opposing:
-                self._doubted |= best.opposing | best.agreeing
-            if best.agreeing & self._doubted:
-                return None
+        best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
         if not best.certain or (known and not best.compelling):
-            return None
-        if any(r.share > _RIVAL_SHARE * best.share and not best.beats(r) for r in rivals):
             return None
         if not known and not self._checked(best, here) and not (best.sharp and self._waited()):
             return None

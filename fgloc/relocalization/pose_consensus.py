@@ -11,7 +11,6 @@ from fgloc.graph.pose_fit import Fit
 from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
-_MARGIN = 9.0  # how much more a rival place has to cost (in units of squared sigma)
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
 _SHARP = 0.4  # times that, of a place that one beacon could feign
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
@@ -66,11 +65,6 @@ class Agreed:
         """Whether it says that the robot is not where it was believed to be."""
         known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
         return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * REDUNDANT
-
-    def beats(self, other: Agreed) -> bool:
-        """Whether a place that explains about as much is so much worse that it is none."""
-        worse = other.fit.cost > MAX_COST_PER_DOF * other.fit.dof
-        return worse or (self.share == other.share and other.fit.cost > self.fit.cost + _MARGIN)
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
