@@ -291,6 +291,7 @@ class Localizer:
         self.rejections["motion.jump"] += 1
         self.sources.begin_segment()
         self.trust.reset()
+        self.weights.contradiction_is_over()
         estimate = self._start(step, place, ())
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 

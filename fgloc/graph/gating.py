@@ -43,6 +43,7 @@ class Weights:
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
         self.contrary: frozenset[tuple[int, int]] = frozenset()
+        self._contradicting: set[int] = set()
         self._believed_ns = 0  # the newest keyframe at which something was believed
         self.quarantine = Quarantine(config.weights.quarantine_after)
 
@@ -95,6 +96,7 @@ class Weights:
             )
         if believed:
             self._believed_ns = stamp_ns
+            self._contradicting.clear()
             for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
                 refused.remove(misread)
@@ -103,6 +105,8 @@ class Weights:
                 decisions.append(decision)
         if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
+        if not believed:
+            self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
         return believed, refused, decisions
 
     def _read_again(
@@ -270,8 +274,13 @@ class Weights:
     @property
     def contradicting(self) -> int:
         """How many landmarks were refused since one was believed."""
-        return len(self._refused_ids)
+        return len(self._contradicting)
+
+    def contradiction_is_over(self) -> None:
+        """The robot is elsewhere: what contradicted the pose does so no more."""
+        self._contradicting.clear()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
+        self.contradiction_is_over()
