@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
-
-import numpy as np
 
 from benchmarks.mechanisms_switch import (
     Constant,
@@ -19,7 +16,6 @@ from benchmarks.mechanisms_switch import (
     not_none,
     something,
 )
-from fgloc.types import FloatArray
 
 _GATE = "fgloc.graph.gating"
 _SEARCH = "fgloc.relocalization.global_search"
@@ -42,25 +38,6 @@ def _never(real: Any) -> property:
 
 def _always(real: Any) -> property:
     return property(lambda self: True)
-
-
-def _all_landmarks(real: Function) -> Function:
-    return lambda self, log, factors, config, probability, moved=(): real(self, log, factors, config, probability)
-
-
-class _Certain:
-    """Marginal covariances of poses that are known exactly."""
-
-    def marginalCovariance(self, key: int) -> FloatArray:  # noqa: N802 (GTSAM's)
-        return np.zeros((3, 3))
-
-
-def _certain_poses(real: Function) -> Function:
-    def judged(self: Any) -> Any:
-        with patch.object(self, "_marginals", _Certain):
-            return real(self)
-
-    return judged
 
 
 OF_TRACKING: tuple[Mechanism, ...] = (
@@ -143,30 +120,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
             lambda belief, before, self, frame: belief is not before,
             lambda self, frame: frame.belief,
         ),
-        batch=True,
-    ),
-    Mechanism(
-        "batch_regating",
-        "Batch: all sightings, the refused ones too, are gated again at the smoothed trajectory.",
-        ("graph/batch.py",),
-        (Switch(f"{_BATCH}._decide", Returns(None)),),
-        Probe(f"{_BATCH}._decide", called),
-        batch=True,
-    ),
-    Mechanism(
-        "batch_pose_sigma",
-        "Batch: sightings that are not in the graph are gated with the covariance of the smoothed pose.",
-        ("graph/batch.py",),
-        (Switch(f"{_BATCH}._judged", _certain_poses),),
-        Probe(f"{_BATCH}._judged", called),
-        batch=True,
-    ),
-    Mechanism(
-        "batch_without_moved",
-        "Batch: landmarks named as moved are left out.",
-        ("graph/batch.py", "smoothing.py"),
-        (Switch(f"{_BATCH}.__init__", _all_landmarks),),
-        Probe(f"{_BATCH}.__init__", lambda _, before, self, log, factors, config, probability, moved=(): moved),
         batch=True,
     ),
     Mechanism(

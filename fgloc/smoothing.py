@@ -43,8 +43,8 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
         EstimatorError: the graph cannot be solved.
     """
     localizer, config = parts.localizer, parts.config
-    log, moved = localizer.estimator.log, localizer.weights.quarantine.displacements
-    solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability, moved)
+    log = localizer.estimator.log
+    solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability)
     if parts.learned is not None and parts.learned.reads_velocity:
         for _ in range(config.batch.outer_iterations - 1):
             solver.replace_motions(_measure_again(parts, solver))

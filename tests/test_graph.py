@@ -464,17 +464,6 @@ def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(k
     assert estimator.update(7 * 10**8, 0.1, step).pose == pytest.approx((0.7, 0.5, 0.0), abs=1e-6)
 
 
-def test_moved_and_contradicting_landmarks_are_left_out_of_the_batch():
-    """A marker seen as if from close by was refused, and stays so; one that was moved is left out although it fits."""
-    walls, start = LandmarkFactors(wall_map()), Belief(np.zeros(3), np.eye(3) * 100.0)
-    sound, moved = (walls.sighting(0, corner_sighting(np.zeros(3), wall_map().landmarks[i]), 3.0) for i in (0, 7))
-    near = walls.sighting(0, corner_sighting(np.array([2.7, 0.0, 0.0]), wall_map().landmarks[0]), 300.0)
-    log = MeasurementLog(10.0, keep_all=True)
-    log.append(Keyframe(0, 0, 0.0, start, prior=start, sightings=(sound, moved), refused=(near,)))
-    solver = BatchSmoother(log, walls, BatchConfig(), 0.9999, {7})
-    assert [s.measurement for s in solver.believed[0]] == [sound.measurement]
-
-
 def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
     landmarks = wall_map()
     factors = LandmarkFactors(landmarks)

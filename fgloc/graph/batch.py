@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
@@ -24,7 +24,6 @@ from fgloc.graph.factors import (
     pose_key,
     prior_factor,
     sighting_factors,
-    sighting_whitening,
 )
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
@@ -44,8 +43,6 @@ _DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
 _LINEARIZATIONS = 6
 _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
 _STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
-_DECISIONS = 3
-_ABSURD = 1e4  # sigmas: of a marker that would be all but in the plane of the camera; its derivatives mean nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +60,8 @@ class Smoothed:
 class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
-    The first solution holds what was believed online; then every sighting is looked at again, and those that the
-    smoothed trajectory finds less likely than ``1 - gate_probability`` are left out.
+    It holds what was believed online. Of an unknown map, sightings that the first solution finds less likely than
+    ``1 - gate_probability`` are left out.
 
     Attributes:
         frames: the keyframes.
@@ -77,9 +74,8 @@ class BatchSmoother:
         factors: LandmarkFactors,
         config: BatchConfig,
         gate_probability: float,
-        moved: Collection[int] = (),
     ) -> None:
-        """Take the log, whose filtered beliefs are the initial values; landmarks that were moved are left out.
+        """Take the log, whose filtered beliefs are the initial values.
 
         Raises:
             EstimatorError: the log is empty.
@@ -90,51 +86,11 @@ class BatchSmoother:
         self._factors = factors
         self._config = config
         self._probability = gate_probability
-        self._moved = moved
-        self.believed = {frame.k: _of_others(frame.sightings, moved) for frame in self.frames}
+        self.believed = {frame.k: frame.sightings for frame in self.frames}
         self._values = _initial(self.frames, self.believed, self._factors)
         self._optimize()
-        if factors.known:
-            self._decide()
-        else:
+        if not factors.known:
             self._leave_out_unlikely()
-
-    def _decide(self) -> None:
-        """Look again at every sighting, the refused ones too, from the smoothed trajectory, until nothing changes."""
-        for _ in range(_DECISIONS):
-            before = {k: {id(s.measurement) for s in held} for k, held in self.believed.items()}
-            self.believed = self._judged()
-            changed = {k for k, held in self.believed.items() if {id(s.measurement) for s in held} != before[k]}
-            self._optimize()
-            if not changed:
-                break
-
-    def _judged(self) -> dict[int, tuple[Sighting, ...]]:
-        """All sightings that the solution finds likely enough."""
-        seen = [
-            (frame.k, pose, s)
-            for frame, pose in zip(self.frames, self.poses(), strict=True)
-            for s in _of_others((*frame.sightings, *frame.refused), self._moved)
-        ]
-        kept: dict[int, tuple[Sighting, ...]] = {frame.k: () for frame in self.frames}
-        if not seen:
-            return kept
-        observed = self._factors.observe([s.measurement for _, _, s in seen])
-        lines = observed.linearize(np.array([pose for _, pose, _ in seen]), self._theta())
-        held = {id(s.measurement) for sightings in self.believed.values() for s in sightings}
-        marginals = None
-        for (k, _, s), one in zip(seen, lines, strict=True):
-            if one.behind or np.abs(one.residual).max() > _ABSURD:
-                continue
-            cov, bound = one.noise(), chi2_bound(self._probability, len(one.residual))
-            nis = _squared(one.residual, cov)
-            if nis > bound and id(s.measurement) not in held:  # what is not in the graph may be off by the pose's sigma
-                marginals = marginals or self._marginals()
-                cov = cov + one.J @ marginals.marginalCovariance(pose_key(k)) @ one.J.T
-                nis = _squared(one.residual, cov)
-            if nis <= bound:
-                kept[k] = (*kept[k], s)
-        return kept
 
     def _leave_out_unlikely(self) -> None:
         """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""
@@ -176,7 +132,7 @@ class BatchSmoother:
         seen = [
             (pose, s)
             for frame, pose in zip(self.frames, self.poses(), strict=True)
-            for s in _of_others((*frame.sightings, *frame.refused), self._moved)
+            for s in (*frame.sightings, *frame.refused)
         ]
         if not self._factors.known or not seen:
             factors = [f for held in self.believed.values() for s in held for f in s.factors]
@@ -289,14 +245,6 @@ class BatchSmoother:
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
         params.setRelativeErrorTol(1e-7)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-
-
-def _squared(residual: FloatArray, cov: FloatArray) -> float:
-    return float(np.sum((sighting_whitening(cov) @ residual) ** 2))
-
-
-def _of_others(sightings: Iterable[Sighting], moved: Collection[int]) -> tuple[Sighting, ...]:
-    return tuple(s for s in sightings if s.measurement.landmark_id not in moved)
 
 
 def _solvable(work: Callable[[], _T]) -> _T:

@@ -86,7 +86,7 @@ class Estimator(ABC):
             dt: time since the one before [s].
             motions: between-factors from the one before; at least one.
             sightings: landmark measurements carried to this keyframe.
-            refused: sightings that are only logged, for the batch smoother to look at again.
+            refused: sightings that are only logged, for the cost of the batch.
             predicted: what `predict` said of these motions, if the caller has asked already.
         """
         predicted = predicted or self.predict(motions)

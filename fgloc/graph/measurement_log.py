@@ -49,7 +49,7 @@ class Keyframe:
     prior: Belief | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
     sightings: tuple[Sighting, ...] = ()
-    refused: tuple[Sighting, ...] = ()  # not believed online; the batch looks again
+    refused: tuple[Sighting, ...] = ()  # not believed online; for the cost of the batch
     step: Step | None = None  # what was heard, to be measured again
     mode: Mode = Mode.OK
     readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
