@@ -18,6 +18,7 @@ from fgloc.sensors.cameras import pinhole
 from fgloc.types import Camera, FloatArray, InstallationFound, LandmarkMap, Setting
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_MOST_LOG_SCALE = 20.0  # of a run that went astray; larger ones are no numbers
 _SIGMAS = {  # the field that takes the sigma of settings back; of several the largest
     "wheels.scale_v": "wheels.scale_sigma",
     "wheels.scale_omega": "wheels.turn_scale_sigma",
@@ -107,7 +108,7 @@ def _of_motion(state: _State, config: Config) -> Iterator[Setting]:
 
 def _of_sightings(state: _State, config: Config) -> Iterator[Setting]:
     scale, bias = config.landmarks.range_scale, config.landmarks.bearing_bias_rad
-    found = scale * math.exp(state.value("sightings.range_scale"))
+    found = scale * math.exp(min(state.value("sightings.range_scale"), _MOST_LOG_SCALE))
     yield from state.setting("landmarks.range_scale", scale, found, {"sightings.range_scale": scale})
     name = "sightings.bearing_offset_rad"
     yield from state.setting("landmarks.bearing_bias_rad", bias, bias + state.value(name), {name: 1.0})

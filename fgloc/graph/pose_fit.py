@@ -19,6 +19,7 @@ from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasure
 
 _GAUSS_NEWTON_STEPS = 4
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
+_TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
 
 
 @lru_cache(maxsize=256)
@@ -110,7 +111,9 @@ class PoseFit:
             cov = cov + stack.H @ P @ stack.H.transpose(0, 2, 1)
         shared = [batch.shared(i, stack.J[i], stack.H[i]) for i in range(n)]
         cov = cov + np.array([g @ g.T for g in shared])
-        cov = np.where(stack.behind[:, None, None], np.eye(d), cov)
+        useless = stack.behind | ~(np.trace(cov, axis1=1, axis2=2) < _TELLS_NOTHING)
+        noise = np.where(stack.behind, 1.0, _TELLS_NOTHING)
+        cov = np.where(useless[:, None, None], noise[:, None, None] * np.eye(d), cov)
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
 
     def _white(
