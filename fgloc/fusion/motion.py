@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -184,8 +185,9 @@ class MotionSources:
             readings: what the sources say.
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
-            scale: on the wheels' covariance, as they and their witness differ (`SourceTrust`); above 1 on that of the
-                learned motion, too, up to what it is worth beside wrong wheels.
+            scale: on the wheels' covariance, as they and their witness differ (`SourceTrust`). On that of the learned
+                motion, too, up to what it is worth beside wrong wheels; below 1 its root, as nothing tells which of the
+                two is better than it says.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
@@ -194,7 +196,8 @@ class MotionSources:
         if learned is None or "learned" in off:
             learned = None
         else:
-            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else min(max(scale, 1.0), _LEARNED_ALONE))
+            both = min(scale, _LEARNED_ALONE) if scale > 1.0 else math.sqrt(scale)
+            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else both)
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
         if wheels is not None and "wheels" in off:

@@ -41,6 +41,7 @@ _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check i
 _CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
+_KNOWN_SEEDS = 1  # of a robot whose place is believed: the newest, which any other place has to explain, too
 _HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
 _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
 _UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
@@ -175,7 +176,7 @@ class Initializer:
             return None  # one landmark alone may have been moved, or misread
         fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
         candidates = sorted(
-            self._candidates(here), key=lambda c: float(np.minimum(fit_few.costs(c)[0], _UNLIKELY).sum())
+            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], _UNLIKELY).sum())
         )
         rough = [fit for c in candidates[:_MAX_CANDIDATES] if (fit := fit_few.solve(c, _ROUGH_ITERATIONS)) is not None]
         if known and all(fit.cost > _HOPELESS * MAX_COST_PER_DOF * fit.dof for fit in rough):
@@ -255,12 +256,13 @@ class Initializer:
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
         return joint_fit(start, sightings, self._factors, self._config, iterations)
 
-    def _candidates(self, sightings: Sequence[LandmarkMeasurement]) -> Iterator[FloatArray]:
+    def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:
             return
         points = []
         whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
-        for m in [*_spread(whole, _MAX_SEEDS), *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
+        seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
+        for m in [*seeds, *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
             landmark = self._map.landmarks[m.landmark_id]
             if isinstance(m, CornerMeasurement):
                 yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
