@@ -10,7 +10,7 @@ pipelines (`benchmarks.textbook`) over that of fgloc without learned motion, bot
   it saw a marker again is left out.
 - ``lost_share``: poses of mode LOST without cause. ``refused_share``: sightings not used as given; none is wrong.
 - ``update_*``: processor time of a whole update, all but the detection of markers.
-- ``found.*``: from drives of two minutes. Time offsets are relative to the wheels' stamps.
+- ``found.*``: from drives of two minutes. Time offsets are relative to the IMU's stamps.
 
 Settings are chosen on the training and validation splits; the rows are of the test split. Finished cells are kept
 (`benchmarks.installed_runs`), so that an interrupted run goes on.

@@ -72,7 +72,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
         ("fusion/motion.py",),
-        (Switch("fgloc.fusion.motion:_LEARNED_ALONE", Constant(1.0)),),
+        (Switch("fgloc.fusion.motion:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
         Probe("fgloc.fusion.motion:MotionSources.combine", _without_wheels),
         batch=True,
     ),

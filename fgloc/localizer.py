@@ -13,7 +13,7 @@ from fgloc.config import Config
 from fgloc.faults.landmark_faults import Suspicion
 from fgloc.faults.motion_faults import SourceTrust, Trust
 from fgloc.fusion.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
-from fgloc.fusion.motion import MotionSources, worsened
+from fgloc.fusion.motion import MotionSources, with_noise
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
@@ -218,7 +218,7 @@ class Localizer:
                 fit = self.weights.overruled(refused, weighed, predicted)
             if fit is not None:
                 doubt = np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2)
-                motions = [worsened(m, doubt=doubt) for m in motions]
+                motions = [with_noise(m, doubt=doubt) for m in motions]
                 self.rejections["motion.overruled"] += 1
                 predicted = self.estimator.predict(motions)
                 believed, refused, weighed = self._weigh(k, step, sightings, predicted)
@@ -244,7 +244,7 @@ class Localizer:
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, trust.scale, doubt
         decisions += motion_decisions(
-            k, motions, readings, trust.off, "overruled by sightings" if fit is not None else ""
+            k, motions, readings, trust.off, "overruled by sightings" if fit is not None else "", trust.scale
         )
         return self._estimate(step, frame.belief, [*decisions, *weighed, *accused])
 
@@ -277,8 +277,7 @@ class Localizer:
                 continue
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
-                if frame.off:
-                    decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "")
+                decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "", frame.scale)
         self.estimator.revise(changed)
         return decisions
 
@@ -291,7 +290,7 @@ class Localizer:
         self.rejections["motion.jump"] += 1
         self.sources.begin_segment()
         self.trust.reset()
-        self.weights.contradiction_is_over()
+        self.weights.forget_contradictions()
         estimate = self._start(step, place, ())
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 
@@ -302,8 +301,8 @@ class Localizer:
     def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._whereabouts.mode
-        frame.told_cov = self._by_clock(step) + self._whereabouts.carried_cov(self.weights.contradicting, belief)
-        cov = se2.rotate_cov(belief.cov + frame.told_cov, float(belief.pose[2]))
+        frame.added_cov = self._by_clock(step) + self._whereabouts.kidnapped_cov(self.weights.contradicting, belief)
+        cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
 
     def _by_clock(self, step: Step) -> FloatArray:

@@ -21,10 +21,10 @@ from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import Attendance
-from fgloc.recording.reader import open_recording
+from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
-from fgloc.sensors.remembered import FoundBefore, RememberedDetections
+from fgloc.sensors.remembered import RememberedDetections
 from fgloc.smoothing import smooth_run
 from fgloc.threads import one_blas_thread
 from fgloc.types import (
@@ -34,7 +34,6 @@ from fgloc.types import (
     Event,
     Heard,
     ImageEvent,
-    LandmarkMap,
     RunResult,
     SightingsEvent,
     Step,
@@ -94,25 +93,16 @@ def run(
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
-        detector: Detector | None = None if parts.detector is None else FoundBefore(parts.detector, wrong.detections)
-        if parts.detector is not None and detections is not None:
-            detector = RememberedDetections(detections, FoundBefore(parts.detector, wrong.detections))
-        replay = _Replay(parts, recording.roles, detector, recording.duration_s, progress, pace, sightings)
-        for step in replay.steps(recording.events() if events is None else events(recording.events())):
-            start = time.perf_counter()
-            estimate = parts.localizer.update(step)
-            replay.record(step, estimate, (time.perf_counter() - start) * 1e3)
-            parts.diagnosis.observe(step, parts.wheels.measure(step))
-            if on_step is not None:
-                on_step(step, estimate)
+        memory = None
+        if parts.detector is not None:
+            memory = RememberedDetections(detections, parts.detector, wrong.detections, note=detections is not None)
+        replay = _Replay(parts, recording.roles, memory, recording.duration_s, progress, pace, sightings)
+        replay.run(recording.events() if events is None else events(recording.events()), on_step)
         if mode == "batch" or not replay.estimates:
             replay.make_up(parts.localizer.finish(replay.blind))
-        if isinstance(detector, RememberedDetections):
-            detector.save()
-        hints = (*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing())
-        untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
-        if parts.detector is not None and not parts.localizer.counts["corners"]:
-            hints = (*image_hints(recording, parts.detector)[0], *hints)
+        if memory is not None:
+            memory.save()
+        hints, untried = _hints(recording, parts, replay)
         notes = (
             *hints,
             *recording.notes,
@@ -124,28 +114,16 @@ def run(
         )
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
+        roles = recording.roles
     if not replay.estimates:
         raise EstimatorError(" ".join([*wrong.sentences, _never_found(replay, rejections), *hints, *untried]))
-    estimates = replay.estimates
-    landmarks: LandmarkMap | None = parts.landmark_map
-    installed = parts.localizer.estimator.installed
-    smoothed = None
-    if mode == "batch":
-        try:
-            smoothed = smooth_run(parts)
-        except EstimatorError as error:
-            raise EstimatorError(" ".join([*wrong.sentences, _sentence(str(error)), *hints, *untried])) from error
-        estimates, landmarks = smoothed.estimates, smoothed.landmarks
-        installed = smoothed.installation
-        notes = (*notes, *smoothed.notes)
-    if again := len(estimates) - len(last_pass(estimates)):
-        notes = (
-            *notes,
-            f"The clock jumped back: {again} poses whose times came again are left out.",
-        )
-        estimates = last_pass(estimates)
-    found = installation_found(parts, recording.roles, installed)
-    cost = smoothed.cost if smoothed is not None else None
+    try:
+        smoothed = smooth_run(parts) if mode == "batch" else None
+    except EstimatorError as error:
+        raise EstimatorError(" ".join([*wrong.sentences, _sentence(str(error)), *hints, *untried])) from error
+    estimates = last_pass(replay.estimates if smoothed is None else smoothed.estimates)
+    installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
+    found = installation_found(parts, roles, installed)
     tried = None
     if check and not wrong.sentences and on_step is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
@@ -154,6 +132,8 @@ def run(
         *wrong.notes,
         *(() if tried is None else tried[:1]),
         *notes,
+        *(() if smoothed is None else smoothed.notes),
+        *_left_out(len(replay.estimates if smoothed is None else smoothed.estimates) - len(estimates)),
         *contradictions(found if tried is None else tried[1]),
     )
     return RunResult(
@@ -166,18 +146,32 @@ def run(
         step_ms=np.array(replay.step_ms),
         wall_s=time.perf_counter() - began,
         truth=replay.truth.trajectory(),
-        landmarks=landmarks,
+        landmarks=parts.landmark_map if smoothed is None else smoothed.landmarks,
         spans=replay.spans(),
         source=recording_path,
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),
         found=found,
-        cost=cost,
+        cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
         mistakes=wrong.sentences,
         config=config,
     )
+
+
+def _hints(recording: Recording, parts: Assembly, replay: _Replay) -> tuple[list[str], list[str]]:
+    """What does not fit together: surely, and what of the clocks is still to be tried."""
+    hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing()]
+    untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
+    if parts.detector is not None and not parts.localizer.counts["corners"]:
+        hints = [*image_hints(recording, parts.detector)[0], *hints]
+    return hints, untried
+
+
+def _left_out(poses: int) -> Iterator[str]:
+    if poses:
+        yield f"The clock jumped back: {poses} poses whose times came again are left out."
 
 
 def _tried(recording: Path, map_path: Path | None, detections: Path | None, config: Config) -> RunResult:
@@ -225,6 +219,16 @@ class _Replay:
             self.attendance.hear(event.topic, event.stamp_ns)
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
+
+    def run(self, events: Iterator[Event], on_step: Callable[[Step, Estimate | None], None] | None) -> None:
+        """Localise, step by step."""
+        for step in self.steps(events):
+            start = time.perf_counter()
+            estimate = self._parts.localizer.update(step)
+            self.record(step, estimate, (time.perf_counter() - start) * 1e3)
+            self._parts.diagnosis.observe(step, self._parts.wheels.measure(step))
+            if on_step is not None:
+                on_step(step, estimate)
 
     def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note one step's outcome."""

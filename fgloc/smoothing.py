@@ -51,7 +51,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     notes = []
     result = solver.result()
     estimates = [
-        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.told_cov, float(pose[2])), frame.mode)
+        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode)
         for frame, pose, cov in zip(solver.frames, result.poses, result.covs, strict=True)
     ]
     landmarks = parts.landmark_map

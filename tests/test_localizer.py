@@ -294,6 +294,23 @@ def test_a_kidnapped_robot_is_found_elsewhere_without_restart(initial):
     assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in after]) < 0.01
 
 
+def test_a_pose_that_the_only_landmark_contradicts_allows_for_a_robot_that_was_carried_away():
+    """One marker may be moved or misread; two that agree on another place end it."""
+    full = room()
+    settings = config(estimator={"initial_pose": tuple(truth_at(0.0))})
+    chain = Chain(settings, full)
+    before = list(chain.run(World(full, seconds=8.0).events()))
+    one = LandmarkMap({0: full.landmarks[0]}, full.dictionary)
+    later = World(full, seconds=4.0, start_ns=START_NS + 8_000_000_000, start_s=8.0, kidnap_s=0.0, shown=one)
+    after = chain.run(later.events())[len(before) :]
+    assert math.sqrt(before[-1].cov[0, 0]) < 0.02
+    wrong = [e for e in after if position_error(e, later.truth(e.stamp_ns)) > 1.0]
+    contradicted = [e for e in wrong if any(d.landmark_id == 0 and d.reason for d in e.decisions)]
+    assert len(contradicted) > 3
+    assert min(math.sqrt(e.cov[0, 0]) for e in contradicted) > 0.2
+    assert np.mean([nees(e, later.truth(e.stamp_ns)) for e in contradicted]) / 3.0 < 200.0  # 5e4 without
+
+
 def test_a_given_first_pose_is_used_with_its_sigmas():
     settings = exact(estimator={"initial_pose": (0.3, -1.0, 0.1), "initial_sigmas": (0.2, 0.1, 0.3)})
     _, _, estimates = drive("corners", settings, seconds=2.0, blind=((0.0, 2.0),))

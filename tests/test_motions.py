@@ -14,7 +14,8 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
-from fgloc.fusion.motion import MotionSources, worsened
+from fgloc.fusion.decision_log import motion_decisions
+from fgloc.fusion.motion import MotionSources, with_noise
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse, predict
@@ -191,7 +192,21 @@ def test_factors_made_again_keep_what_sightings_said_against_them():
     frame = Keyframe(1, 0, 0.1, Belief(np.zeros(3), np.eye(3)), readings=Readings(WHEELS), scale=4.0, doubt=doubt)
     (made,) = sources().combine_again(frame)
     assert made.cov == pytest.approx(4.0 * W + doubt)
-    assert worsened(WHEELS).cov == pytest.approx(W)
+    assert with_noise(WHEELS).cov == pytest.approx(W)
+
+
+@pytest.mark.parametrize(
+    ("off", "scale", "weights"),
+    [({}, 1.0, (1.0, 1.0)), ({}, 9.0, (1 / 9, 1 / 4)), ({}, 0.25, (4.0, 2.0)), ({"wheels": "slip"}, 9.0, (0.0, 1 / 4))],
+)
+def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, off, scale, weights):
+    readings = Readings(WHEELS, LEARNED)
+    made = sources(learned_motion(tmp_path)).combine(readings, off, scale)
+    rows = {d.kind: d for d in motion_decisions(3, made, readings, off, "", scale)}
+    assert (rows["wheels"].weight, rows["learned"].weight) == pytest.approx(weights)
+    for m in made:
+        given = {"wheels": W, "learned": N}[m.source]
+        assert m.cov == pytest.approx(given / rows[m.source].weight)
 
 
 # --- the same covariance at 20 Hz and at 5 Hz -------------------------------------------------------------------------

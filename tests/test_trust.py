@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
 import numpy as np
@@ -86,6 +87,21 @@ def test_a_flag_is_raised_once_held_and_released_after_agreement():
     again = judged(test, [none] * 3 + [slip] * 10)  # what came before the release is forgotten
     (since,) = [v.since for v in again if v.since]
     assert since <= 10
+
+
+def test_differences_usually_smaller_than_their_covariance_show_smaller_slips_and_shrink_it_while_calm():
+    """Half the sigmas, and a slip of a sigma a step as given, so two of the true ones."""
+    delays, smallest = {1.0: [], 0.5: []}, {1.0: 9.0, 0.5: 9.0}
+    for seed, share in itertools.product(range(6), delays):
+        test, rng = Disagreement(WeightsConfig()), np.random.default_rng(seed)
+        calm = judged(test, share * white(rng, 600))
+        assert not any(v.flagged for v in calm)
+        smallest[share] = min(smallest[share], *(v.scale for v in calm[300:]))
+        later = judged(test, share * white(rng, 60) + np.array([0.004, 0.0, 0.0]))
+        delays[share].append(next((i for i, v in enumerate(later) if v.flagged), 60) * DT)
+    assert max(delays[0.5]) <= 1.5
+    assert np.median(delays[0.5]) < 0.5 * np.median(delays[1.0])
+    assert 0.25 <= smallest[0.5] < 0.6 * smallest[1.0]
 
 
 # --- which source, and why --------------------------------------------------------------------------------------------
@@ -218,3 +234,15 @@ def test_wheels_known_to_be_wrong_are_not_found_out_again():
     assert [t.off for t in (*before, *after)] == [{}] * 20
     assert [t.off for t in during] == [{"wheels": "distrusted"}] * 10
     assert not trust.flags
+
+
+def test_wheels_that_differ_by_less_than_an_alarm_are_worth_less_back_to_the_onset():
+    """A slip of one sigma a step; told as the number of steps for which the larger covariance holds."""
+    trust = trust_in()
+    run(trust, 40, (SPEED, TURN))
+    found = run(trust, 6, (SPEED + 0.03, TURN), first=40)
+    assert not any(t.off for t in found)
+    assert [t.span for t in found] == [1, 2, 3, 4, 5, 6]
+    assert [t.scale for t in found] == sorted(t.scale for t in found)
+    assert found[0].scale < 1.0
+    assert 4.0 < found[-1].scale < 5.0

@@ -19,7 +19,7 @@ from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.sensors.remembered import Detections, NotedDetector
+from fgloc.sensors.remembered import Detections, RememberedDetections
 from fgloc.types import FloatArray, LandmarkMap
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
@@ -42,7 +42,7 @@ class Mistakes:
     sentences: tuple[str, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
-    detections: Mapping[tuple[int, int], Detections] = field(default_factory=dict)
+    detections: Mapping[bytes, Detections] = field(default_factory=dict)
     undone: bool = False
 
     @property
@@ -93,7 +93,7 @@ class _Search:
         self.config = config
         self.landmark_map: LandmarkMap | None = None
         self.sentences: list[str] = []
-        self.detections: dict[tuple[int, int], Detections] = {}
+        self.detections: dict[bytes, Detections] = {}
 
     def run(self) -> None:
         """All checks, in the order in which one makes the next possible."""
@@ -104,8 +104,7 @@ class _Search:
         """All checks with the stamps as they are; whether these were corrected and all has to begin again."""
         with open_recording(self._path, self.config.recording) as recording:
             parts = assemble(recording, self._map_path, self.config, keep_all=False)
-            detector = None if parts.detector is None else NotedDetector(parts.detector, self.detections)
-            excerpt = read_excerpt(recording, self.config, detector)
+            excerpt = self._excerpt(recording, parts)
             roles = other_clocks(excerpt.delays)
             given = self.config.recording.received_stamps
             if roles and not set(roles) <= set(given):
@@ -126,10 +125,18 @@ class _Search:
             if self.config.markers.dictionary != parts.config.markers.dictionary:
                 self.detections.clear()
                 parts = assemble(recording, self._map_path, self.config, keep_all=False)
-                assert parts.detector is not None
-                excerpt = read_excerpt(recording, self.config, NotedDetector(parts.detector, self.detections))
+                excerpt = self._excerpt(recording, parts)
             self._fit(recording, excerpt, parts)
         return False
+
+    def _excerpt(self, recording: Recording, parts: Assembly) -> Excerpt:
+        """The excerpt; what is found in its images is remembered."""
+        if parts.detector is None:
+            return read_excerpt(recording, self.config, None)
+        memory = RememberedDetections(None, parts.detector, self.detections)
+        excerpt = read_excerpt(recording, self.config, memory)
+        self.detections = memory.found
+        return excerpt
 
     def _unseen(self, excerpt: Excerpt, parts: Assembly) -> bool:
         """Whether images were searched and next to none shows a marker of the map."""

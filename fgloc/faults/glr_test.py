@@ -29,7 +29,7 @@ class Verdict:
             spans; else 0.
         nis: largest NIS of any window that ends with this step, over what is usual.
         span: the number of that window's steps.
-        scale: on the covariances of what is compared: how large differences are by the least likely window, or usually.
+        scale: factor on the sources' covariances: the NIS over its expectation, or the usual level if that is larger.
     """
 
     flagged: bool
@@ -46,7 +46,7 @@ class Disagreement:
     windows that end now, the one whose summed difference is least likely; its beginning is the most likely onset of
     what goes wrong. A flag is taken back after the newest steps have agreed for a while.
 
-    Source: Willsky and Jones 1976, generalized likelihood ratio for a jump of unknown time; design.md §6.2.
+    Source: Willsky and Jones 1976, generalized likelihood ratio for a jump of unknown time; docs/decisions/0003.
     """
 
     def __init__(self, config: WeightsConfig) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from fgloc import se2
+from fgloc.fusion.motion import noise_scales
 from fgloc.graph.measurement_log import Belief
 from fgloc.types import Decision, FloatArray, MotionMeasurement, Readings
 
@@ -20,15 +21,22 @@ _REASONS = {
 
 
 def motion_decisions(
-    k: int, motions: Sequence[MotionMeasurement], readings: Readings, off: Mapping[str, str], reason: str
+    k: int,
+    motions: Sequence[MotionMeasurement],
+    readings: Readings,
+    off: Mapping[str, str],
+    reason: str,
+    scale: float = 1.0,
 ) -> list[Decision]:
     """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
 
     Sources that are not believed (``off``: and why) have weight 0. A ``reason`` says why the covariance of all the
-    others was inflated; their weight is then 0 too, as they no longer hold the pose. A step that was judged again has
-    more than one row for a source; the last one holds.
+    others was inflated; their weight is then 0 too, as they no longer hold the pose. Otherwise the weight is one over
+    the factor on the covariance (`noise_scales` of ``scale``). A step that was judged again has more than one row for a
+    source; the last one holds.
     """
     rows = []
+    scales = noise_scales(off, scale)
     used = {m.source: m for m in motions}
     for source in ("wheels", "learned", "gyro", "unknown"):
         reading = getattr(readings, source, None) or used.get(source)
@@ -39,7 +47,7 @@ def motion_decisions(
         if readings.wheels is not None and source != "wheels":
             difference: FloatArray = se2.log(se2.between(readings.wheels.motion, reading.motion))
             nis = float(difference @ np.linalg.solve(readings.wheels.cov + reading.cov, difference))
-        weight = 0.0 if why else 1.0
+        weight = 0.0 if why else 1.0 / scales.get(source, 1.0)
         rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why))
     return rows
 

@@ -24,7 +24,7 @@ _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this w
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
-_LEARNED_ALONE = 4.0  # on its covariance beside wrong wheels: over 1 s of a slip squared errors are 2 to 5 times it
+_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
 
 
 _OF_MOTION = (
@@ -185,19 +185,14 @@ class MotionSources:
             readings: what the sources say.
             off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
-            scale: on the wheels' covariance, as they and their witness differ (`SourceTrust`). On that of the learned
-                motion, too, up to what it is worth beside wrong wheels; below 1 its root, as nothing tells which of the
-                two is better than it says.
+            scale: as `noise_scales` takes it.
         """
         off = off or {}
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        scales = noise_scales(off, scale)
         if wheels is not None:
-            wheels = worsened(wheels, scale)
-        if learned is None or "learned" in off:
-            learned = None
-        else:
-            both = min(scale, _LEARNED_ALONE) if scale > 1.0 else math.sqrt(scale)
-            learned = worsened(learned, _LEARNED_ALONE if "wheels" in off else both)
+            wheels = with_noise(wheels, scales.get("wheels", 1.0))
+        learned = None if learned is None or "learned" in off else with_noise(learned, scales["learned"])
         if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
             gyro = None
         if wheels is not None and "wheels" in off:
@@ -221,7 +216,7 @@ class MotionSources:
     def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
         made = self.combine(readings or frame.readings, frame.off, frame.scale)
-        return [worsened(m, doubt=frame.doubt) for m in made]
+        return [with_noise(m, doubt=frame.doubt) for m in made]
 
     def disagreement(self, readings: Readings) -> Difference | None:
         """How far the wheels and the sources that witness their slip are apart over the step.
@@ -297,8 +292,22 @@ class MotionSources:
             self.gyro.forget_fix()
 
 
-def worsened(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None = None) -> MotionMeasurement:
-    """The motion with its covariance scaled, and with room ``(3, 3)`` for what sightings say against it."""
+def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
+    """Factors on the covariances of wheels and learned motion.
+
+    Args:
+        off: sources that are left out, and why.
+        scale: on the wheels' covariance, as they and the other sources differ (`SourceTrust`). The learned motion's
+            follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of the two
+            is better than it says.
+    """
+    if "wheels" in off:
+        return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
+    return {"wheels": scale, "learned": min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)}
+
+
+def with_noise(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None = None) -> MotionMeasurement:
+    """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
     if scale == 1.0 and doubt is None:
         return m
     return replace(m, cov=m.cov * scale + (0.0 if doubt is None else doubt))

@@ -1,7 +1,7 @@
 """Measurements to GTSAM factors: the one place that knows both.
 
 A known landmark enters as a unary factor; an unknown one is a variable. Motion factors are Gaussian, landmark factors
-robust (Cauchy), as design.md §6 has it.
+robust (Cauchy).
 """
 
 from __future__ import annotations

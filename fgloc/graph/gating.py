@@ -273,14 +273,14 @@ class Weights:
 
     @property
     def contradicting(self) -> int:
-        """How many landmarks were refused since one was believed."""
+        """How many landmarks were refused since a sighting was accepted."""
         return len(self._contradicting)
 
-    def contradiction_is_over(self) -> None:
-        """The robot is elsewhere: what contradicted the pose does so no more."""
+    def forget_contradictions(self) -> None:
+        """The pose was set anew: `contradicting` starts from 0."""
         self._contradicting.clear()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
-        self.contradiction_is_over()
+        self.forget_contradictions()

@@ -1,6 +1,6 @@
 """The incremental estimator: iSAM2 in a fixed-lag window (flat cost, however long the run) or whole (short runs).
 
-See design.md §7. A GTSAM update that throws leaves the smoother in ruins; the window is then rebuilt from our own log
+A GTSAM update that throws leaves the smoother in ruins; the window is then rebuilt from our own log
 without the sightings of the step, and the caller is told.
 """
 

@@ -56,7 +56,7 @@ class Keyframe:
     off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
     scale: float = 1.0  # on the covariances of sources that disagree
     doubt: FloatArray | None = None  # added to the covariances of the motions that these make
-    told_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose, beside the graph's
+    added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
 
     @property

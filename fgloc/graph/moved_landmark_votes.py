@@ -37,8 +37,6 @@ class Quarantine:
     """Counts, for every landmark, how often it was refused while others were believed.
 
     Wrong ids scatter: only a landmark whose refused sightings agree on another place has been moved.
-
-    Source: design.md §6.5.
     """
 
     def __init__(self, after: int) -> None:

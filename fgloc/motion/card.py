@@ -97,10 +97,7 @@ class ErrorMemory(Section):
 
 
 class JointErrors(Section):
-    """Error covariances of wheels (W) and model (N) over windows, and C = E[e_n e_wᵀ]; body frame at the window's end.
-
-    Source: design.md §4, "Correlation of the two".
-    """
+    """Error covariances of wheels (W) and model (N) over windows, and C = E[e_n e_wᵀ]; body frame at its end."""
 
     window_s: Positive
     W: Matrix

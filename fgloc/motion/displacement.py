@@ -28,8 +28,6 @@ class DisplacementModel:
     are read replace them, and a gyro that is read replaces the yaw rate. Nothing is fed back, so errors do not feed
     themselves.
     An ensemble answers with its mean, and doubts where its members differ.
-
-    Source: design.md §5.
     """
 
     def __init__(self, card: ModelCard, network: Answering) -> None:

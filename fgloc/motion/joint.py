@@ -21,7 +21,7 @@ class JointCalibration:
     Kept as the dimensionless ``R = L_n⁻¹ C L_w⁻ᵀ`` with the Cholesky factors of N and W, so that a calibration from
     long windows serves a step of any length and any predicted covariance: ``C = L_n R L_wᵀ`` of that step.
 
-    Source: design.md §4; conditional mean of the joint Gaussian.
+    Source: conditional mean of the joint Gaussian.
     """
 
     def __init__(self, W: ArrayLike, N: ArrayLike, C: ArrayLike) -> None:

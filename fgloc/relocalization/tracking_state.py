@@ -20,8 +20,8 @@ _NAMED = 3  # jumps
 _CONFIRMED = 2  # sightings in excess of those that speak against it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
-_CARRIED = 1e-3  # share of all sightings that contradict where the robot is because it was carried away ...
-_WRONG = 0.05  # ... and of those of a landmark that was moved or misread: several are that by chance together
+_KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
+_WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misread, each independently
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
@@ -127,7 +127,7 @@ class Whereabouts:
         """Sightings agree on another place than the given one."""
         self.defied = se2.between(believed.pose, place.pose)
 
-    def carried_cov(self, contradicting: int, belief: Belief) -> FloatArray:
+    def kidnapped_cov(self, contradicting: int, belief: Belief) -> FloatArray:
         """What is added to the covariance ``(3, 3)`` of a pose that all landmarks seen since the last fix contradict.
 
         Either each of them is wrong by itself, or the robot was carried away, and may be where the landmarks are.
@@ -140,9 +140,9 @@ class Whereabouts:
         """
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
             return np.zeros((3, 3))
-        carried = _CARRIED / (_CARRIED + _WRONG**contradicting)
+        kidnapped = _KIDNAPPED / (_KIDNAPPED + _WRONG**contradicting)
         spread = np.mean((self._places - belief.pose[:2]) ** 2)
-        return np.asarray(carried * np.diag([spread, spread, math.pi**2 / 3.0]))
+        return np.asarray(kidnapped * np.diag([spread, spread, math.pi**2 / 3.0]))
 
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""

@@ -23,31 +23,51 @@ class RememberedDetections:
     What is remembered goes by the image's content: a result is the same whether it was remembered or found anew. The
     file is for one dictionary and one version of the detector, which its name has to tell. Images that cannot be
     decoded are not remembered. Several processes may use the file at once: what one of them fails to add is found anew.
+
+    Attributes:
+        found: what is not in the file, by image: ``known`` for another detector of the same images.
     """
 
-    def __init__(self, path: Path, detector: Detector) -> None:
+    def __init__(
+        self,
+        path: Path | None,
+        detector: Detector,
+        known: Mapping[bytes, Detections] | None = None,
+        note: bool = True,
+    ) -> None:
+        """Take what a file and an earlier run know.
+
+        Args:
+            path: file; None: nothing is written.
+            detector: asked about all other images.
+            known: found by a detector of the same dictionary; goes into the file as well.
+            note: whether to remember what is found anew: memory grows with the images.
+        """
+        self.found: dict[bytes, Detections] = dict(known or {})
         self._path = path
         self._detector = detector
-        self._known = _read(path)
-        self._new: dict[bytes, tuple[MarkerCorners, ...]] = {}
+        self._note = note
+        self._known = (_read(path) if path is not None else {}) | self.found
 
     def detect(self, event: ImageEvent) -> CornersEvent:
         """The markers of one image; raises as the detector does."""
         key = _key(event)
         sightings = self._known.get(key)
         if sightings is None:
-            sightings = self._known[key] = self._new[key] = self._detector.detect(event).sightings
+            sightings = self._detector.detect(event).sightings
+            if self._note:
+                self._known[key] = self.found[key] = sightings
         return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
 
     def save(self) -> None:
-        """Add what was new to the file.
+        """Add what was new to the file, if there is one.
 
         Raises:
             OutputError: it cannot be written.
         """
-        if self._new:
-            _write(self._path, _read(self._path) | self._new)
-            self._new.clear()
+        if self._path is not None and self.found:
+            _write(self._path, _read(self._path) | self.found)
+            self.found.clear()
 
 
 def _key(event: ImageEvent) -> bytes:
@@ -57,7 +77,7 @@ def _key(event: ImageEvent) -> bytes:
     return digest.digest()
 
 
-def _read(path: Path) -> dict[bytes, tuple[MarkerCorners, ...]]:
+def _read(path: Path) -> dict[bytes, Detections]:
     """What a file holds; nothing if there is none, or none that can be read."""
     try:
         with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
@@ -72,7 +92,7 @@ def _read(path: Path) -> dict[bytes, tuple[MarkerCorners, ...]]:
     }
 
 
-def _write(path: Path, known: dict[bytes, tuple[MarkerCorners, ...]]) -> None:
+def _write(path: Path, known: dict[bytes, Detections]) -> None:
     found = [s for sightings in known.values() for s in sightings]
     with atomic_file(path, binary=True) as file:
         np.savez(
@@ -82,35 +102,3 @@ def _write(path: Path, known: dict[bytes, tuple[MarkerCorners, ...]]) -> None:
             ids=np.array([s.marker_id for s in found], dtype=np.int64),
             corners=np.array([s.corners_px for s in found], dtype=float).reshape(len(found), 4, 2),
         )
-
-
-class NotedDetector:
-    """Searches images and notes what it found, for a run that comes to the same images."""
-
-    def __init__(self, detector: Detector, found: dict[tuple[int, int], Detections]) -> None:
-        """Note into ``found``, by receive time and number of bytes."""
-        self._detector, self._found = detector, found
-
-    def detect(self, event: ImageEvent) -> CornersEvent:
-        """The markers of one image; raises as the detector does."""
-        key = event.received_ns, len(event.data)
-        if key not in self._found:
-            self._found[key] = self._detector.detect(event).sightings
-        return _event(event, self._found[key])
-
-
-class FoundBefore:
-    """Searches only images in which nothing was found before."""
-
-    def __init__(self, detector: Detector, found: Mapping[tuple[int, int], Detections]) -> None:
-        """Take what a `NotedDetector` of the same dictionary has found."""
-        self._detector, self._found = detector, found
-
-    def detect(self, event: ImageEvent) -> CornersEvent:
-        """The markers of one image; raises as the detector does."""
-        known = self._found.get((event.received_ns, len(event.data)))
-        return self._detector.detect(event) if known is None else _event(event, known)
-
-
-def _event(event: ImageEvent, sightings: Detections) -> CornersEvent:
-    return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
