@@ -1,4 +1,4 @@
-"""Whether the bundled samples give the results of the committed file, bit by bit: `make equal` before and after a refactoring.
+"""Whether the bundled samples give the results of the committed file, bit by bit: `make equal`, around a refactoring.
 
 One line a sample and mode: a hash of poses, covariances and counts. Another processor may round differently: write the
 file anew there (`python -m benchmarks.equal --write`), from the commit that the change starts from.
@@ -40,7 +40,9 @@ def digests() -> dict[str, str]:
     return found
 
 
-def main(write: Annotated[bool, typer.Option("--write", help="Make today's results the expected ones.")] = False) -> None:
+def main(
+    write: Annotated[bool, typer.Option("--write", help="Make today's results the expected ones.")] = False,
+) -> None:
     """Compare the bundled samples' results with the committed ones; exit code 1 if any differs."""
     found = digests()
     expected = json.loads(EXPECTED.read_text(encoding="utf-8")) if EXPECTED.is_file() else {}

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, Verdict
+from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
 from fgloc.types import (
     CommandEvent,
@@ -37,7 +37,7 @@ class _Source:
     disorder_ns: int = 0  # how far it has stepped back behind its own newest stamp
 
 
-class Stepper:
+class KeyframeBuilder:
     """Turns gated events, in order of receipt, into contiguous steps.
 
     A keyframe is made at the stamp of each sightings event with a sighting, else every ``max_interval_s`` while a
@@ -127,13 +127,13 @@ class Stepper:
         """The last steps of a recording: nothing more will come."""
         return self._take(self._clock.flush()) + self._finish()
 
-    def _take(self, verdicts: list[tuple[Verdict, Event]]) -> list[Step]:
+    def _take(self, verdicts: list[tuple[ClockVerdict, Event]]) -> list[Step]:
         steps: list[Step] = []
         for verdict, event in verdicts:
-            if verdict is Verdict.STRAY:
+            if verdict is ClockVerdict.OUTLIER:
                 self._stray(event)
                 continue
-            if verdict is Verdict.STARTS:
+            if verdict is ClockVerdict.STARTS:
                 steps += self._jump(event)
             self._insert(event)
             while (stamp_ns := self._candidate()) is not None and self._closed(stamp_ns):
