@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -14,6 +15,7 @@ import numpy as np
 from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError, FglocError, OutputError
 from fgloc.graph.measurement_log import Belief
+from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.events import EventMaker
 from fgloc.live.facts import ROLE_OF, LiveFacts
@@ -28,7 +30,24 @@ from fgloc.types import Camera, Estimate, Event, ImageEvent, LandmarkMap, Step
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot
 _SAVE_EVERY_S = 1.0
 _SILENT_S = 2.0  # a topic that others outlive by this long is reported
+_SUCCESSION_NS = 1_000_000_000  # a publisher silent for this long has ended; another one of the topic is used
+_TWO_PUBLISHERS = "{topic}: two publishers; only the messages of the first are used: stop or rename one of them"
 _SUBSCRIBER = "A subscriber failed and is not called any more"
+
+
+@dataclass(slots=True)
+class _Publisher:
+    """Whose messages of a topic are used."""
+
+    name: str
+    received_ns: int
+
+    def speaks(self, name: str, received_ns: int) -> bool:
+        """Whether a message is of that publisher, or of one that takes its place."""
+        if name != self.name and received_ns - self.received_ns < _SUCCESSION_NS:
+            return False
+        self.name, self.received_ns = name, received_ns
+        return True
 
 
 class Live(EventMaker):
@@ -101,6 +120,8 @@ class Live(EventMaker):
         self._subscribers: list[Callable[[Estimate], None]] = []
         self._meters: dict[str, TopicMeter] = {}
         self._dropped: Counter[str] = Counter()
+        self._clocks = TopicClocks()
+        self._publishers: dict[str, _Publisher] = {}
         self._step_s = self._longest_s = 0.0
         self._worker = DetectionWorker(self._changed, image_queue)
         self._thread = threading.Thread(target=self._estimate, name="fgloc-estimation", daemon=True)
@@ -118,30 +139,43 @@ class Live(EventMaker):
 
     # --- in ---
 
-    def push(self, event: Event) -> None:
+    def push(self, event: Event, publisher: str = "") -> None:
         """Take an event, in order of receipt. Never waits for estimation or detection.
+
+        Args:
+            event: any that a recording has.
+            publisher: tells publishers of one topic apart; only the first is used, until it has been silent for 1 s.
 
         Raises:
             EstimatorError: `close` was called.
             FglocError: the run has failed: what it was fed cannot be used.
         """
-        is_image = isinstance(event, ImageEvent)
-        queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
+        role = ROLE_OF.get(type(event), "tf")
         with self._changed:
             self._alive()
-            meter = self._meters.get(event.topic)
-            if meter is None:
-                meter = self._meters[event.topic] = TopicMeter(ROLE_OF.get(type(event), "tf"))
-            meter.add(event.stamp_ns, event.received_ns)
-            if is_image:
-                self._worker.arrived(queued)
-            self._inbox.append(queued)
-            if len(self._inbox) > _MOST_EVENTS:
-                lost = self._inbox.popleft()
-                if isinstance(lost, Queued) and lost.event is not None:
-                    self._dropped[ROLE_OF.get(type(lost.event), "tf")] += 1
-                    self._worker.discard(lost)
+            first = self._publishers.setdefault(event.topic, _Publisher(publisher, event.received_ns))
+            if not first.speaks(publisher, event.received_ns):
+                self._dropped[role] += 1
+                self._tell(_TWO_PUBLISHERS.format(topic=event.topic))
+                return
+            if event.topic not in self._meters:
+                self._meters[event.topic] = TopicMeter(role)
+            self._meters[event.topic].add(event.stamp_ns, event.received_ns)
+            for passed in self._clocks.correct(event):
+                self._queue(passed)
             self._changed.notify_all()
+
+    def _queue(self, event: Event) -> None:
+        is_image = isinstance(event, ImageEvent)
+        queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
+        if is_image:
+            self._worker.arrived(queued)
+        self._inbox.append(queued)
+        if len(self._inbox) > _MOST_EVENTS:
+            lost = self._inbox.popleft()
+            if isinstance(lost, Queued) and lost.event is not None:
+                self._dropped[ROLE_OF.get(type(lost.event), "tf")] += 1
+                self._worker.discard(lost)
 
     def _deliver(self, event: Event) -> None:
         self.push(event)
@@ -209,7 +243,7 @@ class Live(EventMaker):
                 dropped=dict(dropped),
                 rejections=dict(sorted(rejections.items())),
                 waiting_for=waiting,
-                notes=tuple(dict.fromkeys((*self._notes, *silent, *notes))),
+                notes=tuple(dict.fromkeys((*self._notes, *self._clocks.notes, *silent, *notes))),
             )
 
     def wait(self, timeout_s: float | None = None) -> bool:
@@ -327,8 +361,7 @@ class Live(EventMaker):
         role = ROLE_OF.get(type(event), "tf")
         note = f"{event.topic}: a second topic of the role {role} is not used; choose one by recording.topics.{role}"
         with self._changed:
-            if note not in self._notes:
-                self._notes.append(note)
+            self._tell(note)
             self._dropped[role] += 1
             self._worker.discard(item)
 
@@ -375,7 +408,7 @@ class Live(EventMaker):
                 except Exception as error:  # theirs, not ours: the robot still needs its pose
                     with self._changed:
                         self._subscribers.remove(callback)
-                        self._notes.append(f"{_SUBSCRIBER}: {type(error).__name__}: {error}")
+                        self._tell(f"{_SUBSCRIBER}: {type(error).__name__}: {error}")
             began = time.perf_counter()
 
     # --- state ---
@@ -390,9 +423,13 @@ class Live(EventMaker):
                 self.save(self._state_path)
             except OutputError as error:
                 with self._changed:
-                    self._notes = [*dict.fromkeys([*self._notes, str(error)])]
+                    self._tell(str(error))
 
     # --- with the condition held ---
+
+    def _tell(self, note: str) -> None:
+        if note not in self._notes:
+            self._notes.append(note)
 
     def _idle(self) -> bool:
         return not (self._inbox or self._working or self._line)
