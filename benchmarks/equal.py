@@ -40,7 +40,9 @@ def digests() -> dict[str, str]:
     return found
 
 
-def main(write: Annotated[bool, typer.Option("--write", help="Make today's results the expected ones.")] = False) -> None:
+def main(
+    write: Annotated[bool, typer.Option("--write", help="Make today's results the expected ones.")] = False,
+) -> None:
     """Compare the bundled samples' results with the committed ones; exit code 1 if any differs."""
     found = digests()
     expected = json.loads(EXPECTED.read_text(encoding="utf-8")) if EXPECTED.is_file() else {}
