@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from fgloc.intake.clock_guard import MOTION_EVENTS
-from fgloc.types import CornersEvent, Event, ImageEvent, MarkerPosesEvent, RangeBearingEvent
+from fgloc.types import CornersEvent, Event, ImageEvent, JointsEvent, MarkerPosesEvent, RangeBearingEvent
 
 _RESET_NS = 5_000_000_000  # a topic's delay that changes by more is not the network's
 _COUNT = 3  # messages that agree on the new delay, before ...
@@ -18,9 +18,17 @@ _SHARE = 0.1  # of a new delay in the mean
 _STAMPED = (*MOTION_EVENTS, ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent)
 
 
+Source = tuple[str, tuple[str, ...]]
+
+
+def source_of(event: Event) -> Source:
+    """Who speaks: a topic; of joint states, one for each set of joints, as wheels and arm may share the topic."""
+    return event.topic, event.names if isinstance(event, JointsEvent) else ()
+
+
 @dataclass(slots=True)
 class _Clock:
-    """What is known of one topic's stamps."""
+    """What is known of one source's stamps."""
 
     delay_ns: float  # usual receive time less stamp
     received_ns: int  # of the newest message
@@ -39,7 +47,7 @@ class TopicClocks:
 
     def __init__(self) -> None:
         """Nothing has come in."""
-        self._clocks: dict[str, _Clock] = {}
+        self._clocks: dict[Source, _Clock] = {}
         self._resets: dict[str, tuple[int, int]] = {}  # by topic: how often, offset of the last [ns]
 
     @property
@@ -55,10 +63,11 @@ class TopicClocks:
         """Events that may pass, in order of receipt: mostly this one."""
         if not isinstance(event, _STAMPED):
             return [event]
-        clock = self._clocks.get(event.topic)
+        source = source_of(event)
+        clock = self._clocks.get(source)
         delay = event.received_ns - event.stamp_ns
         if clock is None:
-            self._clocks[event.topic] = _Clock(delay, event.received_ns)
+            self._clocks[source] = _Clock(delay, event.received_ns)
             return [event]
         clock.received_ns = event.received_ns
         delay -= clock.offset_ns
@@ -95,15 +104,16 @@ class TopicClocks:
     def _witnessed(self, now_ns: int) -> list[Event]:
         """A topic came with its usual delay: one that has been held for a while is alone with its own."""
         released: list[Event] = []
-        for topic, clock in self._clocks.items():
+        for clock in self._clocks.values():
             if len(clock.held) >= _COUNT and now_ns - clock.held[0].received_ns >= _SPAN_NS:
-                released += self._rebase(clock, topic)
+                released += self._rebase(clock)
         return released
 
-    def _rebase(self, clock: _Clock, topic: str) -> list[Event]:
+    def _rebase(self, clock: _Clock) -> list[Event]:
         """Correct a topic's stamps so that its delay is the usual one again."""
         mean = sum(_delay(e) for e in clock.held) // len(clock.held)
         clock.offset_ns = mean - round(clock.delay_ns)
+        topic = clock.held[0].topic
         self._resets[topic] = (self._resets.get(topic, (0, 0))[0] + 1, clock.offset_ns)
         released, clock.held = [_shifted(e, clock.offset_ns) for e in clock.held], []
         return released
