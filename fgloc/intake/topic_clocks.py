@@ -35,6 +35,14 @@ class _Clock:
     offset_ns: int = 0  # added to its stamps
     held: list[Event] = field(default_factory=list)  # with another delay than usual
 
+    def change_ns(self, event: Event) -> int:
+        """How much later than usual a message seems."""
+        return _delay(event) - self.offset_ns - round(self.delay_ns)
+
+    def begin_anew(self, event: Event) -> None:
+        """Take its delay for the usual one."""
+        self.delay_ns, self.offset_ns = _delay(event), 0
+
 
 class TopicClocks:
     """Tells the reset of one topic's clock from a jump of the clock that all share.
@@ -48,6 +56,7 @@ class TopicClocks:
     def __init__(self) -> None:
         """Nothing has come in."""
         self._clocks: dict[Source, _Clock] = {}
+        self._jump_ns: int | None = None  # how much later than before the last common jump made messages seem
         self._resets: dict[str, tuple[int, int]] = {}  # by topic: how often, offset of the last [ns]
 
     @property
@@ -95,7 +104,11 @@ class TopicClocks:
             yield from held
             held.clear()
         held.append(event)
-        if self._all_jumped(event.received_ns):
+        if self._jump_ns is not None and abs(clock.change_ns(event) - self._jump_ns) <= _AGREE_NS:
+            clock.begin_anew(event)
+            yield from held
+            held.clear()
+        elif self._all_jumped(event.received_ns):
             yield from self._jump()
         elif event.received_ns - held[0].received_ns > _PATIENCE_NS:
             yield from held
@@ -127,7 +140,8 @@ class TopicClocks:
         held = self.flush()
         for clock in self._clocks.values():
             if clock.held:
-                clock.delay_ns, clock.offset_ns = _delay(clock.held[-1]), 0
+                self._jump_ns = clock.change_ns(clock.held[-1])
+                clock.begin_anew(clock.held[-1])
                 clock.held = []
         yield from held
 
