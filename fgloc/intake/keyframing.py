@@ -6,7 +6,7 @@ from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, Verdict
+from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
 from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
 from fgloc.types import (
@@ -30,7 +30,7 @@ _SIGHTINGS = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
 
 
-class Stepper:
+class KeyframeBuilder:
     """Turns gated events, in order of receipt, into contiguous steps.
 
     A keyframe is made at the stamp of each sightings event with a sighting, else every ``max_interval_s`` while a
@@ -128,13 +128,13 @@ class Stepper:
         """The last steps of a recording: nothing more will come."""
         return self._take(self._clock.flush()) + self._finish()
 
-    def _take(self, verdicts: list[tuple[Verdict, Event]]) -> list[Step]:
+    def _take(self, verdicts: list[tuple[ClockVerdict, Event]]) -> list[Step]:
         steps: list[Step] = []
         for verdict, event in verdicts:
-            if verdict is Verdict.STRAY:
+            if verdict is ClockVerdict.OUTLIER:
                 self._stray(event)
                 continue
-            if verdict is Verdict.STARTS:
+            if verdict is ClockVerdict.STARTS:
                 steps += self._jump(event)
             self._insert(event)
             while (stamp_ns := self._candidate()) is not None and self._closed(stamp_ns):
