@@ -12,14 +12,14 @@ from typing import Any, TypeVar
 
 from fgloc import se2
 from fgloc.assembly import Assembly
-from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.status import LivePose
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import (
     CommandEvent,
