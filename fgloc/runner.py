@@ -21,6 +21,7 @@ from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import TopicActivity
+from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
@@ -106,11 +107,8 @@ def run(
         notes = (
             *hints,
             *recording.notes,
-            *parts.notes,
-            *parts.gate.notes,
-            *parts.stepper.notes,
-            *parts.wheels.notes,
-            *parts.localizer.notes,
+            *replay.clocks.notes,
+            *parts.sentences,
         )
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
@@ -203,6 +201,7 @@ class _Replay:
         self.first_pose_s: float | None = None
         self.blind = True  # no image and no sighting was recorded, not even an unusable one
         self.activity = TopicActivity(roles)
+        self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
         self.decisions: list[Decision] = []
@@ -250,22 +249,8 @@ class _Replay:
 
     def rejections(self) -> Counter[str]:
         """Everything refused anywhere, by reason."""
-        parts = self._parts
-        total = Counter(parts.gate.rejections)
-        sources = [
-            parts.detections.rejections,
-            parts.stepper.rejections,
-            parts.wheels.rejections,
-            parts.landmarks.rejections,
-            self._image_rejections,
-        ]
-        sources += [parts.localizer.rejections, parts.localizer.association.rejections]
-        if parts.learned is not None:
-            sources.append(parts.learned.rejections)
-        if parts.localizer.sources.gyro is not None:
-            sources.append(parts.localizer.sources.gyro.rejections)
-        for source in sources:
-            total.update(source)
+        total = self._parts.rejections
+        total.update(self._image_rejections)
         return total
 
     def spans(self) -> dict[str, TopicTimes]:
@@ -274,7 +259,7 @@ class _Replay:
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
-        for event in events:
+        for event in self.clocks.corrected(events):
             if self._first_ns is None:
                 self._first_ns = event.received_ns
             elapsed = (event.received_ns - self._first_ns) * 1e-9
