@@ -45,7 +45,7 @@ from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match
 from fgloc.localizer import Localizer
-from fgloc.recording.outputs import atomic_file
+from fgloc.atomic import atomic_file
 from fgloc.types import Estimate, Step, Trajectory
 
 CASES = ("none", "slip", "mu01", "dark30", "dark60", "ids30", "moved", "frozen", "onewheel", "kidnap")

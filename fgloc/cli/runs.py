@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import fgloc
+from fgloc.atomic import check_out
 from fgloc.cli.options import (
     Bag,
     Bags,
@@ -109,6 +110,7 @@ def calibrate(
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
 
+    check_out(out, folder=False)
     before = configured(bags[0], config, None)
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
@@ -135,6 +137,7 @@ def _localise(
     from fgloc.recording.outputs import sha256_of
     from fgloc.runner import find_beside, run
 
+    check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
     config = resolved(configured(bag, config_file, model), map_path)
     with run_bar(mode) as progress:

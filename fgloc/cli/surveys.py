@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from fgloc.atomic import check_out
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
 from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar
 from fgloc.errors import ConfigError, RecordingError
@@ -47,6 +48,7 @@ def make_map(
     from fgloc.calibration.survey import survey
     from fgloc.sensors.maps import load_map, write_map
 
+    check_out(out, folder=False)
     settings = configured(bags[0], config, model)
     given = None if anchor is None else load_map(anchor, size or settings.markers.default_size_m)
     settings = _with_markers(settings, dictionary, size, given)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.atomic import check_out
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
 from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, typed
 
@@ -24,15 +25,19 @@ def ablate(
 ) -> None:
     """Tell what the failure of each sensor costs; a killed sweep goes on where it was."""
     from fgloc.ablation.jobs import make_jobs
+    from fgloc.ablation.records import only_sweep
     from fgloc.ablation.report import failed, write_report
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
 
+    check_out(out)
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
-    with jobs_bar("runs", len(jobs)) as show:
-        records = sweep(jobs, out, workers, scheduler, retry, show)
-    for sentence in write_report(plan, jobs, records, out, typed()):
+    with only_sweep(out):
+        with jobs_bar("runs", len(jobs)) as show:
+            records = sweep(jobs, out, workers, scheduler, retry, show)
+        sentences = write_report(plan, jobs, records, out, typed())
+    for sentence in sentences:
         typer.echo(sentence)
     without = failed(jobs, records)
     if without:
@@ -51,12 +56,14 @@ def smooth_many(
 ) -> None:
     """Smooth each bag into a folder of its own; one that fails is listed and tried again next time."""
     from fgloc.ablation.bags import plan_bags
+    from fgloc.ablation.records import only_sweep
     from fgloc.ablation.sweep import sweep
 
+    check_out(out)
     if config_file is not None:
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
-    with jobs_bar("bags", len(plan.jobs)) as show:
+    with only_sweep(out), jobs_bar("bags", len(plan.jobs)) as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from fgloc.atomic import atomic_file
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.motion.card import FORMAT, VERSION, ModelCard
 from fgloc.motion.displacement import DisplacementModel
@@ -70,13 +72,12 @@ def read_model(path: Path) -> tuple[Tensors, ModelCard]:
 def save_model(path: Path, tensors: Tensors, card: ModelCard) -> None:
     """Write a model file that `load_model` accepts, atomically."""
     metadata = {"card": card.model_dump_json()}  # one entry: the order of several would differ from run to run
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(save(tensors, metadata=metadata))
-    try:
-        load_model(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    data = save(tensors, metadata=metadata)
+    with TemporaryDirectory(prefix="fgloc-") as folder:
+        (Path(folder) / path.name).write_bytes(data)
+        load_model(Path(folder) / path.name)
+    with atomic_file(path, binary=True) as file:
+        file.write(data)
 
 
 def _card(metadata: dict[str, str], path: Path) -> ModelCard:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from fgloc.errors import ConfigError, MapError
 from fgloc.frames import quaternion_matrix, rpy_matrix
-from fgloc.recording.outputs import atomic_file
+from fgloc.atomic import atomic_file
 from fgloc.sensors.dictionaries import load_dictionary
 from fgloc.sensors.documents import Item, read_document
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
