@@ -68,7 +68,9 @@ def test_fault_71_kill_at_every_rename_leaves_the_old_or_the_new_result(tmp_path
     states = kill_everywhere(tmp_path, lambda out: write(out, "old"))
     found = [content(out) for out in states]
     assert all(state in (OLD, NEW) for state in found)
-    assert found[0] == OLD and found[-1] == NEW and len(found) > 5
+    assert found[0] == OLD
+    assert found[-1] == NEW
+    assert len(found) > 5
     for out in states:
         write(out, "third")
         assert content(out) == dict.fromkeys((*NAMES, "d"), "third")
@@ -188,8 +190,10 @@ def test_no_link_is_followed_and_names_cannot_be_guessed(tmp_path):
         names = [name for name in os.listdir(tmp_path) if name.endswith(".partial") and str(os.getpid()) not in name]
         file.write("new")
     assert victim.read_text() == "precious"
-    assert (tmp_path / "a").read_text() == "new" and not (tmp_path / "a").is_symlink()
-    assert len(names) == 1 and len(names[0]) > 20
+    assert (tmp_path / "a").read_text() == "new"
+    assert not (tmp_path / "a").is_symlink()
+    assert len(names) == 1
+    assert len(names[0]) > 20
 
 
 def test_file_left_by_a_killed_writer_is_removed(tmp_path):
@@ -252,7 +256,8 @@ def test_kernel_that_refuses_to_write_keeps_the_old_file(tmp_path):
         "except Exception as error: print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("OutputError") and "File too large" in done.stdout
+    assert done.stdout.startswith("OutputError")
+    assert "File too large" in done.stdout
     assert (tmp_path / "a").read_text() == "old"
     assert os.listdir(tmp_path) == ["a"]
     assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 1000

@@ -19,7 +19,7 @@ class BagMetadata:
     """What of ``metadata.yaml`` is needed to find and to judge the storage files."""
 
     files: tuple[Path, ...]
-    compressed: bool  # by rosbag2 itself (whole files or single messages), not inside the storage format
+    compressed: str  # by rosbag2 itself: "file", "message", or "" (also where the storage format compresses)
     message_count: int | None
 
 
@@ -42,9 +42,10 @@ def read_metadata(folder: Path) -> BagMetadata | None:
         information = content["rosbag2_bagfile_information"]
         names = [_inside(path, name) for name in information["relative_file_paths"]]
         count = information.get("message_count")
+        mode = str(information.get("compression_mode")).lower()
         return BagMetadata(
             files=tuple(folder / name for name in dict.fromkeys(names)),
-            compressed=str(information.get("compression_mode")).lower() in ("file", "message"),
+            compressed=mode if mode in ("file", "message") else "",
             message_count=count if isinstance(count, int) and count >= 0 else None,
         )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):

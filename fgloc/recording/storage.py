@@ -16,6 +16,16 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from fgloc.errors import RecordingError
+from fgloc.recording.limits import (
+    REWINDS,
+    Budget,
+    TooLargeError,
+    bound_reader,
+    check_sqlite,
+    decompress_file,
+    decompressed,
+    opening,
+)
 from fgloc.recording.metadata import BagMetadata, read_metadata
 from fgloc.recording.recover import recover
 from fgloc.recording.recover_sqlite import sqlite_journals
@@ -57,26 +67,35 @@ class Storage:
         self.kind = _kind(self.files[0])
         self._files: list[_File] = []
         try:
-            if metadata is not None and metadata.compressed:
-                self._files.append(_File(path, "folder", self._folder, self.notes))
-            else:
-                self._open_files()
+            self._open_files(metadata is not None and metadata.compressed == "message")
             if metadata is not None and metadata.message_count is not None:
                 self._compare_count(metadata.message_count)
         except BaseException:
             self.close()
             raise
 
-    def _open_files(self) -> None:
+    def _open_files(self, compressed_messages: bool) -> None:
         failures = []
         for file in self.files:
             try:
-                self._files.append(_File(file, _kind(file), self._folder, self.notes))
+                plain = self._decompressed(file) if file.suffix == ".zstd" else file
+                self._files.append(_File(plain, self._folder, self.notes, compressed_messages))
+            except TooLargeError:
+                raise
             except RecordingError as error:
                 failures.append(str(error))
         if not self._files:
             raise RecordingError("\n".join(failures))
         self.notes.extend(failures)
+
+    def _decompressed(self, file: Path) -> Path:
+        """A copy of a file that the recorder compressed as a whole; of a damaged one, as far as it goes."""
+        target = self._folder() / file.stem
+        try:
+            decompress_file(file, target)
+        except (OSError, EOFError) as error:
+            self.notes.append(f"{file.name} is damaged ({_reason(error)}): what comes before is used.")
+        return target
 
     def _compare_count(self, expected: int) -> None:
         found = sum(channel.count for channel in self.channels)
@@ -141,16 +160,18 @@ class Storage:
 
 
 class _File:
-    """One storage file (or a compressed folder), replaced by a salvaged copy once it proves damaged."""
+    """One storage file, replaced by a salvaged copy once it proves damaged."""
 
-    def __init__(self, path: Path, kind: str, folder: Callable[[], Path], notes: list[str]) -> None:
-        self._path, self._kind, self._folder, self._notes = path, kind, folder, notes
+    def __init__(self, path: Path, folder: Callable[[], Path], notes: list[str], compressed_messages: bool) -> None:
+        self._path, self._kind, self._folder, self._notes = path, _kind(path), folder, notes
+        self._compressed_messages = compressed_messages
         self._recovered = False
+        self._budget = Budget(path)
         self.reader: Any = None
         try:
-            if kind == "sqlite3" and (journals := sqlite_journals(path)):
+            if self._kind == "sqlite3" and (journals := sqlite_journals(path)):
                 raise RecordingError(f"the recorder was killed, {journals[0].name} is left")
-            self.reader = _open(path, kind)
+            self.reader = _open(path, self._kind, self._budget)
         except Exception as error:  # rosbags leaks apsw, struct, decoding and assertion errors
             self._recover(error)
 
@@ -163,6 +184,7 @@ class _File:
         last_ns = -1
         at_last: list[tuple[str, bytes]] = []  # what was delivered last, to go on from there in a salvaged copy
         resume = (last_ns, at_last)
+        self._budget.start_pass(REWINDS)
         while True:
             reader = self.reader
             wanted = [c for c in reader.connections if topics is None or c.topic in topics]
@@ -177,7 +199,8 @@ class _File:
                     if received_ns != last_ns:
                         last_ns, at_last = received_ns, []
                     at_last.append((connection.topic, raw))
-                    yield connection.topic, connection.msgtype, received_ns, raw
+                    self._budget.spend(len(raw))
+                    yield connection.topic, connection.msgtype, received_ns, self._plain(raw)
                 return
             except Exception as error:
                 if self.reader is reader:  # else another iterator has already replaced it
@@ -190,13 +213,32 @@ class _File:
                         return
                 resume = (last_ns, at_last)
 
+    def _plain(self, raw: bytes) -> bytes:
+        """A message as it was before the recorder compressed it; one that is damaged stays, and is not decodable."""
+        if not self._compressed_messages:
+            return raw
+        try:
+            plain = decompressed("zstd", raw, self._budget.limit)
+        except OverflowError:
+            self._budget.check(self._budget.limit + 1)
+            raise
+        except Exception:  # damaged bytes
+            return raw
+        self._budget.spend(len(plain))
+        return plain
+
     def _recover(self, error: Exception) -> None:
+        if isinstance(error, TooLargeError):
+            raise error
         reason = _reason(error)
-        if self._recovered or self._kind == "folder" or isinstance(error, (PermissionError, FileNotFoundError)):
+        if self._recovered or isinstance(error, (PermissionError, FileNotFoundError)):
             raise RecordingError(f"{self._path}: cannot be read: {reason}.") from error
         try:
             recovered = recover(self._path, self._kind, self._folder())
-            reader = _open(recovered.path, _kind(recovered.path)) if recovered.messages else None
+            again = Budget(recovered.path) if recovered.messages else None
+            reader = _open(recovered.path, _kind(recovered.path), again) if again is not None else None
+        except TooLargeError:
+            raise
         except Exception as second:
             raise RecordingError(f"{self._path}: cannot be read: {reason}; nor salvaged: {_reason(second)}.") from error
         if reader is None:
@@ -216,11 +258,21 @@ class _File:
             self._notes.append(text)
 
 
-def _open(path: Path, kind: str) -> Any:
+def _open(path: Path, kind: str, budget: Budget) -> Any:
+    if kind == "sqlite3":
+        check_sqlite(path)
     reader = Ros1Reader(path) if kind == "ros1" else Ros2Reader(path)
-    reader.open()
+    budget.start_pass()
+    with opening(budget):
+        reader.open()
+        return _checked(reader, kind, budget)
+
+
+def _checked(reader: Any, kind: str, budget: Budget) -> Any:
     try:
-        if kind == "mcap" and not reader.storage.chunks:  # type: ignore[union-attr]
+        bound_reader(reader, budget)
+        if kind == "mcap" and not reader.storage.chunks:
+            budget.start_pass()
             for _ in reader.messages():  # without an index rosbags finds disorder only when it meets it
                 pass
         if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
