@@ -8,7 +8,6 @@ try:
 except PackageNotFoundError:  # run from a source tree that is not installed
     __version__ = "0+unknown"
 
-MAX_IMAGE_PIXELS = 1 << 24
-"""Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel."""
-# OpenCV reads this when it is loaded, and keeps to it whatever the format, before it takes memory.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_PIXELS))
+# Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel. OpenCV reads this when it
+# is loaded, and keeps to it whatever the format.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 24))

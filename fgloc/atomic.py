@@ -1,10 +1,9 @@
 """Files and folders that appear whole or not at all, also if the process is killed between any two system calls.
 
-A file is written under a temporary name in the same folder, flushed and renamed over the old one. A folder of results is
-written beside the old one; then the two are exchanged by one rename, so that a reader finds either all old files or all
-new ones. Where one rename cannot do it (``out`` is a mount point, the working folder, holds folders of others, or the
-file system cannot exchange), the old files move out before the new ones move in, and the next write completes or
-takes back what was interrupted: files of two results never lie side by side.
+A file is written under a temporary name beside the old one, flushed and renamed over it. So is a folder of results: one
+rename exchanges the two. Where that is not possible (``out`` is a mount point or the working folder, holds folders of
+others, or the file system cannot exchange), the old files move out before the new ones move in, and the next write
+completes or takes back what was interrupted: files of two results never lie side by side.
 
 Temporary names are random, made with ``O_EXCL`` or ``mkdir`` (no symbolic link is followed), and locked while their
 process lives: what is found unlocked was left by a killed one, and is removed.
@@ -15,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import fcntl
+import glob
 import os
 import secrets
 import shutil
@@ -80,7 +80,7 @@ def atomic_folder(out: Path, own: Sequence[str] = (), kept: Sequence[str] = ()) 
             yield stage
             _flush_folder(stage)
             with _one_at_a_time(out.parent):
-                own = (*own, *map(_literal, _names(stage)))
+                own = (*own, *map(glob.escape, _names(stage)))
                 if not (beside and _replaceable(out, own, kept) and _exchanged(stage, out, own)):
                     _move_in(stage, out, own)
                 _flush_folder(out.parent)
@@ -101,7 +101,7 @@ def check_out(out: Path, folder: bool = True) -> None:
     """
     with _named(out, "result" if folder else "file"):
         with suppress(FileNotFoundError, NotADirectoryError):
-            out.lstat()  # some names are refused: with a NUL, or too long
+            out.lstat()  # refuses a NUL
         if out.exists() and out.is_dir() is not folder:
             raise OutputError(f"{out}: is {'a file' if folder else 'a folder'}; give another --out")
         place = out if folder else out.parent
@@ -287,11 +287,6 @@ def _names(folder: Path) -> list[str]:
 
 def _fits(name: str, patterns: Sequence[str]) -> bool:
     return any(fnmatch(name, pattern) for pattern in patterns)
-
-
-def _literal(name: str) -> str:
-    """As a pattern that only this name fits."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 def _flush_folder(folder: Path) -> None:

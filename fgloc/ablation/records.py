@@ -82,7 +82,7 @@ def write_record(out: Path, record: Record) -> None:
 
 
 def attempts(out: Path) -> list[tuple[str, float]]:
-    """Key and time [s since 1970] of every run that was begun, in order; a line cut short by a full disk is left out."""
+    """Key and time [s since 1970] of every run that was begun, in order, without lines that a full disk cut short."""
     path = out / "jobs" / "attempts.log"
     lines = path.read_text(encoding="ascii", errors="replace").splitlines() if path.exists() else []
     return [(match[1], float(match[2])) for match in map(_ATTEMPT.fullmatch, lines) if match]

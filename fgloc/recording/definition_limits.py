@@ -1,7 +1,7 @@
 """What an embedded message definition may ask for: text that is quick to parse, and values that the message must hold.
 
-rosbags writes code for each element of a fixed array of texts or messages (``string[100000000]`` takes 5 GB), and parses
-IDL by trying: two nested parentheses take a minute.
+rosbags writes code for each element of a fixed array of texts or messages (``string[100000000]`` takes 5 GB), and
+parses IDL by trying: two nested parentheses take a minute.
 """
 
 from __future__ import annotations

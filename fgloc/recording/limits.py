@@ -1,7 +1,7 @@
 """Bounds on what a recording may expand to: work and memory stay in proportion to the size of its files.
 
-A few kilobytes of zstd, LZ4 or bzip2 can stand for gigabytes of zeros, an index may name one message a million times, and
-a table of a database may be a query that never ends. Sensor data compresses by 2 to 10, uncompressed images of a
+A few kilobytes of zstd, LZ4 or bzip2 can stand for gigabytes of zeros, an index may name one message a million times,
+and a table of a database may be a query that never ends. Sensor data compresses by 2 to 10, uncompressed images of a
 simulator without noise by up to 100: a pass over a recording may deliver 128 times its size, and 64 MiB in any case.
 """
 

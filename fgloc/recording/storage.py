@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from fgloc.errors import RecordingError
+from fgloc.recording.files import EXPECTED, find_files, kind_of
 from fgloc.recording.limits import (
     REWINDS,
     Budget,
@@ -26,12 +26,8 @@ from fgloc.recording.limits import (
     decompressed,
     opening,
 )
-from fgloc.recording.metadata import BagMetadata, read_metadata
 from fgloc.recording.recover import recover
 from fgloc.recording.recover_sqlite import sqlite_journals
-
-_KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
-_EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 RawMessage = tuple[str, str, int, bytes]  # topic, message type (pkg/msg/Name), received_ns, serialized message
 
@@ -63,8 +59,8 @@ class Storage:
         """
         self.notes: list[str] = []
         self._scratch: TemporaryDirectory[str] | None = None
-        metadata, self.files = _find_files(path, self.notes)
-        self.kind = _kind(self.files[0])
+        metadata, self.files = find_files(path, self.notes)
+        self.kind = kind_of(self.files[0])
         self._files: list[_File] = []
         try:
             self._open_files(metadata is not None and metadata.compressed == "message")
@@ -163,7 +159,7 @@ class _File:
     """One storage file, replaced by a salvaged copy once it proves damaged."""
 
     def __init__(self, path: Path, folder: Callable[[], Path], notes: list[str], compressed_messages: bool) -> None:
-        self._path, self._kind, self._folder, self._notes = path, _kind(path), folder, notes
+        self._path, self._kind, self._folder, self._notes = path, kind_of(path), folder, notes
         self._compressed_messages = compressed_messages
         self._recovered = False
         self._budget = Budget(path)
@@ -236,14 +232,14 @@ class _File:
         try:
             recovered = recover(self._path, self._kind, self._folder())
             again = Budget(recovered.path) if recovered.messages else None
-            reader = _open(recovered.path, _kind(recovered.path), again) if again is not None else None
+            reader = _open(recovered.path, kind_of(recovered.path), again) if again is not None else None
         except TooLargeError:
             raise
         except Exception as second:
             raise RecordingError(f"{self._path}: cannot be read: {reason}; nor salvaged: {_reason(second)}.") from error
         if reader is None:
             raise RecordingError(
-                f"{self._path}: cannot be read: {reason}; {_EXPECTED}, and no message could be salvaged."
+                f"{self._path}: cannot be read: {reason}; {EXPECTED}, and no message could be salvaged."
             ) from error
         self._recovered = True
         self.close()
@@ -281,51 +277,6 @@ def _checked(reader: Any, kind: str, budget: Budget) -> Any:
         reader.close()
         raise
     return reader
-
-
-def _find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
-    """Storage files of a recording, in order, and its metadata where used."""
-    if not path.exists():
-        raise RecordingError(f"{path}: does not exist; {_EXPECTED}")
-    if path.is_file():
-        _kind(path)
-        return None, (path,)
-    metadata = read_metadata(path)
-    if metadata is not None:
-        present = tuple(file for file in metadata.files if file.is_file())
-        if present:
-            missing = [file.name for file in metadata.files if file not in present]
-            if missing:
-                notes.append(f"Named by metadata.yaml but missing: {', '.join(missing)}.")
-            return metadata, present
-    groups: dict[str, list[Path]] = defaultdict(list)
-    for file in sorted(path.iterdir(), key=_natural):
-        if file.is_file() and file.suffix in (".mcap", ".db3"):
-            groups[file.suffix].append(file)
-    if not groups:
-        bags = sorted(file.name for file in path.glob("*.bag"))
-        hint = f"; give one of its ROS 1 bags: {', '.join(bags)}" if bags else f"; {_EXPECTED}"
-        raise RecordingError(f"{path}: a folder without .mcap or .db3{hint}")
-    if len(groups) > 1:
-        names = ", ".join(file.name for files in groups.values() for file in files)
-        raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
-    files = next(iter(groups.values()))
-    state = "damaged" if (path / "metadata.yaml").exists() else "missing"
-    notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
-    return None, tuple(files)
-
-
-def _kind(path: Path) -> str:
-    suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
-    if suffix not in _KINDS:
-        raise RecordingError(f"{path}: unknown kind {suffix!r}; {_EXPECTED}")
-    return _KINDS[suffix]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key: run_2 before run_10."""
-    parts = "".join(c if c.isdigit() else f" {c} " for c in path.name).split()
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _reason(error: Exception) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc import MAX_IMAGE_PIXELS
 from fgloc.errors import RecordingError
 from fgloc.types import ImageEvent
 
@@ -42,6 +42,7 @@ _PACKED: dict[str, tuple[str, int, int | None]] = {
 _LUMA_OFFSET = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 _PLANAR_LUMA = ("nv12", "nv21", "nv24")  # the luma plane comes first
 
+_MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])  # which `fgloc` sets
 _MAX_SCANS = 64  # of a progressive JPEG; cameras write up to 12, and each of them goes over the whole image
 
 _JPEG_START, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
@@ -129,10 +130,8 @@ def _stated_sizes(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _check_pixels(topic: str, width: int, height: int) -> None:
-    if width * height > MAX_IMAGE_PIXELS:
-        raise ImageError(
-            "size", f"{topic}: image of {width}x{height} pixels, expected at most {MAX_IMAGE_PIXELS} in all"
-        )
+    if width * height > _MAX_PIXELS:
+        raise ImageError("size", f"{topic}: image of {width}x{height} pixels, expected at most {_MAX_PIXELS} in all")
 
 
 def _raw(event: ImageEvent) -> GrayImage:

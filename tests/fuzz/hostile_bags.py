@@ -211,7 +211,8 @@ def sqlite_query(path: Path, query: str) -> None:
     }
     with closing(sqlite3.connect(path)) as database:
         database.executescript(
-            "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT); INSERT INTO schema VALUES(3, 'humble');"
+            "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT);"
+            "INSERT INTO schema VALUES(3, 'humble');"
             "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
             " offered_qos_profiles TEXT);"
             "INSERT INTO topics VALUES(1, '/odom', 'nav_msgs/msg/Odometry', 'cdr', '');"

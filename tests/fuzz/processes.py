@@ -40,7 +40,7 @@ class Done:
 
 
 def run(arguments: Sequence[str], seconds: float = 20.0) -> Done:
-    """Run ``python ARGUMENTS``; it is killed after this much processor time, or three times as much time on the wall."""
+    """Run ``python ARGUMENTS``; it is killed after this much processor time, or three times as much on the wall."""
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
