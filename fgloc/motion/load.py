@@ -54,6 +54,8 @@ def model_of(tensors: Tensors, card: ModelCard, path: Path = Path("model")) -> M
 def read_model(path: Path) -> tuple[Tensors, ModelCard]:
     """Raw weights by name and the checked card; errors as in `load_model`."""
     try:
+        if path.exists() and not path.is_file():
+            raise ModelError(f"{path}: not a regular file; give a .safetensors file")
         size = path.stat().st_size
         if size > _MAX_BYTES:
             raise ModelError(f"{path}: {size} bytes, expected a motion model of at most {_MAX_BYTES}")
@@ -85,7 +87,7 @@ def _card(metadata: dict[str, str], path: Path) -> ModelCard:
         fields = json.loads(metadata["card"])
     except KeyError:
         raise ModelError(f"{path}: has no card (inputs, normalization, noise) in its header; {_REMEDY}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"{path}: its card is not JSON ({error}); {_REMEDY}") from error
     found = (fields.get("format"), fields.get("version")) if isinstance(fields, dict) else fields
     if found != (FORMAT, VERSION):

@@ -20,8 +20,10 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
     """
     if not path.exists():
         raise RecordingError(f"{path}: does not exist; {EXPECTED}")
-    if path.is_file():
+    if not path.is_dir():
         kind_of(path)
+        if not path.is_file():
+            raise RecordingError(f"{path}: not a regular file; {EXPECTED}")
         return None, (path,)
     metadata = read_metadata(path)
     if metadata is not None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.atomic import atomic_file
+from fgloc.documents import read_text
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.frames import quaternion_yaw
 from fgloc.types import Decision, Trajectory
@@ -51,11 +52,7 @@ def read_tum(path: Path) -> Trajectory:
         TrajectoryError: the file is missing or empty, or a line has not eight finite numbers, a zero quaternion, or a
             stamp that does not come after the one before. The message names file, line and value.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise TrajectoryError(f"{path}: cannot be read ({why}); give a TUM text file") from error
+    lines = read_text(path, TrajectoryError, "give a TUM text file", max_bytes=1 << 30).splitlines()
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):

@@ -23,10 +23,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgloc.atomic import atomic_file
+from fgloc.documents import Item, read_document
 from fgloc.errors import ConfigError, MapError
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.sensors.dictionaries import load_dictionary
-from fgloc.sensors.documents import Item, read_document
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
