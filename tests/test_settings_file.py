@@ -34,11 +34,15 @@ def test_fault_65_hostile_configurations_are_refused_in_time(write):
     accepted = set()
     for name, text in SYNTAX.items():
         began = time.process_time()
+        path = write(text)
         try:
-            load_config(write(text))
-            accepted.add(name)
+            load_config(path)
         except ConfigError as error:
-            assert "robot.yaml" in str(error), name
+            said = str(error)
+        else:
+            said = str(path)
+            accepted.add(name)
+        assert str(path) in said, name
         assert time.process_time() - began < 2.0, name
     assert accepted == ACCEPTED | FILES
 
@@ -88,7 +92,7 @@ def test_suite_errors_name_line_and_correction(write):
 @pytest.mark.parametrize("text", [SYNTAX[name] for name in ("alias bomb", "merge bomb", "alias chain", "deep lists")])
 def test_fault_65_bombs_are_refused_by_every_reader(write, text):
     for read in (load_config, load_suite, load_map):
-        with pytest.raises(FglocError, match="stand for more|nested deeper"):
+        with pytest.raises(FglocError, match=r"stand for more|nested deeper"):
             read(write(text))
 
 

@@ -10,7 +10,7 @@ import typer
 
 from fgloc.atomic import check_out
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
-from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, typed
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, say, typed
 
 if TYPE_CHECKING:
     from fgloc.ablation.records import Record
@@ -38,11 +38,11 @@ def ablate(
             records = sweep(jobs, out, workers, scheduler, retry, show)
         sentences = write_report(plan, jobs, records, out, typed())
     for sentence in sentences:
-        typer.echo(sentence)
+        say(sentence)
     without = failed(jobs, records)
     if without:
-        typer.echo(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
-    typer.echo(f"report: {out / 'report.html'}")
+        say(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    say(f"report: {out / 'report.html'}")
 
 
 def smooth_many(
@@ -67,21 +67,21 @@ def smooth_many(
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
-    typer.echo(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
+    say(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
     errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
     for name in plan.names:
         if name in errors:
-            typer.echo(f"{name}: {errors[name]}", err=True)
+            say(f"{name}: {errors[name]}", err=True)
     for name, record in by_name.items():
         for mistake in record.mistakes:
-            typer.echo(f"{name}: {mistake}", err=True)
-    typer.echo(f"reports: {out / '*' / 'report.html'}")
+            say(f"{name}: {mistake}", err=True)
+    say(f"reports: {out / '*' / 'report.html'}")
     if errors:
-        typer.echo(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
+        say(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     lost = any(record.modes.get("LOST") for record in by_name.values())
     if lost:
-        typer.echo("LOST for part of a run: do not trust it there", err=True)
+        say("LOST for part of a run: do not trust it there", err=True)
     if lost or any(record.mistakes for record in by_name.values()):
         raise typer.Exit(EXIT_LOST)
 

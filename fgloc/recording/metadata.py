@@ -27,7 +27,8 @@ def read_metadata(folder: Path) -> BagMetadata | None:
     """Read ``folder/metadata.yaml``; None if it is absent or is too damaged to be understood.
 
     Raises:
-        RecordingError: the file is absurdly large or deep, has aliases that expand without bound, or names a path outside the folder.
+        RecordingError: the file is absurdly large or deep, has aliases that expand without bound, or names a path
+            outside the folder.
     """
     path = folder / "metadata.yaml"
     try:
@@ -40,7 +41,7 @@ def read_metadata(folder: Path) -> BagMetadata | None:
         return None
     try:
         root = parse(text, str(path))
-        content = None if root is None else plain(root)
+        content = {} if root is None else plain(root)
         information = content["rosbag2_bagfile_information"]
         names = [_inside(path, name) for name in information["relative_file_paths"]]
         count = information.get("message_count")
