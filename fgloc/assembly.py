@@ -101,7 +101,7 @@ def assemble(
     camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(recording, config, first, notes)
-    if resolved(config, map_path) != config:
+    if map_path is None and landmark_map is None and {"image", "sightings"} & set(recording.roles):
         config = resolved(config, map_path)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
