@@ -17,6 +17,7 @@ from fgloc.types import (
     Landmark,
     LandmarkMeasurement,
     MarkerPoseMeasurement,
+    PoseMeasurement,
     RangeBearingMeasurement,
 )
 
@@ -86,14 +87,17 @@ class Observations:
         """
         self._count = len(measurements)
         corners = [i for i, m in enumerate(measurements) if isinstance(m, CornerMeasurement)]
-        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement)]
-        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch]] = []
+        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement | PoseMeasurement)]
+        by_pose = [i for i, m in enumerate(measurements) if isinstance(m, PoseMeasurement)]
+        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch | PoseBatch]] = []
         if corners:
             seen = [m for m in measurements if isinstance(m, CornerMeasurement)]
             self.batches.append((corners, CornerBatch(seen, landmarks, installation)))
         if planar:
-            rest = [m for m in measurements if not isinstance(m, CornerMeasurement)]
+            rest = [m for m in measurements if not isinstance(m, CornerMeasurement | PoseMeasurement)]
             self.batches.append((planar, PlanarBatch(rest, landmarks, installation)))
+        if by_pose:
+            self.batches.append((by_pose, PoseBatch([m for m in measurements if isinstance(m, PoseMeasurement)])))
 
     def __len__(self) -> int:
         return self._count
@@ -323,6 +327,32 @@ class PlanarBatch:
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it: the noise of these sightings has all in it."""
         return np.zeros((len(J), 0))
+
+
+class PoseBatch:
+    """Measurements of registered sensors, which depend on the pose alone."""
+
+    def __init__(self, seen: Sequence[PoseMeasurement]) -> None:
+        self._seen = seen
+        self.rows = [len(m.cov) for m in seen]
+        self._whitening = [np.asarray(np.linalg.inv(np.linalg.cholesky(m.cov))) for m in seen]
+        self._columns = np.zeros((len(seen), 0), dtype=np.int64)
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All measurements, each at its own pose ``(m, 3)``."""
+        n, most = len(poses), max(self.rows)
+        residual, J = np.zeros((n, most)), np.zeros((n, most, 3))
+        for i, (m, W, d) in enumerate(zip(self._seen, self._whitening, self.rows, strict=True)):
+            r, by_pose = m.residual_at_keyframe(poses[i])
+            residual[i, :d], J[i, :d] = W @ r, W @ by_pose
+        return Stacked(residual, J, np.zeros((n, most, 0)), self._columns, np.zeros(n, dtype=np.bool_))
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it: of the motion by which the measurement was moved to its keyframe."""
+        m = self._seen[i]
+        if m.motion_cov is None:
+            return np.zeros((len(J), 0))
+        return np.asarray(J @ se2.adjoint(m.T_keyframe_then) @ _root(m.motion_cov))
 
 
 def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

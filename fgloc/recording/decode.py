@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from fgloc.config import Role
+from fgloc.sensors import registry
 from fgloc.types import (
     CameraInfoEvent,
     CommandEvent,
@@ -184,6 +185,11 @@ CONVERTERS: dict[Role, dict[str, Callable[[Any, When], Event]]] = {
         "nav_msgs/msg/Odometry": _covariance_truth,
     },
 }
+
+
+def converters_of(role: Role) -> Mapping[str, Callable[[Any, When], Event]]:
+    """Converters of any role, by message type."""
+    return CONVERTERS[role] if role in CONVERTERS else registry.converters(role)
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------

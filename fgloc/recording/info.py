@@ -13,7 +13,7 @@ import numpy as np
 from fgloc.config import Config, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.checks import CHECKS
+from fgloc.recording.checks import CHECKS, OtherChecks
 from fgloc.recording.checks_base import Collector
 from fgloc.recording.checks_camera import CameraInfoChecks, ImageChecks, SightingsChecks
 from fgloc.recording.reader import Recording
@@ -48,7 +48,7 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
     with Recording(path, config.recording) as recording:
         times = {topic.name: Times() for topic in recording.topics}
         role_of = {topic: role for role, topic in recording.roles.items()}
-        checks: dict[str, Collector] = {topic: CHECKS[role]() for topic, role in role_of.items()}
+        checks: dict[str, Collector] = {topic: CHECKS.get(role, OtherChecks)() for topic, role in role_of.items()}
         child_frame = ""
         for message in recording.messages():
             topic, _, received_ns, _ = message

@@ -27,6 +27,7 @@ from fgloc.types import (
     MarkerPoseMeasurement,
     MotionMeasurement,
     MotionReadings,
+    PoseMeasurement,
     RangeBearingMeasurement,
     Step,
 )
@@ -47,6 +48,8 @@ _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
 _UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
 _ITERATIONS, _ROUGH_ITERATIONS = 16, 4
+_POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
+_YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes what 5 s of them say.
 _RETRY_NS = 800_000_000
 
@@ -246,7 +249,7 @@ class GlobalSearch:
             told[m.landmark_id] = told.get(m.landmark_id, 0.0) + _information(m)
         share = sum(told.values()) / sum(map(_information, sightings))
         heard = {i for i, information in told.items() if information > _HEARD * max(told.values())}
-        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in heard}
+        residuals = {m.landmark_id: _residuals(m) for m in agreeing if m.landmark_id in heard}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         outliers = [m for m in sightings if not any(m is other for other in agreeing)]
@@ -272,6 +275,10 @@ class GlobalSearch:
         if self._map is None:
             return
         points = []
+        by_pose = [m for m in sightings if isinstance(m, PoseMeasurement)]
+        for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
+            yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
+        sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
         whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
         for m in [*seeds, *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
@@ -312,6 +319,10 @@ def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[Lan
     if len(sightings) <= most:
         return sightings
     return sorted(sightings, key=lambda m: m.landmark_id)[:: -(-len(sightings) // most)]
+
+
+def _residuals(m: LandmarkMeasurement) -> int:
+    return len(m.cov) if isinstance(m, PoseMeasurement) else _RESIDUALS[type(m)]
 
 
 def _information(m: LandmarkMeasurement) -> float:

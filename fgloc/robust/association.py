@@ -20,6 +20,7 @@ from fgloc.types import (
     Decision,
     LandmarkMeasurement,
     MarkerPoseMeasurement,
+    PoseMeasurement,
     RangeBearingMeasurement,
 )
 
@@ -63,10 +64,10 @@ class Association:
         """
         believed, refused, decisions = [], [], []
         fitting, gated = [], []
+        judged = self._judge(measurements, predicted)
+        measurements, judged = self._explained_otherwise(measurements, judged, predicted)
         shared = [self._share_information(m) for m in measurements]
-        for alone, (m, weight), (nis, dof, reason) in zip(
-            measurements, shared, self._judge(measurements, predicted), strict=True
-        ):
+        for alone, (m, weight), (nis, dof, reason) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
             if not reason:
                 fitting.append(sighting)
@@ -78,7 +79,7 @@ class Association:
                 reason = "contradicts_start"
             if reason:
                 refused.append(sighting)
-                self.rejections[f"sightings.{reason}"] += 1
+                self.rejections[f"{_source(m)}.{reason}"] += 1
             else:
                 believed.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
@@ -86,8 +87,8 @@ class Association:
                 Decision(
                     k,
                     stamp_ns,
-                    KINDS[type(m)],
-                    m.landmark_id,
+                    _kind(m),
+                    m.target if isinstance(m, PoseMeasurement) else m.landmark_id,
                     math.sqrt(nis),
                     nis,
                     dof,
@@ -107,8 +108,34 @@ class Association:
         if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
         if not believed:
-            self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
+            self._contradicting.update(
+                s.measurement.landmark_id
+                for s, d in zip(refused, decisions, strict=True)
+                if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
+            )
         return believed, refused, decisions
+
+    def _explained_otherwise(
+        self,
+        measurements: Sequence[LandmarkMeasurement],
+        judged: list[tuple[float, int, str]],
+        predicted: PoseWithCovariance,
+    ) -> tuple[list[LandmarkMeasurement], list[tuple[float, int, str]]]:
+        """Where the gate refuses a measurement, the first of its alternatives that the gate accepts takes its place.
+
+        Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the likeliest
+        component of a mixture stands for all of it; here the gate decides which.
+        """
+        taken, verdicts = list(measurements), list(judged)
+        for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True)):
+            if reason != "gate" or not isinstance(m, PoseMeasurement):
+                continue
+            for other in m.alternatives(predicted.pose):
+                verdict = self._judge([other], predicted)[0]
+                if not verdict[2]:
+                    taken[i], verdicts[i] = other, verdict
+                    break
+        return taken, verdicts
 
     def _reassociate(
         self,
@@ -167,7 +194,8 @@ class Association:
             return
         for sighting in fitting:
             self.exclusion.accept(sighting.measurement.landmark_id)
-        self.exclusion.reject(gated, k, predicted.pose, self._factors)
+        of_landmarks = [s for s in gated if not isinstance(s.measurement, PoseMeasurement)]
+        self.exclusion.reject(of_landmarks, k, predicted.pose, self._factors)
 
     def nearby_consensus(
         self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
@@ -186,7 +214,9 @@ class Association:
         x, y, yaw = se2.between(predicted.pose, fit.pose)
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
             return None
-        self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
+        self.rejections.subtract(
+            f"{_source(s.measurement)}.{d.reason}" for s, d in zip(refused, decisions, strict=True)
+        )
         self.rejections += Counter()  # drops the zeros
         return fit
 
@@ -281,7 +311,7 @@ class Association:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
         correlation_s = self._config.landmarks.repeat_s
         last = self._last_used_ns.get(m.landmark_id)
-        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement):
+        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement | PoseMeasurement):
             return m, 1.0
         apart = max((m.stamp_ns - last) * 1e-9, 0.01)
         scale = max(1.0, correlation_s / apart)
@@ -300,3 +330,13 @@ class Association:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
         self.forget_contradictions()
+
+
+def _kind(m: LandmarkMeasurement) -> str:
+    """Of a measurement's row in ``steps.csv``."""
+    return m.source if isinstance(m, PoseMeasurement) else KINDS[type(m)]
+
+
+def _source(m: LandmarkMeasurement) -> str:
+    """Of a measurement's rejections."""
+    return m.source if isinstance(m, PoseMeasurement) else "sightings"
