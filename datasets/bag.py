@@ -253,7 +253,7 @@ class BagWriter:
         self, topic: str, stamp_ns: int, range_m: float, frame_id: str, received_ns: int | None = None
     ) -> None:
         """``sensor_msgs/Range`` of a radio, of 0.1 to 100 m."""
-        content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m, variance=0.0)
+        content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m)
         self._write(topic, "sensor_msgs/msg/Range", stamp_ns, received_ns, frame_id, content)
 
     def satellite_fix(
