@@ -421,7 +421,7 @@ class Decision:
 
     step: int
     stamp_ns: int
-    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "prior", or a sensor's name
+    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "prior", or of a sensor
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float

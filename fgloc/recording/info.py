@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc.config import Config, Role
+from fgloc.config import BUILT_IN_ROLES, Config, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.checks import CHECKS, OtherChecks
@@ -20,6 +20,8 @@ from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
+
+_NO_PLACE = frozenset(BUILT_IN_ROLES) - {"image", "sightings"}  # roles that do not tell where in the map a robot is
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         found.append("No odometry, joint states or commands: nothing tells how the robot moves.")
-    if not unsettled and not {"image", "sightings"} & roles.keys():
+    if not unsettled and not roles.keys() - _NO_PLACE:
         found.append("No images and no marker sightings: nothing bounds the drift.")
     images = next((c for c in checks.values() if isinstance(c, ImageChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)

@@ -13,6 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
+from fgloc.robust.innovation_bias import InnovationBias
 from fgloc.robust.moved_landmark_votes import LandmarkExclusion
 from fgloc.stats import chi2_bound
 from fgloc.types import (
@@ -47,6 +48,7 @@ class Association:
         self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
         self._believed_ns = 0  # the newest keyframe at which something was believed
+        self._bias = InnovationBias(config.estimator.gate_probability)
         self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
 
     def judge(
@@ -64,7 +66,7 @@ class Association:
         """
         believed, refused, decisions = [], [], []
         fitting, gated = [], []
-        judged = self._judge(measurements, predicted)
+        judged = self._biased(measurements, self._judge(measurements, predicted), predicted)
         measurements, judged = self._explained_otherwise(measurements, judged, predicted)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, reason) in zip(measurements, shared, judged, strict=True):
@@ -88,7 +90,7 @@ class Association:
                     k,
                     stamp_ns,
                     _kind(m),
-                    m.target if isinstance(m, PoseMeasurement) else m.landmark_id,
+                    -1 if isinstance(m, PoseMeasurement) else m.landmark_id,
                     math.sqrt(nis),
                     nis,
                     dof,
@@ -115,6 +117,26 @@ class Association:
             )
         return believed, refused, decisions
 
+    def _biased(
+        self,
+        measurements: Sequence[LandmarkMeasurement],
+        judged: list[tuple[float, int, str]],
+        predicted: PoseWithCovariance,
+    ) -> list[tuple[float, int, str]]:
+        """Refuse measurements of registered sensors that pass the gate one by one, but not together."""
+        rows = [
+            i
+            for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True))
+            if isinstance(m, PoseMeasurement) and not reason
+        ]
+        verdicts = list(judged)
+        for i in rows if self._config.weights.adaptive else ():
+            m = measurements[i]
+            (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.believed.mean)
+            if self._bias.is_biased((_kind(m), m.landmark_id), m.stamp_ns, one, predicted.cov):
+                verdicts[i] = verdicts[i][0], verdicts[i][1], "biased"
+        return verdicts
+
     def _explained_otherwise(
         self,
         measurements: Sequence[LandmarkMeasurement],
@@ -128,7 +150,7 @@ class Association:
         """
         taken, verdicts = list(measurements), list(judged)
         for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True)):
-            if reason != "gate" or not isinstance(m, PoseMeasurement):
+            if reason not in ("gate", "biased") or not isinstance(m, PoseMeasurement):
                 continue
             for other in m.alternatives(predicted.pose):
                 verdict = self._judge([other], predicted)[0]
@@ -325,6 +347,7 @@ class Association:
     def forget_contradictions(self) -> None:
         """The pose was set anew: `contradicting` starts from 0."""
         self._contradicting.clear()
+        self._bias.forget()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
@@ -333,8 +356,10 @@ class Association:
 
 
 def _kind(m: LandmarkMeasurement) -> str:
-    """Of a measurement's row in ``steps.csv``."""
-    return m.source if isinstance(m, PoseMeasurement) else KINDS[type(m)]
+    """Of a measurement's row in ``steps.csv``: of a registered sensor with the number of what it measured."""
+    if not isinstance(m, PoseMeasurement):
+        return KINDS[type(m)]
+    return m.source if m.target < 0 else f"{m.source}.{m.target}"
 
 
 def _source(m: LandmarkMeasurement) -> str:
