@@ -27,6 +27,6 @@ def unused_sightings(rejections: Mapping[str, int], roles: Mapping[Role, str], u
     reasons = ", ".join(f"{name} {n}" for name, n in sorted(by_clock.items(), key=lambda item: -item[1]))
     return (
         f"None of the sightings on {roles[role]} was used, for their stamps do not fit the clock of the other topics "
-        f"({reasons}): the run is dead reckoning. `fgloc info` compares the clocks; recording.received_stamps: [{role}] "
-        "takes the receive times instead.",
+        f"({reasons}): the run is dead reckoning. `fgloc info` compares the clocks; recording.received_stamps: "
+        f"[{role}] takes the receive times instead.",
     )
