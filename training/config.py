@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from fgloc.config import Section
-from fgloc.motion.card import Input, Kind, Split
+from fgloc.sensors.learned.card import Input, Kind, Split
 from fgloc.settings_file import Settings
 
 

@@ -16,10 +16,10 @@ import fgloc
 from fgloc.config import GateConfig, load_config
 from fgloc.documents import parse, plain
 from fgloc.errors import FglocError, ModelError
-from fgloc.intake.validation import Gate
-from fgloc.motion import load_model
+from fgloc.intake.validation import EventValidator
 from fgloc.recording.decode import CONVERTERS
 from fgloc.recording.messages import default_typestore
+from fgloc.sensors.learned import load_model
 from tests.fuzz import zygote
 from tests.fuzz.cases import recording_cases
 from tests.fuzz.mutate import MUTATIONS, mutated
@@ -112,7 +112,7 @@ def test_absurd_numbers_in_every_field_are_judged(role, kind):
     @settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(st.data())
     def judged(data):
-        gate = Gate(GateConfig(), None)
+        gate = EventValidator(GateConfig(), None)
         for k in range(3):
             message = _filled(kind, data.draw)
             with np.errstate(all="ignore"):

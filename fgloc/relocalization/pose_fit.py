@@ -1,0 +1,140 @@
+"""The place that sightings tell: the pose that explains them best, and how well it does."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.observation import CornerBatch, PlanarBatch, Stacked
+from fgloc.stats import chi2_bound
+from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
+
+_GAUSS_NEWTON_STEPS = 4
+_BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
+_TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A pose that sightings alone give: covariance of the right perturbation, robust cost, number of residuals."""
+
+    pose: FloatArray
+    cov: FloatArray
+    cost: float
+    dof: int
+
+    @property
+    def redundancy(self) -> int:
+        """How many residuals there are more than are needed for a pose."""
+        return self.dof - 3
+
+    def bound(self, probability: float) -> float:
+        """What the cost exceeds as seldom as one minus this."""
+        return chi2_bound(probability, max(self.redundancy, 1))
+
+
+def joint_fit(
+    start: FloatArray,
+    sightings: Sequence[LandmarkMeasurement],
+    factors: LandmarkFactors,
+    config: Config,
+    iterations: int = 4 * _GAUSS_NEWTON_STEPS,
+) -> Fit | None:
+    """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
+
+    Gauss-Newton with Cauchy weights, so that one wrong sighting does not corrupt the place. What is not known of the
+    installation is taken for noise of each sighting by itself.
+    """
+    fitted = PoseFit(sightings, factors, config)
+    return fitted.solve(start, iterations)
+
+
+class PoseFit:
+    """Sightings of one base, to be fitted from several starting poses."""
+
+    def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
+        self._observed = factors.observe(sightings)
+        self._theta, self._cov = factors.believed.mean, factors.believed.cov
+        self._k = np.array([cauchy_k(m, config) for m in sightings])
+        self._whitening: dict[int, FloatArray] = {}  # by kind
+
+    def solve(self, start: FloatArray, iterations: int) -> Fit | None:
+        """As `joint_fit`."""
+        pose, previous = start, math.inf
+        for step in range(iterations):
+            normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
+            for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
+                square = np.einsum("ni,ni->n", r, r)
+                weight = np.where(behind, 0.0, k**2 / (k**2 + 2.0 * square / d))  # as if of two-dimensional sightings
+                cost += float(np.where(behind, _BEHIND_COST, _robust_costs(square, d, k)).sum())
+                dof += int(d.sum())
+                normal += np.einsum("n,nij,nik->jk", weight, J, J)
+                pull += np.einsum("n,nij,ni->j", weight, J, r)
+            if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
+                return None
+            if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
+                break
+            previous = cost
+            pose = se2.compose(pose, se2.exp(np.asarray(np.linalg.solve(normal, -pull), dtype=np.float64)))
+        cov = np.linalg.inv(normal)
+        return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
+
+    def costs(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Robust cost of each sighting at a pose (infinite: it cannot have been made there), and its residuals."""
+        costs, dofs = np.zeros(len(self._observed)), np.zeros(len(self._observed), dtype=int)
+        for (rows, _), (r, _, behind, d, k) in zip(self._observed.batches, self._white(pose, anew=True), strict=True):
+            square = np.einsum("ni,ni->n", r, r)
+            costs[rows] = np.where(behind, np.inf, _robust_costs(square, d, k))
+            dofs[rows] = d
+        return costs, dofs
+
+    def _whiten(self, batch: CornerBatch | PlanarBatch, stack: Stacked) -> FloatArray:
+        """What is not known of the installation, of the stamps and of the motion in between counts as noise."""
+        n, d = stack.residual.shape
+        cov = np.broadcast_to(np.eye(d), (n, d, d))
+        if len(self._cov):
+            P = self._cov[stack.columns[:, :, None], stack.columns[:, None, :]]
+            cov = cov + stack.H @ P @ stack.H.transpose(0, 2, 1)
+        shared = [batch.shared(i, stack.J[i], stack.H[i]) for i in range(n)]
+        cov = cov + np.array([g @ g.T for g in shared])
+        useless = stack.behind | ~(np.trace(cov, axis1=1, axis2=2) < _TELLS_NOTHING)
+        noise = np.where(stack.behind, 1.0, _TELLS_NOTHING)
+        cov = np.where(useless[:, None, None], noise[:, None, None] * np.eye(d), cov)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+
+    def _white(
+        self, pose: FloatArray, anew: bool
+    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray]]:
+        """Of each kind: residuals, Jacobians, what is behind the camera, residuals of each, Cauchy constants."""
+        for i, (rows, batch) in enumerate(self._observed.batches):
+            stack = batch.evaluate(np.broadcast_to(pose, (len(rows), 3)), self._theta, by_installation=anew)
+            if anew:
+                self._whitening[i] = self._whiten(batch, stack)
+            W = self._whitening[i]
+            r = np.einsum("nij,nj->ni", W, stack.residual)
+            yield r, W @ stack.J, stack.behind, np.array(batch.rows), self._k[rows]
+
+
+def sighting_costs(
+    pose: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
+) -> tuple[FloatArray, IntArray]:
+    """Robust cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
+    return PoseFit(sightings, factors, config).costs(pose)
+
+
+def cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
+    """Cauchy constant of a sighting of this kind, in units of its sigma."""
+    return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
+
+
+def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:
+    """Cauchy's costs of squared whitened residuals, as if they were those of two-dimensional sightings."""
+    pairs = dof / 2.0
+    return np.asarray(k**2 * np.log1p(square / pairs / k**2) * pairs)

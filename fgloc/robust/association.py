@@ -1,0 +1,302 @@
+"""What a sighting is worth: its covariance, and whether it is believed at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
+from fgloc.robust.moved_landmark_votes import LandmarkExclusion
+from fgloc.stats import chi2_bound
+from fgloc.types import (
+    CornerMeasurement,
+    Decision,
+    LandmarkMeasurement,
+    MarkerPoseMeasurement,
+    RangeBearingMeasurement,
+)
+
+KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
+_STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
+REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
+NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
+
+
+class Association:
+    """Weighs the sightings of one step against the prediction.
+
+    Attributes:
+        rejections: refused sightings by reason.
+        contrary: sightings, by stamp and landmark, that contradict the place where the run starts: not to be believed.
+    """
+
+    def __init__(self, config: Config, factors: LandmarkFactors) -> None:
+        self._config = config
+        self._factors = factors
+        self._last_used_ns: dict[int, int] = {}
+        self._seen: Counter[int] = Counter()
+        self.rejections: Counter[str] = Counter()
+        self.outliers: frozenset[tuple[int, int]] = frozenset()
+        self._contradicting: set[int] = set()
+        self._believed_ns = 0  # the newest keyframe at which something was believed
+        self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
+
+    def judge(
+        self,
+        k: int,
+        stamp_ns: int,
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: PoseWithCovariance,
+    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
+        """Sort sightings into believed and refused, with the decision on each.
+
+        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
+        the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
+        because after dead reckoning the linear one is far too large.
+        """
+        believed, refused, decisions = [], [], []
+        fitting, gated = [], []
+        shared = [self._share_information(m) for m in measurements]
+        for alone, (m, weight), (nis, dof, reason) in zip(
+            measurements, shared, self._judge(measurements, predicted), strict=True
+        ):
+            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
+            if not reason:
+                fitting.append(sighting)
+            elif reason == "gate":
+                gated.append(sighting)
+            if self.exclusion.excludes(m.landmark_id):
+                reason = "quarantined"
+            elif (m.stamp_ns, m.landmark_id) in self.outliers:
+                reason = "contradicts_start"
+            if reason:
+                refused.append(sighting)
+                self.rejections[f"sightings.{reason}"] += 1
+            else:
+                believed.append(sighting)
+                self._last_used_ns[m.landmark_id] = m.stamp_ns
+            decisions.append(
+                Decision(
+                    k,
+                    stamp_ns,
+                    KINDS[type(m)],
+                    m.landmark_id,
+                    math.sqrt(nis),
+                    nis,
+                    dof,
+                    0.0 if reason else weight,
+                    reason,
+                )
+            )
+        if believed:
+            self._believed_ns = stamp_ns
+            self._contradicting.clear()
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
+                gated = [s for s in gated if s is not misread]
+                refused.remove(misread)
+                believed.append(sighting)
+                fitting.append(sighting)
+                decisions.append(decision)
+        if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
+            self._compare(k, fitting, gated, predicted)
+        if not believed:
+            self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
+        return believed, refused, decisions
+
+    def _reassociate(
+        self,
+        k: int,
+        stamp_ns: int,
+        refused: Sequence[LandmarkFactor],
+        decisions: list[Decision],
+        predicted: PoseWithCovariance,
+    ) -> list[tuple[LandmarkFactor, LandmarkFactor, Decision]]:
+        """Refused markers whose code was misread: what was refused, what it was, and the decision on that.
+
+        Beside others that are believed, a marker that cannot be where it was seen, in a place where exactly one other
+        would be seen that was not, is that other.
+        """
+        if not refused or not self._config.weights.adaptive or not self._factors.known:
+            return []
+        found = []
+        seen = {d.landmark_id for d in decisions if not d.reason}
+        rows = [i for i, d in enumerate(decisions) if d.reason]
+        for i, misread in zip(rows, refused, strict=True):
+            m = misread.measurement
+            if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, CornerMeasurement):
+                continue
+            fits = []
+            for other in self._factors.lookalikes(m, predicted.pose):
+                if other in seen or self.exclusion.excludes(other):
+                    continue
+                again = dataclasses.replace(m, landmark_id=other)
+                sighting = self._factors.sighting(k, again, misread.cauchy_k)
+                nis, dof, reason = self._judge([again], predicted)[0]
+                if not reason:
+                    fits.append((sighting, nis, dof))
+            if len(fits) != 1:
+                continue
+            sighting, nis, dof = fits[0]
+            other = sighting.measurement.landmark_id
+            seen.add(other)
+            self._last_used_ns[other] = m.stamp_ns
+            self.rejections[f"sightings.{decisions[i].reason}"] -= 1
+            self.rejections["sightings.misread"] += 1
+            decisions[i] = dataclasses.replace(decisions[i], reason="misread")
+            found.append(
+                (misread, sighting, Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, ""))
+            )
+        self.rejections += Counter()  # drops the zeros
+        return found
+
+    def _compare(
+        self, k: int, fitting: Sequence[LandmarkFactor], gated: Sequence[LandmarkFactor], predicted: PoseWithCovariance
+    ) -> None:
+        """Others were believed, now or just before: what disagrees beside them may have been moved.
+
+        Without them, in the dark say, the prediction is too little known to be held against a landmark.
+        """
+        if not self._config.weights.adaptive or not self._factors.known:
+            return
+        for sighting in fitting:
+            self.exclusion.accept(sighting.measurement.landmark_id)
+        self.exclusion.reject(gated, k, predicted.pose, self._factors)
+
+    def nearby_consensus(
+        self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
+    ) -> Fit | None:
+        """The place nearby that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
+
+        Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
+        is taken back.
+        """
+        gated = [s for s, d in zip(refused, decisions, strict=True) if d.reason == "gate"]
+        if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
+            return None
+        fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
+        if fit is None or fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability):
+            return None
+        x, y, yaw = se2.between(predicted.pose, fit.pose)
+        if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
+            return None
+        self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
+        self.rejections += Counter()  # drops the zeros
+        return fit
+
+    def _judge(
+        self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> list[tuple[float, int, str]]:
+        """Of each: NIS, its degrees of freedom, and why it is refused ("" if it is believed)."""
+        if not self._factors.known:
+            return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
+        if not measurements:
+            return []
+        lines = self._factors.linearize(measurements, predicted.pose)
+        known = predicted.installation or self._factors.believed
+        found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
+        uncertain = not is_linear(predicted)
+        judged = []
+        for m, one, nis in zip(measurements, lines, found, strict=True):
+            dof = len(one.residual)
+            if one.behind:
+                judged.append((math.nan, dof, "behind_camera"))
+                continue
+            bound = chi2_bound(self._config.estimator.gate_probability, dof)
+            if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
+                nis = min(nis, corrected[1])
+            judged.append((nis, dof, "gate" if nis > bound else ""))
+        return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
+
+    def _agreed(
+        self,
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: PoseWithCovariance,
+        judged: list[tuple[float, int, str]],
+    ) -> list[tuple[float, int, str]]:
+        """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
+
+        Between as many as that, those that the prediction finds likeliest.
+
+        Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
+        """
+        rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
+        if len(rows) < 2 or self._compatible(rows, measurements, predicted):
+            return judged
+        found = [self._agreeing_with(i, rows, measurements, predicted) for i in rows]
+        most: list[int] = []
+        for _, agree in sorted(found, key=lambda item: (-len(item[1]), item[0])):
+            while len(agree) > max(len(most), 1) and not self._compatible(agree, measurements, predicted):
+                agree = agree[:-1]
+            if len(agree) > len(most):
+                most = agree
+        return [
+            (nis, dof, reason or ("" if i in most or not most else "contradicts_others"))
+            for i, (nis, dof, reason) in enumerate(judged)
+        ]
+
+    def _compatible(
+        self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> bool:
+        """Whether these sightings and the prediction may all be right."""
+        known = predicted.installation or self._factors.believed
+        seen = [measurements[i] for i in rows]
+        together = correct(predicted, known, seen, self._factors)
+        dof = sum(8 if isinstance(m, CornerMeasurement) else len(m.cov) for m in seen)
+        return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
+
+    def _agreeing_with(
+        self,
+        first: int,
+        rows: Sequence[int],
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: PoseWithCovariance,
+    ) -> tuple[float, list[int]]:
+        """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
+        known = predicted.installation or self._factors.believed
+        alone = correct(predicted, known, [measurements[first]], self._factors)
+        if alone is None or alone[0].installation is None:
+            return math.inf, []
+        belief, theirs = alone[0], alone[0].installation
+        others = [i for i in rows if i != first]
+        lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
+        found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
+        ratios = {
+            i: math.inf if one.behind else nis / chi2_bound(self._config.estimator.gate_probability, len(one.residual))
+            for i, one, nis in zip(others, lines, found, strict=True)
+        }
+        return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
+
+    def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
+        self._seen[m.landmark_id] += 1
+        return "seen_too_seldom" if self._seen[m.landmark_id] < self._config.landmarks.min_sightings else ""
+
+    def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
+        """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
+        correlation_s = self._config.landmarks.repeat_s
+        last = self._last_used_ns.get(m.landmark_id)
+        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement):
+            return m, 1.0
+        apart = max((m.stamp_ns - last) * 1e-9, 0.01)
+        scale = max(1.0, correlation_s / apart)
+        return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
+
+    @property
+    def contradicting(self) -> int:
+        """How many landmarks were refused since a sighting was accepted."""
+        return len(self._contradicting)
+
+    def forget_contradictions(self) -> None:
+        """The pose was set anew: `contradicting` starts from 0."""
+        self._contradicting.clear()
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of when landmarks were seen last."""
+        self._last_used_ns.clear()
+        self.forget_contradictions()

@@ -1,0 +1,78 @@
+"""What is said of the motion: rows of ``steps.csv``, and sentences for the user."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.robust.motion_fusion import noise_scales
+from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings
+
+_REASONS = {
+    "slip": "they slipped",
+    "frozen": "they stood still while the robot moved",
+    "left_wheel_dead": "the left wheel's encoder stood still",
+    "right_wheel_dead": "the right wheel's encoder stood still",
+}
+
+
+def motion_decisions(
+    k: int,
+    motions: Sequence[MotionMeasurement],
+    readings: MotionReadings,
+    off: Mapping[str, str],
+    reason: str,
+    scale: float = 1.0,
+) -> list[Decision]:
+    """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
+
+    Sources that are not believed (``off``: and why) have weight 0. A ``reason`` says why the covariance of all the
+    others was inflated; their weight is then 0 too, as they no longer hold the pose. Otherwise the weight is one over
+    the factor on the covariance (`noise_scales` of ``scale``). A step that was judged again has more than one row for a
+    source; the last one holds.
+    """
+    rows = []
+    scales = noise_scales(off, scale)
+    used = {m.source: m for m in motions}
+    for source in ("wheels", "learned", "gyro", "unknown"):
+        reading = getattr(readings, source, None) or used.get(source)
+        why = off.get(source, reason)
+        if reading is None or (source not in used and not why):
+            continue
+        nis = 0.0
+        if readings.wheels is not None and source != "wheels":
+            difference: FloatArray = se2.log(se2.between(readings.wheels.motion, reading.motion))
+            nis = float(difference @ np.linalg.solve(readings.wheels.cov + reading.cov, difference))
+        weight = 0.0 if why else 1.0 / scales.get(source, 1.0)
+        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why))
+    return rows
+
+
+def place_decision(
+    k: int, stamp_ns: int, believed: PoseWithCovariance, place: PoseWithCovariance, reason: str
+) -> Decision:
+    """The row for a pose that sightings tell, against the one that was believed: ``jump`` if it is gone to."""
+    miss = se2.log(se2.between(believed.pose, place.pose))
+    nis = float(miss @ np.linalg.solve(believed.cov + place.cov, miss))
+    return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, 1.0 if reason == "jump" else 0.0, reason)
+
+
+def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:
+    """Of landmarks in quarantine."""
+    for landmark_id, moved in displacements.items():
+        yield (
+            f"marker {landmark_id} does not stand where the map has it: it seems to be {math.hypot(*moved):.2f} m "
+            f"off (x {moved[0]:+.2f}, y {moved[1]:+.2f}) and was not used; correct the map or take it down"
+        )
+
+
+def flag_notes(flags: Mapping[str, int]) -> Iterator[str]:
+    """Of sources that were flagged, by "source.reason"."""
+    for kind, n in sorted(flags.items()):
+        source, reason = kind.split(".")
+        name = "learned motion" if source == "learned" else source
+        yield f"the {name} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"

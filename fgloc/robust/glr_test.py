@@ -1,0 +1,130 @@
+"""Whether two motion sources still agree: a generalized likelihood ratio test over windows, with hysteresis."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgloc.config import WeightsConfig
+from fgloc.types import FloatArray
+
+_CALM = 0.6  # of the alarm: below it the newest window agrees
+_LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
+_LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
+_LEAST_LEVEL = 0.25  # covariances are taken to be given too large by at most four times
+_DOF = 3.0  # expected of one window
+_ADAPTS = 0.1  # share by which a step moves the quantile
+
+
+@dataclass(frozen=True, slots=True)
+class GlrResult:
+    """What is thought of the newest step.
+
+    Attributes:
+        flagged: whether the sources disagree now.
+        since: on the step that raises the flag, how many of the newest steps (this one included) the disagreement
+            spans; else 0.
+        nis: largest NIS of any window that ends with this step, over what is usual.
+        span: the number of that window's steps.
+        scale: factor on the sources' covariances: the NIS over its expectation, or the usual level if that is larger.
+    """
+
+    flagged: bool
+    since: int
+    nis: float
+    span: int = 1
+    scale: float = 1.0
+
+
+class GlrTest:
+    """Compares two motion sources over all windows up to a length at once.
+
+    A single step says little (encoder quantization alone trips it), a long window says it late. The test takes, of all
+    windows that end now, the one whose summed difference is least likely; its beginning is the most likely onset of
+    what goes wrong. A flag is taken back after the newest steps have agreed for a while.
+
+    Source: Willsky and Jones 1976, generalized likelihood ratio for a jump of unknown time; docs/decisions/0003.
+    """
+
+    def __init__(self, config: WeightsConfig) -> None:
+        self._config = config
+        self.flagged = False
+        self._low = _LOW_EXPECTED  # quantile of the statistic
+        self._steps: deque[tuple[float, FloatArray, FloatArray, FloatArray]] = deque()  # dt, value, cov, derivative
+        self._length_s = 0.0
+        self._calm_s = 0.0
+
+    def reset(self) -> None:
+        """Forget all: nothing connects what comes with what was."""
+        self.flagged = False
+        self._steps.clear()
+        self._length_s = self._calm_s = 0.0
+
+    def judge(
+        self,
+        dt: float,
+        difference: FloatArray,
+        cov: FloatArray,
+        by_installation: FloatArray | None = None,
+        installation_cov: FloatArray | None = None,
+    ) -> GlrResult:
+        """Take in one step.
+
+        Args:
+            dt: its length [s].
+            difference: ``(3,)`` in the body frame. Summed as it is: over a window the body hardly moves by more than a
+                metre, and the position error of a yaw difference over so short a way is small beside the yaw's own.
+            cov: ``(3, 3)`` of it if both sources are right.
+            by_installation: ``(3, p)`` its derivative by what is wrong in the same way all the time.
+            installation_cov: ``(p, p)`` of that.
+        """
+        D = np.zeros((3, 0)) if by_installation is None else by_installation
+        self._installation_cov = np.zeros((0, 0)) if installation_cov is None else installation_cov
+        self._steps.append((dt, difference, cov, D))
+        self._length_s += dt
+        while len(self._steps) > 1 and self._length_s - self._steps[0][0] >= self._config.window_s:
+            self._length_s -= self._steps.popleft()[0]
+        nis, span = self._worst()
+        if not self.flagged:
+            self._low *= math.exp(_ADAPTS * ((nis > self._low) - (1.0 - _LOW)))
+            self._low = min(max(self._low, _LEAST_LEVEL * _LOW_EXPECTED), _LOW_EXPECTED)
+        nis /= self._level
+        if not self.flagged:
+            if nis <= self._config.alarm:
+                return GlrResult(False, 0, nis, span, max(self._level, nis / _DOF))
+            self.flagged, self._calm_s = True, 0.0
+            return GlrResult(True, span, nis, span)
+        self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0
+        if self._calm_s >= self._config.release_s:
+            self.flagged = False
+            self._steps.clear()
+            self._length_s = 0.0
+        return GlrResult(self.flagged, 0, nis, span)
+
+    @property
+    def _level(self) -> float:
+        """How large differences are while nothing is wrong, as a share of what their covariances say."""
+        return self._low / _LOW_EXPECTED
+
+    def _worst(self) -> tuple[float, int]:
+        """NIS of the least likely window that ends now, and the number of its steps."""
+        differences = np.cumsum([d for _, d, _, _ in reversed(self._steps)], axis=0)
+        covs = np.cumsum([S for _, _, S, _ in reversed(self._steps)], axis=0)
+        D = np.cumsum([D for _, _, _, D in reversed(self._steps)], axis=0)
+        covs = covs + D @ self._installation_cov @ D.transpose(0, 2, 1)
+        nis = np.einsum("ni,ni->n", differences, np.linalg.solve(covs, differences[:, :, None])[:, :, 0])
+        worst = int(np.argmax(nis))
+        return float(nis[worst]), worst + 1
+
+    def _newest_nis(self) -> float:
+        """NIS of the newest steps, as many as the release takes."""
+        d, S, length = np.zeros(3), np.zeros((3, 3)), 0.0
+        D = np.zeros_like(self._steps[-1][3])
+        for dt, difference, cov, derivative in reversed(self._steps):
+            d, S, D, length = d + difference, S + cov, D + derivative, length + dt
+            if length >= self._config.release_s:
+                break
+        return float(d @ np.linalg.solve(S + D @ self._installation_cov @ D.T, d))

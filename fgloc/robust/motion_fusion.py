@@ -1,0 +1,337 @@
+"""The motion sources side by side, and what of them enters the graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.sensors.gyro import Gyro, Turn
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
+
+_SAYS_NOTHING = 1e2  # m²: a gyro knows no position
+_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
+_SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
+_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
+_SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
+_WRONG_LASTS_S = 1.0  # ... for this long in one direction
+_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
+
+
+_OF_MOTION = (
+    "wheels.radius",
+    "wheels.track",
+    "wheels.yaw_per_m",
+    "wheels.slowdown",
+    "wheels.delay_s",
+    "learned.scale",
+    "gyro.scale",
+    "wheels.time_offset_s",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Difference:
+    """Of two motion sources over a step, in the body frame.
+
+    Attributes:
+        value: ``(3,)``.
+        cov: ``(3, 3)`` if both are right, of what differs from step to step.
+        by_installation: ``(3, p)`` derivative by the parameters of the sources, whose error is always the same ...
+        installation_cov: ... and their covariance ``(p, p)``.
+    """
+
+    value: FloatArray
+    cov: FloatArray
+    by_installation: FloatArray
+    installation_cov: FloatArray
+
+
+class MotionFusion:
+    """Wheels, learned motion and gyro."""
+
+    def __init__(
+        self,
+        config: Config,
+        wheels: WheelMotion,
+        learned: LearnedMotion | None = None,
+        joint: JointCalibration | None = None,
+        gyro: Gyro | None = None,
+        factors: LandmarkFactors | None = None,
+    ) -> None:
+        """Take the sources.
+
+        Args:
+            config: of all of them.
+            wheels: wheel odometry.
+            learned: the learned motion, if any.
+            joint: its correlation with the wheels; None: the two are taken as independent.
+            gyro: the gyro, if any.
+            factors: hold what is known of the installation; None: motions are taken as they are reported.
+        """
+        self._config = config
+        self._factors = LandmarkFactors(None) if factors is None else factors
+        self._wheels = wheels
+        self._learned = learned
+        self.joint = joint
+        self.gyro = gyro
+        self._turn: Turn | None = None  # what the gyro says of the step that was read last
+        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
+
+    @property
+    def gyro_is_read(self) -> bool:
+        """Whether the learned motion has the gyro in it already."""
+        return self._learned is not None and "gyro" in self._learned.model.card.inputs
+
+    def read(self, step: Step, blind_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
+        """Ask every source once.
+
+        Args:
+            step: what was heard.
+            blind_s: time before the step without a fix.
+            velocity: ``(2,)`` at its start, if known better than by the learned model itself.
+        """
+        if step.dt <= 0.0:
+            return MotionReadings()
+        wheels = self._wheels.measure(step)
+        if wheels is not None:
+            change = None
+            if not self._factors.installation.index.keys().isdisjoint(("wheels.time_offset_s", "wheels.delay_s")):
+                start, end = self._wheels.twist(step, step.start_ns), self._wheels.twist(step, step.stamp_ns)
+                change = end - se2.adjoint(se2.inverse(wheels.motion)) @ start
+            wheels = self._installed(wheels, change=change)
+        motion = np.zeros(3) if wheels is None else wheels.motion
+        gyro = self._turn = None
+        if self.gyro is not None:
+            turn = self.gyro.measure(step, None if wheels is None or _told_to_move(step) else motion, blind_s)
+            if turn is not None:
+                cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
+                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
+                gyro = self._installed(gyro, turn)
+                self._turn = turn
+        readings = MotionReadings(wheels, self._measure_learned(step, velocity), gyro)
+        if readings.wheels is not None or readings.learned is not None:
+            self._silent_s = 0.0
+        return readings
+
+    def _installed(
+        self, m: MotionMeasurement, turn: Turn | None = None, change: FloatArray | None = None
+    ) -> MotionMeasurement:
+        """The motion with the installation as it is known now, and its derivatives by it.
+
+        Args:
+            m: as it is reported.
+            turn: what the gyro says, if the motion is made of it.
+            change: ``(3,)`` of the wheels' twist over the step: by it a wrong clock shows.
+
+        Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
+        extrinsics using pre-integration" (differential drive); the right Jacobian of SE(2) to first order.
+        """
+        rho_x, rho_y, phi = se2.log(m.motion)
+        by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
+        derivatives: dict[str, FloatArray] = {}
+        if m.source == "wheels":
+            derivatives["wheels.radius"] = np.array([rho_x, rho_y, phi])
+            derivatives["wheels.track"] = -phi * by_turn
+            derivatives["wheels.yaw_per_m"] = rho_x * by_turn
+            derivatives["wheels.slowdown"] = self._by_slowdown(m, rho_x, phi)
+            if change is not None:
+                derivatives["wheels.time_offset_s"], derivatives["wheels.delay_s"] = change, -change
+        if m.source == "learned":
+            derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
+        if turn is not None:
+            derivatives["gyro.scale"] = phi * by_turn
+        index, mean = self._factors.installation.index, self._factors.believed.mean
+        kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
+        correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
+        return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
+
+    def _by_slowdown(self, m: MotionMeasurement, rho_x: float, phi: float) -> FloatArray:
+        """Derivative of the wheels' motion by ``slowdown``: it takes from the speed by the turning that is reported."""
+        wheels, seconds = self._config.wheels, max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
+        told = abs(phi) / seconds / wheels.scale_omega
+        return np.array([-told * rho_x / max(1.0 - wheels.slowdown * told, _SLOWEST), 0.0, 0.0])
+
+    def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
+        """The readings with the learned motion evaluated at a better velocity."""
+        return replace(readings, learned=self._measure_learned(step, velocity))
+
+    def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+        if self._learned is None:
+            return None
+        m = self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        if m is None:
+            return None
+        scale = self._config.motion.scale
+        if scale != 1.0:
+            m = replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
+        return self._installed(m, self._turn if self.gyro_is_read else None)
+
+    def combine(
+        self, readings: MotionReadings, off: Mapping[str, str] | None = None, scale: float = 1.0
+    ) -> list[MotionMeasurement]:
+        """Factors of a step, independent of each other.
+
+        Args:
+            readings: what the sources say.
+            off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
+                knows the distance, kept with room for a slip.
+            scale: as `noise_scales` takes it.
+        """
+        off = off or {}
+        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        scales = noise_scales(off, scale)
+        if wheels is not None:
+            wheels = with_noise(wheels, scales.get("wheels", 1.0))
+        learned = None if learned is None or "learned" in off else with_noise(learned, scales["learned"])
+        if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
+            gyro = None
+        if wheels is not None and "wheels" in off:
+            wheels = None if learned is not None else self._doubtful(wheels, off["wheels"])
+        elif wheels is not None and learned is not None:
+            if self._wheels.from_commands:  # made of the very commands that the model reads
+                wheels = None
+            elif self.joint is not None:
+                learned = self.joint.decorrelate(wheels, learned)
+        known = [m for m in (wheels, learned) if m is not None]
+        if gyro is not None and known:
+            known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
+        return known
+
+    def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
+        """Wheels that are not believed, where nothing else knows the way."""
+        if why == "slip":
+            return with_room(wheels, _SLIP_SPEED, _SLIP_TURN)
+        return with_room(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
+
+    def combine_again(self, frame: Keyframe, readings: MotionReadings | None = None) -> list[MotionMeasurement]:
+        """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
+        made = self.combine(readings or frame.readings, frame.off, frame.scale)
+        return [with_noise(m, extra_cov=frame.extra_cov) for m in made]
+
+    def disagreement(self, readings: MotionReadings) -> Difference | None:
+        """How far the wheels and the sources that witness their slip are apart over the step.
+
+        Returns:
+            None where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand
+            in for wheels.
+        """
+        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        if wheels is None or self._wheels.from_commands:
+            return None
+        if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
+            d = se2.log(se2.between(wheels.motion, learned.motion))
+            cov = wheels.cov + learned.cov
+            if self.joint is not None:
+                cov = self.joint.difference_cov(wheels.cov, learned.cov)
+            return Difference(d, cov, *self._systematic(wheels, learned))
+        if gyro is None:
+            return None
+        d = np.array([0.0, 0.0, se2.wrap(float(gyro.motion[2] - wheels.motion[2]))])
+        cov = np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
+        return Difference(d, cov, *self._systematic(wheels, gyro))
+
+    def _systematic(self, a: MotionMeasurement, b: MotionMeasurement) -> tuple[FloatArray, FloatArray]:
+        """Derivative ``(3, p)`` of ``b`` less ``a`` by the parameters of the sources, and their covariance."""
+        index = self._factors.installation.index
+        names = [name for name in _OF_MOTION if name in index]
+        D = np.zeros((3, len(names)))
+        for i, name in enumerate(names):
+            for m, sign in ((a, -1.0), (b, 1.0)):
+                if name in m.depends_on:
+                    D[:, i] += sign * m.depends_on[name][0]
+        rows = [index[name] for name in names]
+        return D, self._factors.believed.cov[np.ix_(rows, rows)]
+
+    def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
+        """Nothing told the way: sigma grows with the time of silence, however many steps it is cut into.
+
+        A gyro, if there is one, still tells the turn.
+        """
+        before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
+        gate = self._config.gate
+        speed, turn = _LIKELY * gate.max_speed, _LIKELY * gate.max_yaw_rate
+        cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
+        motion, gyro = np.zeros(3), None if readings is None else readings.gyro
+        if gyro is not None:
+            motion, cov[2, 2] = _turned(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
+
+    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None) -> None:
+        """The robot went on by a step.
+
+        Args:
+            readings: what the sources said of it.
+            fix: where sightings have it now; None if there were none.
+        """
+        if fix is not None:
+            self._silent_s = 0.0
+        if self.gyro is None:
+            return
+        if readings.gyro is None:
+            self.gyro.forget_fix()
+            return
+        turn = readings.gyro
+        self.gyro.turned(float(turn.motion[2]), (turn.stamp_ns - turn.start_ns) * 1e-9)
+        if fix is not None:
+            self.gyro.fix(float(fix.pose[2]), float(fix.cov[2, 2]))
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of what happened in between."""
+        self._silent_s = 0.0
+        if self.gyro is not None:
+            self.gyro.forget_fix()
+
+
+def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
+    """Factors on the covariances of wheels and learned motion.
+
+    Args:
+        off: sources that are left out, and why.
+        scale: on the wheels' covariance, as they and the other sources differ (`MotionFaultMonitor`). The learned
+            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of
+            the two is better than it says.
+    """
+    if "wheels" in off:
+        return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
+    return {"wheels": scale, "learned": min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)}
+
+
+def with_noise(m: MotionMeasurement, scale: float = 1.0, extra_cov: FloatArray | None = None) -> MotionMeasurement:
+    """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
+    if scale == 1.0 and extra_cov is None:
+        return m
+    return replace(m, cov=m.cov * scale + (0.0 if extra_cov is None else extra_cov))
+
+
+def with_room(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:
+    """The wheels' motion with room: the robot may do anything between what they say and nothing, or these speeds.
+
+    Args:
+        m: what the wheels say.
+        speed: that they may be wrong by, even when they hardly turn [m/s].
+        turn: likewise [rad/s].
+    """
+    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
+    told, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
+    density = np.square([max(told, speed), 0.3 * max(told, speed), max(turned, turn)])
+    return replace(m, cov=m.cov + np.diag(density * _WRONG_LASTS_S * seconds))
+
+
+def _turned(motion: FloatArray, yaw: float) -> FloatArray:
+    return np.array([motion[0], motion[1], yaw])
+
+
+def _told_to_move(step: Step) -> bool:
+    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
+    since = step.start_ns - _COMMANDED_NS
+    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)
