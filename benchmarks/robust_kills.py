@@ -14,7 +14,7 @@ import yaml
 
 from tests.fuzz import zygote
 
-_EVENTS = {"os.rename", "os.link", "fgloc.exchange"}
+_EVENTS = {"os.rename", "os.link", "fgloc.exchange", "shutil.rmtree"}
 _STATE = ("jobs", "detections", ".checkpoints")  # of a sweep or a training: no part of its result
 _SECONDS = 120.0
 

@@ -113,7 +113,7 @@ def test_budget_grows_with_the_file(tmp_path):
     path = tmp_path / "f"
     path.write_bytes(bytes(1 << 20))
     budget = Budget(path)
-    assert budget.limit == (64 + 128) << 20
+    assert budget.limit == (32 + 128) << 20
     budget.check(budget.limit)
     budget.start_pass()
     budget.spend(budget.limit)

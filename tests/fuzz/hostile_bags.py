@@ -271,7 +271,7 @@ def make_all(folder: Path, great: int = 3 << 30) -> dict[str, Path]:
     mcap_bomb(at("mcap_undeclared"), "zstd", great, declared=1 << 20)
     mcap_bomb(at("mcap_many_chunks"), "zstd", 60 << 20, chunks=100)
     mcap_indexed_bomb(at("mcap_merged"), chunks=40, each=60 << 20)
-    mcap_indexed_bomb(at("mcap_merged_within"), chunks=6, each=10 << 20)
+    mcap_indexed_bomb(at("mcap_merged_within"), chunks=3, each=10 << 20)
     ros1_bomb(at("ros1_bz2", ".bag"), "bz2", great // 3)
     ros1_bomb(at("ros1_lz4", ".bag"), "lz4", 200 << 20)
     for name, text in DEFINITIONS.items():
