@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from fgloc.errors import RecordingError
@@ -15,6 +16,7 @@ from fgloc.recording.definitions import Decoder
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.storage import Channel
 
+_HEADER = "std_msgs/msg/Header"
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # ROS 1 types that ROS 2 has, alike, under another name
 _ROS1_NAMES = {ros2: ros1 for ros1, ros2 in _RENAMED.items()}
 _NUMPY = {"byte": "uint8", "char": "uint8", "bool": "bool"}  # the other element types have numpy's names
@@ -44,8 +46,15 @@ class Messages:
 
     @classmethod
     def of_channel(cls, channel: Channel, ros1: bool) -> Messages:
-        """With the definitions that a recording embeds for one of its channels."""
-        return cls(Decoder(ros1, [(channel.message_type, channel.definition)]).store, ros1)
+        """With the definitions that a recording embeds for one of its channels; those of ROS 1 as ROS 2 has them."""
+        store = Decoder(ros1, [(channel.message_type, channel.definition)]).store
+        if ros1 and _HEADER in store.fielddefs:
+            constants, fields = store.fielddefs[_HEADER]
+            header = {_HEADER: (constants, [field for field in fields if field[0] != "seq"])}
+            definitions = {**store.fielddefs, **header}
+            store = get_typestore(Stores.EMPTY)
+            store.register(definitions)
+        return cls(store, ros1)
 
     def layout(self, message_type: str) -> dict[str, tuple[FieldLayout, ...]]:
         """Fields of a message type and of all the types inside it, by type.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from fgloc.config import RecordingConfig, Role
 from fgloc.errors import WireError
 from fgloc.live.wire.clock import WireClock
+from fgloc.live.wire.names import OWN
 from fgloc.live.wire.participant import Participant, Publication, Sample
 from fgloc.recording.decode import TF_TYPES, events_of
 from fgloc.recording.roles import Selection, TopicInfo, select_roles
@@ -19,7 +20,6 @@ SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 LOOK: tuple[Role, ...] = ("image", "sightings")
 _TF_TOPICS = ("/tf", "/tf_static")
-OWN = "/fgloc/"  # topics below are outputs, of this process or another
 
 
 class Intake:
@@ -79,7 +79,8 @@ class Intake:
         lacking = []
         if not set(MOTION) & roles.keys():
             lacking.append("odometry, joint states, commands or an IMU")
-        if not set(LOOK) & roles.keys():
+        wanted = [role for role in LOOK if getattr(self._config.topics, role) != "none"]
+        if wanted and not set(wanted) & roles.keys():
             lacking.append("images or marker sightings")
         names = {p.topic for p in self._known}
         for role in (*MOTION, *LOOK, "camera_info"):

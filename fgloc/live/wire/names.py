@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+OWN = "/fgloc/"  # topics below are outputs of `fgloc live`, of this process or another
 _TOPIC = "rt/"
 
 

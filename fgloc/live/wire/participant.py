@@ -30,7 +30,7 @@ _LOOPBACK = """<CycloneDDS><Domain>
 _DEPTH = 200  # messages of a topic that wait: 1 s of the fastest sensor
 _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static transform may be one
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
-_WAKE_S = 0.1  # the reading thread looks this often for new topics and for the end
+_WAIT_S = 60.0  # the reading thread waits this long for messages, then again
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 _domains_lock = threading.Lock()
@@ -99,7 +99,7 @@ class Participant:
             raise WireError(f"domain {domain}: expected 0 to 232, as ROS_DOMAIN_ID")
         try:
             from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-            from cyclonedds.core import DDSException, WaitSet
+            from cyclonedds.core import DDSException, GuardCondition, WaitSet
             from cyclonedds.domain import DomainParticipant
         except ImportError as error:
             raise WireError(f"cyclonedds cannot be loaded ({error}); install it: pip install 'fgloc[live]'") from error
@@ -116,7 +116,9 @@ class Participant:
         self._entering: list[tuple[Any, Publication, OnSample]] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
+        self._changed = GuardCondition(self._participant)
         self._waiting = WaitSet(self._participant)
+        self._waiting.attach(self._changed)
         self._thread = threading.Thread(target=self._read, name="fgloc-wire", daemon=True)
         self._thread.start()
 
@@ -131,11 +133,12 @@ class Participant:
         if self._closing.is_set():
             return
         self._closing.set()
+        self._changed.set(True)
         self._thread.join()
         self._readers.clear()
         self._entering.clear()
         self._topics.clear()
-        del self._waiting, self._found, self._participant, self._domain
+        del self._waiting, self._changed, self._found, self._participant, self._domain
 
     def publications(self) -> tuple[Publication, ...]:
         """What others publish now, by name."""
@@ -189,6 +192,7 @@ class Participant:
         unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
         with self._lock:
             self._entering.append(((reader, unread), Publication(topic, message_type), on_sample))
+        self._changed.set(True)
 
     def _topic(self, topic: str, message_type: str, messages: Messages) -> Any:
         from cyclonedds.core import DDSException
@@ -209,8 +213,9 @@ class Participant:
             for entry in entering:
                 self._waiting.attach(entry[0][1])
                 self._readers.append(entry)
-            if self._waiting.wait(round(_WAKE_S * 1e9)):
-                self._deliver()
+            self._waiting.wait(round(_WAIT_S * 1e9))
+            self._changed.take()
+            self._deliver()
 
     def _deliver(self) -> None:
         """What waits in all readers, in the order of writing."""

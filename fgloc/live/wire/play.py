@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -78,11 +79,12 @@ class Player:
         """What is published."""
         return tuple(sorted(topic for topic, _ in self._writers))
 
-    def wait_for_readers(self, timeout_s: float) -> bool:
+    def wait_for_readers(self, timeout_s: float, stop: threading.Event | None = None) -> bool:
         """Wait until readers have come and no more come; meanwhile /clock stands at the start. Whether any came."""
+        stop = stop or threading.Event()
         began = changed = time.monotonic()
         known = 0
-        while time.monotonic() - began < timeout_s or known:
+        while not stop.is_set() and (time.monotonic() - began < timeout_s or known):
             self._tick(self._storage.span_ns[0])
             readers = sum(writer.readers for writer, _ in self._writers.values())
             if readers != known:
@@ -92,20 +94,29 @@ class Player:
             time.sleep(_TICK_S)
         return False
 
-    def play(self, rate: float = 1.0, progress: Callable[[float, float], None] | None = None) -> None:
+    def play(
+        self,
+        rate: float = 1.0,
+        stop: threading.Event | None = None,
+        progress: Callable[[float, float], None] | None = None,
+    ) -> None:
         """Publish everything once.
 
         Args:
             rate: multiple of the recorded speed.
+            stop: ends it early.
             progress: called with seconds done, and the recording's length.
         """
+        stop = stop or threading.Event()
         start_ns = self._storage.span_ns[0]
         began = time.monotonic()
         for topic, message_type, received_ns, raw in self._storage.messages({topic for topic, _ in self._writers}):
             due = began + (received_ns - start_ns) * 1e-9 / rate
-            while (ahead := due - time.monotonic()) > 0.0:
+            while (ahead := due - time.monotonic()) > 0.0 and not stop.is_set():
                 self._tick(start_ns + round((time.monotonic() - began) * rate * 1e9))
                 time.sleep(min(ahead, max(0.0, self._next_tick_s - time.monotonic())))
+            if stop.is_set():
+                return
             self._tick(received_ns)
             self._publish(topic, message_type, received_ns, raw)
             if progress is not None:
