@@ -1,8 +1,23 @@
 """fgloc: where a wheeled robot is, without GPS, with an honest covariance."""
 
+from __future__ import annotations
+
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fgloc.live import Live as Live
 
 try:
     __version__ = version("fgloc")
 except PackageNotFoundError:  # run from a source tree that is not installed
     __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    """`Live`, imported when it is asked for: it loads the estimator's libraries."""
+    if name == "Live":
+        from fgloc.live import Live
+
+        return Live
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

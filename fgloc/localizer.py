@@ -99,12 +99,13 @@ class Localizer:
         self._keep_all = keep_all
         self._segment = -1
         self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
+        self._restart: Belief | None = None  # where the next step is to begin anew
 
     def update(self, step: Step) -> Estimate | None:
         """Take in one step; return the newest pose, or None while the first pose is not yet known."""
         blind_s = self._whereabouts.blind_s
         self._whereabouts.elapse(step.dt)
-        if step.segment != self._segment:
+        if step.segment != self._segment or self._restart is not None:
             self._begin_segment(step)
         elif not self._whereabouts.waiting and self._whereabouts.nowhere(self.estimator.belief):
             self._get_lost()
@@ -118,6 +119,18 @@ class Localizer:
             return self._initialize(step, readings, sightings)
         return self._advance(step, readings, sightings)
 
+    @property
+    def blind_s(self) -> float:
+        """Time since the last fix [s]."""
+        return self._whereabouts.blind_s
+
+    def restart_at(self, belief: Belief) -> None:
+        """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
+
+        Sightings that contradict it do not hold: the map is searched.
+        """
+        self._restart = belief
+
     def _begin_segment(self, step: Step) -> None:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         if self._keep_all:
@@ -126,7 +139,8 @@ class Localizer:
         self.sources.begin_segment()
         self.trust.begin(step)
         self.weights.begin_segment()
-        self._prior = self._whereabouts.begin_segment(self.estimator.belief)
+        known, self._restart = self._restart, None
+        self._prior = self._whereabouts.begin_segment(self.estimator.belief, known)
 
     def _initialize(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
         """Collect steps until the first pose is clear, then run them all through the estimator."""

@@ -106,11 +106,7 @@ def run(
         notes = (
             *hints,
             *recording.notes,
-            *parts.notes,
-            *parts.gate.notes,
-            *parts.stepper.notes,
-            *parts.wheels.notes,
-            *parts.localizer.notes,
+            *parts.sentences,
         )
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
@@ -250,22 +246,8 @@ class _Replay:
 
     def rejections(self) -> Counter[str]:
         """Everything refused anywhere, by reason."""
-        parts = self._parts
-        total = Counter(parts.gate.rejections)
-        sources = [
-            parts.detections.rejections,
-            parts.stepper.rejections,
-            parts.wheels.rejections,
-            parts.landmarks.rejections,
-            self._image_rejections,
-        ]
-        sources += [parts.localizer.rejections, parts.localizer.weights.rejections]
-        if parts.learned is not None:
-            sources.append(parts.learned.rejections)
-        if parts.localizer.sources.gyro is not None:
-            sources.append(parts.localizer.sources.gyro.rejections)
-        for source in sources:
-            total.update(source)
+        total = self._parts.rejections
+        total.update(self._image_rejections)
         return total
 
     def spans(self) -> dict[str, Heard]:

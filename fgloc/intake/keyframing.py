@@ -97,6 +97,11 @@ class Stepper:
         self._seen_order: deque[tuple[int, str]] = deque()
 
     @property
+    def newest_ns(self) -> int:
+        """Newest stamp of the segment."""
+        return self._newest_ns
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
         notes = self._jumps[:10]

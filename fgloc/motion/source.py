@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 
 from numpy.typing import ArrayLike
@@ -44,6 +45,12 @@ class LearnedMotion:
         """Whether a better velocity changes the prediction: a model of commands alone does not look at it."""
         card = self.model.card
         return "velocity" in card.inputs
+
+    def fork(self) -> LearnedMotion:
+        """A copy that may predict beyond the newest step without changing this one."""
+        forked = copy.copy(self)
+        forked._reader, forked.rejections = self._reader.fork(), Counter()
+        return forked
 
     def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step.

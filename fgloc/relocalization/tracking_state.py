@@ -55,10 +55,17 @@ class Whereabouts:
         self._places: FloatArray = np.array(places).reshape(-1, 2)
         self._never_found = False
 
-    def begin_segment(self, last: Belief | None) -> Belief | None:
-        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
+    def begin_segment(self, last: Belief | None, known: Belief | None = None) -> Belief | None:
+        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings.
+
+        Args:
+            last: of the segment before.
+            known: where it starts, by what the user or an earlier run says.
+        """
         self.lost = self._given = self._told = False
         self._initializer.reset()
+        if known is not None:
+            return known
         given = self._config.initial_pose
         if given is not None and last is None:
             self._given, self._speaking_for, self._speaking_against = True, 0, 0

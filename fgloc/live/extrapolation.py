@@ -1,0 +1,193 @@
+"""Poses between and beyond keyframes: the newest estimate, carried on by the motion sources as the estimator would."""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from fgloc import se2
+from fgloc.assembly import Assembly
+from fgloc.fusion.motion import MotionSources
+from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.joint import predict
+from fgloc.graph.measurement_log import Belief
+from fgloc.intake.clock_guard import ClockGuard, Verdict
+from fgloc.live.status import LivePose
+from fgloc.motion.source import LearnedMotion
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.wheels import WheelMotion
+from fgloc.types import (
+    CommandEvent,
+    Estimate,
+    Event,
+    FloatArray,
+    ImuEvent,
+    JointsEvent,
+    Mode,
+    OdometryEvent,
+    Step,
+)
+
+HISTORY_S = 5.0  # poses further back than this are not told
+_BEFORE_NS = 1_000_000_000  # motion events this long before a keyframe tell how it was moving then
+_PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
+_FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
+_KEPT = 4096  # events of one kind: 5 s at 800 Hz
+_MOTION = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
+
+E = TypeVar("E", bound=Event)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Anchor:
+    """A keyframe to carry on from: the estimate, and the motion sources as they were then."""
+
+    stamp_ns: int
+    belief: Belief
+    known: InstallationBelief
+    added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
+    mode: Mode
+    blind_s: float
+    off: Mapping[str, str]
+    scale: float
+    gyro: Gyro | None
+    learned: LearnedMotion | None
+
+
+class Extrapolator:
+    """Keeps the newest keyframes and motion events; thread-safe.
+
+    Every question is answered anew from the events themselves: nothing that was extrapolated enters the estimate.
+    """
+
+    def __init__(self, parts: Assembly) -> None:
+        """Take the parts of the run."""
+        self._lock = threading.Lock()
+        self._parts = parts
+        self._config = parts.config
+        self._history_ns = round(parts.config.keyframes.history_s * 1e9)
+        self._clock = ClockGuard(parts.config.gate)
+        self._events: dict[type[Event], deque[Any]] = {kind: deque(maxlen=_KEPT) for kind in _MOTION}
+        self._anchors: deque[_Anchor] = deque()
+        self._segment = -1
+        self._newest_ns = 0
+
+    def add(self, event: Event) -> None:
+        """Take in a motion event that passed the gate."""
+        with self._lock:
+            for verdict, judged in self._clock.judge(event):
+                if verdict is Verdict.STRAY:
+                    continue
+                if verdict is Verdict.STARTS:
+                    for events in self._events.values():
+                        events.clear()
+                    self._anchors.clear()
+                    self._newest_ns = 0
+                self._events[type(judged)].append(judged)
+                self._newest_ns = max(self._newest_ns, judged.stamp_ns)
+
+    def anchor(self, step: Step, estimate: Estimate) -> None:
+        """Carry on from here."""
+        localizer = self._parts.localizer
+        estimator, installation = localizer.estimator, localizer.factors
+        frame = estimator.log.keyframes.get(estimator.k)
+        gyro, learned = localizer.sources.gyro, self._parts.learned
+        body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
+        if frame is not None and frame.stamp_ns == estimate.stamp_ns:
+            belief = frame.belief
+            known = belief.installation or installation.believed
+            off, scale = frame.off, frame.scale
+        else:
+            belief, known, off, scale = Belief(estimate.pose, body), installation.believed, {}, 1.0
+        made = _Anchor(
+            stamp_ns=estimate.stamp_ns,
+            belief=belief,
+            known=known,
+            added_cov=body - belief.cov,
+            mode=estimate.mode,
+            blind_s=localizer.blind_s,
+            off=off,
+            scale=scale,
+            gyro=None if gyro is None else gyro.fork(),
+            learned=None if learned is None else learned.fork(),
+        )
+        with self._lock:
+            if step.segment != self._segment:
+                self._anchors.clear()
+                self._segment = step.segment
+            self._anchors.append(made)
+            while self._anchors[0].stamp_ns < made.stamp_ns - HISTORY_S * 1e9:
+                self._anchors.popleft()
+
+    def pose_at(self, stamp_ns: int | None) -> LivePose | None:
+        """The pose at a time; None: of the newest motion event. None is returned while no pose is known then."""
+        with self._lock:
+            if not self._anchors:
+                return None
+            newest = max(self._newest_ns, self._anchors[-1].stamp_ns)
+            at_ns = newest if stamp_ns is None else stamp_ns
+            k = bisect_right(self._anchors, at_ns, key=lambda a: a.stamp_ns) - 1
+            if k < 0 or at_ns > newest + _FURTHEST_NS:
+                return None
+            anchor = self._anchors[k]
+            step = self._step(anchor.stamp_ns, at_ns)
+        belief, mode = self._carried(anchor, step), anchor.mode
+        blind_s = anchor.blind_s + step.dt
+        if mode is Mode.OK and blind_s > self._config.estimator.dead_reckoning_after_s:
+            mode = Mode.DEAD_RECKONING
+        cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
+        return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns)
+
+    def _step(self, start_ns: int, end_ns: int) -> Step:
+        """All motion events from a while before the start to the first one after the end."""
+        first = start_ns - _BEFORE_NS
+        return Step(
+            0,
+            0,
+            start_ns,
+            end_ns,
+            odometry=self._window(OdometryEvent, first, end_ns),
+            commands=self._window(CommandEvent, start_ns - self._history_ns, end_ns),
+            joints=self._window(JointsEvent, first, end_ns),
+            imu=self._window(ImuEvent, start_ns, end_ns),
+        )
+
+    def _window(self, kind: type[E], start_ns: int, end_ns: int) -> tuple[E, ...]:
+        """In order of stamp: events inside, the last one at or before the start, and the first at or after the end."""
+        events = sorted(self._events[kind], key=lambda e: e.stamp_ns)
+        first = max(bisect_right(events, start_ns, key=lambda e: e.stamp_ns) - 1, 0)
+        return tuple(events[first : bisect_left(events, end_ns, key=lambda e: e.stamp_ns) + 1])
+
+    def _carried(self, anchor: _Anchor, step: Step) -> Belief:
+        parts, localizer = self._parts, self._parts.localizer
+        sources = MotionSources(
+            self._config,
+            WheelMotion(self._config.wheels),
+            None if anchor.learned is None else anchor.learned.fork(),
+            localizer.sources.joint,
+            None if anchor.gyro is None else anchor.gyro.fork(),
+            localizer.factors,
+        )
+        belief, start_ns = anchor.belief, step.start_ns
+        while start_ns < step.stamp_ns:
+            end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
+            piece = _piece(step, start_ns, end_ns)
+            readings = sources.read(piece, anchor.blind_s + (start_ns - step.start_ns) * 1e-9)
+            motions = sources.combine(readings, anchor.off, anchor.scale) or [sources.unknown(piece, readings)]
+            belief = predict(belief, anchor.known, parts.localizer.factors.installation, motions)
+            start_ns = end_ns
+        return belief
+
+
+def _piece(step: Step, start_ns: int, end_ns: int) -> Step:
+    """A part of a step with all of its events but those of the IMU, which are integrated from end to end."""
+    if (start_ns, end_ns) == (step.start_ns, step.stamp_ns):
+        return step
+    stamps = [e.stamp_ns for e in step.imu]
+    first = max(bisect_right(stamps, start_ns) - 1, 0)
+    imu = step.imu[first : bisect_left(stamps, end_ns) + 1]
+    return Step(0, 0, start_ns, end_ns, step.odometry, step.commands, step.joints, imu)
