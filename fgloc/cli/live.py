@@ -20,7 +20,6 @@ from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
     from fgloc.config import Config
-    from fgloc.live import Live
     from fgloc.live.wire.node import Node
 
 _STATUS_S = 0.5  # time between two changes of the status line
@@ -38,9 +37,7 @@ def live(
     map_file: Annotated[
         Path | None, typer.Option("--map", metavar="MAP", help="marker map; without one landmarks are estimated")
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="C", help="configuration; default: none")
-    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", metavar="C", help="configuration; default: none")] = None,
     model: ModelOption = None,
     domain: DomainOption = 0,
     network: NetworkOption = False,
@@ -53,7 +50,6 @@ def live(
 ) -> None:
     """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
     # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.live import Live
     from fgloc.live.wire.node import Node
     from fgloc.live.wire.participant import Participant
     from fgloc.sensors.maps import load_map
@@ -62,15 +58,14 @@ def live(
     landmarks = None if map_file is None else load_map(map_file, settings.markers.default_size_m)
     began = time.monotonic()
     with _interrupted() as stop, Participant(domain, network) as participant:
-        localizer = Live(settings, landmarks, state=state)
+        node = Node(participant, settings, landmarks, state)
+        typer.echo(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
         try:
-            node = Node(localizer, landmarks, settings, participant)
-            typer.echo(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
-            with _status_line(localizer, stop):
+            with _status_line(node, stop):
                 node.run(stop, _tell)
         finally:
-            localizer.close()
-        typer.echo(_summary(localizer, node, time.monotonic() - began))
+            node.close()
+        typer.echo(_summary(node, time.monotonic() - began))
 
 
 def play(
@@ -124,7 +119,7 @@ def _tell(sentence: str) -> None:
 
 
 @contextmanager
-def _status_line(localizer: Live, stop: threading.Event) -> Iterator[None]:
+def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     """The pose, on a terminal."""
     with tqdm(bar_format="{desc}", disable=None, file=sys.stderr, leave=False) as bar:
         if bar.disable:
@@ -134,7 +129,7 @@ def _status_line(localizer: Live, stop: threading.Event) -> Iterator[None]:
 
         def show() -> None:
             while not stop.is_set() and not ended.wait(_STATUS_S):
-                pose = localizer.pose_at()
+                pose = None if node.live is None else node.live.pose_at()
                 if pose is not None:
                     x, y, yaw = pose.pose
                     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
@@ -160,16 +155,19 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
     return config.model_copy(update={"estimator": estimator})
 
 
-def _summary(localizer: Live, node: Node, seconds: float) -> str:
-    status = localizer.status()
-    rows = [
-        ("duration", f"{seconds:.1f} s"),
+def _summary(node: Node, seconds: float) -> str:
+    rows = [("duration", f"{seconds:.1f} s"), ("odometry published", str(node.published["odometry"]))]
+    if node.live is None:
+        return columns(None, [*rows, ("received", "nothing: the robot's topics were not found")])
+    status = node.live.status()
+    rows += [
         ("keyframes", str(status.keyframes)),
-        ("odometry published", str(node.published["odometry"])),
         ("last mode", "no pose was found" if status.mode is None else str(status.mode)),
         ("rejected", str(sum(status.rejections.values()))),
-        ("undecodable", str(sum(node.intake.undecodable.values()))),
     ]
+    rows += [(f"undecodable {topic}", str(n)) for topic, n in node.intake.undecodable.items()]
     rows += [(f"dropped {role}", str(n)) for role, n in status.dropped.items()]
-    rows += [(f"{of.role} {topic}", f"{of.count}, delay {of.delay_s * 1e3:.0f} ms") for topic, of in status.topics.items()]
+    rows += [
+        (f"{of.role} {topic}", f"{of.count}, delay {of.delay_s * 1e3:.0f} ms") for topic, of in status.topics.items()
+    ]
     return columns(None, rows)

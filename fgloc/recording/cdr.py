@@ -1,4 +1,4 @@
-"""Messages as ROS 2 puts them on the wire (CDR): decoded, encoded, converted from ROS 1, and the layout of their types."""
+"""Messages as ROS 2 puts them on the wire (CDR): decoded, encoded, converted from ROS 1; layouts of their types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DDS types of ROS messages, built from their definitions. What goes through them is CDR that rosbags (de)serializes."""
+"""DDS types of ROS messages, built from their definitions; rosbags (de)serializes what goes through them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cdr_type(message_type: str, layout: Mapping[str, Sequence[FieldLayout]]) -> 
     def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
         return cls(data)
 
-    kind.__init__ = init  # type: ignore[misc]
+    kind.__init__ = init
     kind.serialize = serialize
     kind.deserialize = kind.deserialize_key = classmethod(deserialize)  # a key comes alone when a writer leaves
     return kind

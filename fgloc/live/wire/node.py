@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import FglocError
+from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose, LiveStatus
 from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.intake import Intake
 from fgloc.live.wire.odom_frame import OdomFrame
 from fgloc.live.wire.outputs import MAP_FRAME, BaseState, Outputs, odom_in_map
 from fgloc.live.wire.participant import Participant, Sample
+from fgloc.live.wire.teller import Teller
 from fgloc.types import Estimate, Event, FloatArray, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
@@ -28,20 +30,38 @@ _INITIAL_POSE = "/initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
-_FIGURES = re.compile(r"\d+")
-
-
 class Node:
     """One live run on the wire. Use `run`, then `close`.
 
     Attributes:
+        live: the run; None until the topics that it needs are there.
+        intake: what comes in.
         published: messages sent, by kind.
     """
 
-    def __init__(self, live: Live, landmarks: LandmarkMap | None, config: Config, participant: Participant) -> None:
-        """Announce the outputs; input is looked for by `run`."""
-        self._live = live
+    def __init__(
+        self,
+        participant: Participant,
+        config: Config,
+        landmarks: LandmarkMap | None,
+        state: Path | None = None,
+        watch: Callable[[Event], None] | None = None,
+    ) -> None:
+        """Announce the outputs; input is looked for by `run`.
+
+        Args:
+            participant: on the wire.
+            config: all settings.
+            landmarks: the map; None: landmarks are estimated.
+            state: as `Live` has it.
+            watch: given every event that comes in, also a truth's.
+        """
+        self.live: Live | None = None
         self._config = config
+        self._landmarks = landmarks
+        self._state = state
+        self._watch = watch
+        self._subscribers: list[Callable[[Estimate], None]] = [self._on_estimate]
         self._clock = WireClock(participant)
         self._outputs = Outputs(participant)
         self._odom = OdomFrame(config.recording)
@@ -56,7 +76,15 @@ class Node:
         if landmarks is not None:
             self._outputs.map(landmarks)
         participant.read(_INITIAL_POSE, _INITIAL_POSE_TYPE, self._on_initial_pose)
-        live.subscribe(self._on_estimate)
+
+    def close(self) -> None:
+        """End the run, and save its state."""
+        if self.live is not None:
+            self.live.close()
+
+    def subscribe(self, callback: Callable[[Estimate], None]) -> None:
+        """As `Live.subscribe`; call it before `run`."""
+        self._subscribers.append(callback)
 
     def run(self, stop: threading.Event, tell: Callable[[str], None]) -> None:
         """Localise until `stop` is set.
@@ -68,39 +96,46 @@ class Node:
         Raises:
             FglocError: what comes in cannot be used.
         """
-        publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
-        publishing.start()
-        told: set[str] = set()  # without their figures, which change
-        subscribed = 0
+        publishing: threading.Thread | None = None
+        teller = Teller(tell)
         next_diagnostics_s = time.monotonic()
         try:
             while not stop.wait(_POLL_S):
                 if self._failure is not None:
                     raise self._failure
-                missing = self.intake.poll()
-                sentences = [missing] if missing else []
-                if len(self.intake.roles) > subscribed:
-                    subscribed = len(self.intake.roles)
-                    sentences.append(f"Subscribed: {', '.join(f'{t} ({r})' for r, t in self.intake.roles.items())}.")
-                status = self._live.status()
-                if self.intake.roles and status.waiting_for:
-                    sentences.append(f"Waiting for {'; '.join(status.waiting_for)}.")
-                sentences += status.notes + tuple(self._take_notes())
-                for sentence in sentences:
-                    if (kind := _FIGURES.sub("", sentence)) not in told:
-                        told.add(kind)
-                        tell(sentence)
+                teller.waiting(self.intake.find())
+                if self.live is None and self.intake.roles:
+                    self._start()
+                    publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
+                    publishing.start()
+                for role, topic in self.intake.subscribe():
+                    teller.tell(f"Subscribed: {topic} ({role}).")
+                status = None if self.live is None else self.live.status()
+                if status is not None:
+                    teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
+                    teller.tell(*status.notes)
+                teller.tell(*self._take_notes())
                 if time.monotonic() >= next_diagnostics_s:
                     next_diagnostics_s = time.monotonic() + 1.0
                     self._diagnose(status)
         finally:
             self._stopping.set()
-            publishing.join()
+            if publishing is not None:
+                publishing.join()
+
+    def _start(self) -> None:
+        """The topics are known: whose first messages come soon belongs to the run from its beginning."""
+        self.live = Live(self._config, self._landmarks, state=self._state, roles=self.intake.roles.keys())
+        for callback in self._subscribers:
+            self.live.subscribe(callback)
 
     def _push(self, event: Event) -> None:
         self._odom.add(event)
+        if self._watch is not None:
+            self._watch(event)
+        assert self.live is not None  # nothing is read before
         try:
-            self._live.push(event)
+            self.live.push(event)
         except FglocError as error:
             self._failure = error
 
@@ -114,13 +149,16 @@ class Node:
         if frame not in ("", MAP_FRAME):
             self._notes.append(f"{_INITIAL_POSE} is in frame {frame!r}, expected {MAP_FRAME!r}: not used.")
             return
+        if self.live is None:
+            self._notes.append(f"{_INITIAL_POSE} came before the robot's topics: not used.")
+            return
         pose, variances = message.pose.pose, np.asarray(message.pose.covariance)[[0, 7, 35]]
         if not (variances > 0.0).all():
             variances = np.square(self._config.estimator.initial_sigmas)
         q = pose.orientation
-        yaw = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        yaw = quaternion_yaw((q.x, q.y, q.z, q.w))
         try:
-            self._live.reset_pose(np.array([pose.position.x, pose.position.y, yaw]), np.sqrt(variances))
+            self.live.reset_pose((pose.position.x, pose.position.y, yaw), np.sqrt(variances).tolist())
         except FglocError as error:
             self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
 
@@ -134,41 +172,57 @@ class Node:
         due = time.monotonic()
         while not self._stopping.is_set():
             due = max(due + period_s, time.monotonic())
-            self._publish_once()
+            try:
+                self._publish_once()
+            except FglocError as error:
+                self._failure = error
+                return
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _publish_once(self) -> None:
-        now = self._live.pose_at(self._clock.now_ns()) or self._live.pose_at()
+        assert self.live is not None
+        now = self.live.pose_at(self._clock.now_ns()) or self.live.pose_at()
         if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
             return
         base = self._odom.base
         self._last_ns = now.stamp_ns
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, self._twist(now)), base)
+        before = self.live.pose_at(now.stamp_ns - round(_TWIST_S * 1e9))
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, _twist(before, now)), base)
         self.published["odometry"] += 1
         odom = self._odom.latest()
         if odom is None:
             self._outputs.transform(now.stamp_ns, now.pose, base)
         elif odom.stamp_ns != self._last_odom_ns:
-            then = self._live.pose_at(odom.stamp_ns)
+            then = self.live.pose_at(odom.stamp_ns)
             if then is not None:
                 self._last_odom_ns = odom.stamp_ns
                 self._outputs.transform(odom.stamp_ns, odom_in_map(then.pose, odom.T_odom_base), odom.frame)
 
-    def _twist(self, now: LivePose) -> FloatArray:
-        """Of the base in its own axes, from the pose a moment before."""
-        before = self._live.pose_at(now.stamp_ns - round(_TWIST_S * 1e9))
-        return np.zeros(3) if before is None else se2.log(se2.between(before.pose, now.pose)) / _TWIST_S
-
-    def _diagnose(self, status: LiveStatus) -> None:
-        values = {"keyframes": str(status.keyframes), "update [ms]": f"{status.step_ms:.1f}"}
-        for topic, of in status.topics.items():
-            values[f"{of.role} [Hz]"] = f"{of.rate_hz:.1f}"
-            values[f"{of.role} delay [s]"] = f"{of.delay_s:.3f}"
-            values[f"{of.role} topic"] = topic
-        values |= {f"dropped {role}": str(n) for role, n in status.dropped.items()}
-        values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
-        values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}
-        waiting = f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet"
-        message = waiting if status.mode is None else str(status.mode)
-        self._outputs.diagnostics(self._clock.now_ns(), status.mode, message, values)
+    def _diagnose(self, status: LiveStatus | None) -> None:
+        mode = None if status is None else status.mode
+        message, values = described(status)
+        self._outputs.diagnostics(self._clock.now_ns(), mode, message, values)
         self.published["diagnostics"] += 1
+
+
+def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
+    """A status as a message and its values, for diagnostics."""
+    if status is None:
+        return "waiting for the robot's topics", {}
+    values = {"keyframes": str(status.keyframes), "update [ms]": f"{status.step_ms:.1f}"}
+    values["keyframe delay [s]"] = f"{status.reordering_s:.3f}"
+    for topic, of in status.topics.items():
+        values[f"{of.role} topic"] = topic
+        values[f"{of.role} rate [Hz]"] = f"{of.rate_hz:.1f}"
+        values[f"{of.role} delay [s]"] = f"{of.delay_s:.3f}"
+    values |= {f"dropped {role}": str(n) for role, n in status.dropped.items()}
+    values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
+    values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}
+    if status.mode is not None:
+        return str(status.mode), values
+    return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values
+
+
+def _twist(before: LivePose | None, now: LivePose) -> FloatArray:
+    """``(3,)`` of the base in its own axes, from the pose `_TWIST_S` before."""
+    return np.zeros(3) if before is None else se2.log(se2.between(before.pose, now.pose)) / _TWIST_S

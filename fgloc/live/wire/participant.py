@@ -154,9 +154,7 @@ class Participant:
                     self._publications[key] = Publication(topic, kind)
         return tuple(sorted(set(self._publications.values()), key=lambda p: (p.topic, p.message_type)))
 
-    def writer(
-        self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None
-    ) -> Writer:
+    def writer(self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None) -> Writer:
         """A reliable writer; a latched one gives late readers what was written before (transient local)."""
         from cyclonedds.pub import DataWriter
         from cyclonedds.qos import Policy, Qos
@@ -219,7 +217,7 @@ class Participant:
 
     def _deliver(self) -> None:
         """What waits in all readers, in the order of writing."""
-        found = []
+        found: list[tuple[int, int, Sample, OnSample]] = []
         for (reader, _), publication, on_sample in self._readers:
             for message in reader.take(_DEPTH):
                 if message.sample_info.valid_data:
