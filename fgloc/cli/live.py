@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.live.wire.node import Node
 
+_SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
 _STATUS_S = 0.5  # time between two changes of the status line
 
 DomainOption = Annotated[
@@ -57,6 +58,7 @@ def live(
     settings = _with_initial_pose(configured(None, config, model), initial_pose)
     landmarks = None if map_file is None else load_map(map_file, settings.markers.default_size_m)
     began = time.monotonic()
+    sys.setswitchinterval(_SWITCH_S)
     with _interrupted() as stop, Participant(domain, network) as participant:
         node = Node(participant, settings, landmarks, state)
         typer.echo(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")

@@ -10,22 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.frames import quaternion_yaw
-from fgloc.live import Live, LivePose, LiveStatus
+from fgloc.live import Live, LiveStatus
 from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.intake import Intake
 from fgloc.live.wire.odom_frame import OdomFrame
 from fgloc.live.wire.outputs import MAP_FRAME, BaseState, Outputs, odom_in_map
 from fgloc.live.wire.participant import Participant, Sample
+from fgloc.live.wire.recent import RecentPoses
 from fgloc.live.wire.teller import Teller
-from fgloc.types import Estimate, Event, FloatArray, LandmarkMap
+from fgloc.types import Estimate, Event, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
 _POLL_S = 0.2  # time between two looks at what there is on the wire
-_TWIST_S = 0.1  # the twist is the motion over this long
 _INITIAL_POSE = "/initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
@@ -126,6 +125,7 @@ class Node:
     def _start(self) -> None:
         """The topics are known: whose first messages come soon belongs to the run from its beginning."""
         self.live = Live(self._config, self._landmarks, state=self._state, roles=self.intake.roles.keys())
+        self._recent = RecentPoses(self.live.pose_at)
         for callback in self._subscribers:
             self.live.subscribe(callback)
 
@@ -184,19 +184,16 @@ class Node:
         now = self.live.pose_at(self._clock.now_ns()) or self.live.pose_at()
         if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
             return
-        base = self._odom.base
         self._last_ns = now.stamp_ns
-        before = self.live.pose_at(now.stamp_ns - round(_TWIST_S * 1e9))
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, _twist(before, now)), base)
+        self._recent.add(now)
+        base, odom = self._odom.base, self._odom.latest()
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, self._recent.twist()), base)
         self.published["odometry"] += 1
-        odom = self._odom.latest()
         if odom is None:
             self._outputs.transform(now.stamp_ns, now.pose, base)
-        elif odom.stamp_ns != self._last_odom_ns:
-            then = self.live.pose_at(odom.stamp_ns)
-            if then is not None:
-                self._last_odom_ns = odom.stamp_ns
-                self._outputs.transform(odom.stamp_ns, odom_in_map(then.pose, odom.T_odom_base), odom.frame)
+        elif odom.stamp_ns != self._last_odom_ns and (then := self._recent.at(odom.stamp_ns)) is not None:
+            self._last_odom_ns = odom.stamp_ns
+            self._outputs.transform(odom.stamp_ns, odom_in_map(then, odom.T_odom_base), odom.frame)
 
     def _diagnose(self, status: LiveStatus | None) -> None:
         mode = None if status is None else status.mode
@@ -221,8 +218,3 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
     if status.mode is not None:
         return str(status.mode), values
     return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values
-
-
-def _twist(before: LivePose | None, now: LivePose) -> FloatArray:
-    """``(3,)`` of the base in its own axes, from the pose `_TWIST_S` before."""
-    return np.zeros(3) if before is None else se2.log(se2.between(before.pose, now.pose)) / _TWIST_S
