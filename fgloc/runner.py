@@ -21,6 +21,7 @@ from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import Attendance
+from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
@@ -106,6 +107,7 @@ def run(
         notes = (
             *hints,
             *recording.notes,
+            *replay.clocks.notes,
             *parts.sentences,
         )
         rejections = replay.rejections()
@@ -199,6 +201,7 @@ class _Replay:
         self.first_pose_s: float | None = None
         self.blind = True  # no image and no sighting was recorded, not even an unusable one
         self.attendance = Attendance(roles)
+        self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
         self.decisions: list[Decision] = []
@@ -256,7 +259,7 @@ class _Replay:
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
-        for event in events:
+        for event in self.clocks.corrected(events):
             if self._first_ns is None:
                 self._first_ns = event.received_ns
             elapsed = (event.received_ns - self._first_ns) * 1e-9

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import threading
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,11 +34,12 @@ from fgloc.types import (
 )
 
 HISTORY_S = 5.0  # poses further back than this are not told
-_BEFORE_NS = 1_000_000_000  # motion events this long before a keyframe tell how it was moving then
+_BEFORE_NS = 500_000_000  # motion events this long before a keyframe tell how it was moving then
 _PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
 _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
-_KEPT = 4096  # events of one kind: 5 s at 800 Hz
 _MOTION = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
+
+_MOST_EVENTS = 8192  # of one kind
 
 E = TypeVar("E", bound=Event)
 
@@ -56,6 +58,7 @@ class _Anchor:
     scale: float
     gyro: Gyro | None
     learned: LearnedMotion | None
+    wheels: WheelMotion  # has read the events that were asked for so far
 
 
 class Extrapolator:
@@ -66,12 +69,15 @@ class Extrapolator:
 
     def __init__(self, parts: Assembly) -> None:
         """Take the parts of the run."""
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of what is kept
+        self._asked = threading.Lock()  # of the model
         self._parts = parts
+        self._model = None if parts.learned is None else copy.deepcopy(parts.learned.model)
         self._config = parts.config
         self._history_ns = round(parts.config.keyframes.history_s * 1e9)
+        self._kept_ns = max(self._history_ns, _BEFORE_NS)
         self._clock = ClockGuard(parts.config.gate)
-        self._events: dict[type[Event], deque[Any]] = {kind: deque(maxlen=_KEPT) for kind in _MOTION}
+        self._events: dict[type[Event], list[Any]] = {kind: [] for kind in _MOTION}  # by stamp
         self._anchors: deque[_Anchor] = deque()
         self._segment = -1
         self._newest_ns = 0
@@ -87,8 +93,11 @@ class Extrapolator:
                         events.clear()
                     self._anchors.clear()
                     self._newest_ns = 0
-                self._events[type(judged)].append(judged)
+                insort(self._events[type(judged)], judged, key=_stamp)
                 self._newest_ns = max(self._newest_ns, judged.stamp_ns)
+            events = self._events[type(event)]
+            if len(events) > _MOST_EVENTS:  # no keyframe has come for long
+                del events[: _MOST_EVENTS // 2]
 
     def anchor(self, step: Step, estimate: Estimate) -> None:
         """Carry on from here."""
@@ -113,7 +122,8 @@ class Extrapolator:
             off=off,
             scale=scale,
             gyro=None if gyro is None else gyro.fork(),
-            learned=None if learned is None else learned.fork(),
+            wheels=WheelMotion(self._config.wheels),
+            learned=None if learned is None or self._model is None else learned.fork(self._model),
         )
         with self._lock:
             if step.segment != self._segment:
@@ -122,6 +132,8 @@ class Extrapolator:
             self._anchors.append(made)
             while self._anchors[0].stamp_ns < made.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
+            for events in self._events.values():
+                del events[: max(bisect_right(events, self._anchors[0].stamp_ns - self._kept_ns, key=_stamp) - 1, 0)]
 
     def pose_at(self, stamp_ns: int | None) -> LivePose | None:
         """The pose at a time; None: of the newest motion event. None is returned while no pose is known then."""
@@ -135,7 +147,8 @@ class Extrapolator:
                 return None
             anchor = self._anchors[k]
             step = self._step(anchor.stamp_ns, at_ns)
-        belief, mode = self._carried(anchor, step), anchor.mode
+        with self._asked:
+            belief, mode = self._carried(anchor, step), anchor.mode
         blind_s = anchor.blind_s + step.dt
         if mode is Mode.OK and blind_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
@@ -158,16 +171,16 @@ class Extrapolator:
 
     def _window(self, kind: type[E], start_ns: int, end_ns: int) -> tuple[E, ...]:
         """In order of stamp: events inside, the last one at or before the start, and the first at or after the end."""
-        events = sorted(self._events[kind], key=lambda e: e.stamp_ns)
-        first = max(bisect_right(events, start_ns, key=lambda e: e.stamp_ns) - 1, 0)
-        return tuple(events[first : bisect_left(events, end_ns, key=lambda e: e.stamp_ns) + 1])
+        events = self._events[kind]
+        first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
+        return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
 
     def _carried(self, anchor: _Anchor, step: Step) -> Belief:
         parts, localizer = self._parts, self._parts.localizer
         sources = MotionSources(
             self._config,
-            WheelMotion(self._config.wheels),
-            None if anchor.learned is None else anchor.learned.fork(),
+            anchor.wheels,
+            None if anchor.learned is None else anchor.learned.fork(anchor.learned.model),
             localizer.sources.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
             localizer.factors,
@@ -181,6 +194,10 @@ class Extrapolator:
             belief = predict(belief, anchor.known, parts.localizer.factors.installation, motions)
             start_ns = end_ns
         return belief
+
+
+def _stamp(event: Event) -> int:
+    return event.stamp_ns
 
 
 def _piece(step: Step, start_ns: int, end_ns: int) -> Step:

@@ -46,9 +46,14 @@ class LearnedMotion:
         card = self.model.card
         return "velocity" in card.inputs
 
-    def fork(self) -> LearnedMotion:
-        """A copy that may predict beyond the newest step without changing this one."""
+    def fork(self, model: MotionModel) -> LearnedMotion:
+        """A copy that may predict beyond the newest step without changing this one.
+
+        Args:
+            model: a copy of this one's, for use in another thread: a model writes into buffers of its own.
+        """
         forked = copy.copy(self)
+        forked.model = model
         forked._reader, forked.rejections = self._reader.fork(), Counter()
         return forked
 
