@@ -162,8 +162,9 @@ class Participant:
         entity = self._topic(topic, message_type, messages or self.messages)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)),
-            Policy.History.KeepLast(_LATCHED_DEPTH if latched else _DEPTH),
+            Policy.History.KeepLast(_DEPTH),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+            Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
         return Writer(DataWriter(self._participant, entity, qos=qos), entity.data_type)
