@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cyclonedds.domain import Domain
 
 _LOOPBACK = """<CycloneDDS><Domain>
-<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces><AllowMulticast>spdp</AllowMulticast>
+<General><Interfaces><NetworkInterface address="127.0.0.1" multicast="true"/></Interfaces><AllowMulticast>spdp</AllowMulticast>
 </General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
@@ -114,6 +114,7 @@ class Participant:
         self._topics: dict[str, Any] = {}
         self._readers: list[tuple[Any, Publication, OnSample]] = []
         self._entering: list[tuple[Any, Publication, OnSample]] = []
+        self._failure: Exception | None = None
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._changed = GuardCondition(self._participant)
@@ -141,7 +142,13 @@ class Participant:
         del self._waiting, self._changed, self._found, self._participant, self._domain
 
     def publications(self) -> tuple[Publication, ...]:
-        """What others publish now, by name."""
+        """What others publish now, by name.
+
+        Raises:
+            WireError: a message of a topic that is read could not be taken in.
+        """
+        if self._failure is not None:
+            raise WireError(f"a message could not be taken in: {self._failure!r}") from self._failure
         from cyclonedds.core import InstanceState
 
         for endpoint in self._found.take(1000):
@@ -226,7 +233,10 @@ class Participant:
                     sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
                     found.append((source_ns, len(found), sample, on_sample))
         for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):
-            on_sample(sample)
+            try:
+                on_sample(sample)
+            except Exception as error:  # told by the next call; the other topics go on
+                self._failure = self._failure or error
 
 
 def _loopback(domain: int) -> Domain:
