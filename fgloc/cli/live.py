@@ -6,8 +6,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +21,7 @@ from fgloc.errors import ConfigError
 if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.live.wire.node import Node
+    from fgloc.types import LandmarkMap
 
 _SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
 _STATUS_S = 0.5  # time between two changes of the status line
@@ -48,6 +49,7 @@ def live(
     state: Annotated[
         Path | None, typer.Option("--state", metavar="FILE", help="kept up to date, and gone on from at the start")
     ] = None,
+    view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
 ) -> None:
     """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
     # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
@@ -63,8 +65,8 @@ def live(
         node = Node(participant, settings, landmarks, state)
         typer.echo(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
         try:
-            with _status_line(node, stop):
-                node.run(stop, _tell)
+            with _page(node, settings, landmarks) if view else nullcontext(_tell) as tell, _status_line(node, stop):
+                node.run(stop, tell)
         finally:
             node.close()
         typer.echo(_summary(node, time.monotonic() - began))
@@ -118,6 +120,32 @@ def _interrupted() -> Iterator[threading.Event]:
 def _tell(sentence: str) -> None:
     tqdm.write(sentence, file=sys.stdout)
     sys.stdout.flush()
+
+
+@contextmanager
+def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator[Callable[[str], None]]:
+    """A page that shows the run; what is to be told goes there too."""
+    from fgloc.recording.truth import base_pose
+    from fgloc.types import Event, TruthEvent
+    from fgloc.view.server import Page
+
+    with Page() as page:
+        scene = page.scene(config.truth.max_gap_s)
+        if landmarks is not None:
+            scene.add_map(landmarks)
+
+        def watch(event: Event) -> None:
+            if isinstance(event, TruthEvent) and config.truth.align == "none":
+                scene.add_truth(event.stamp_ns, base_pose(event, config.truth))
+
+        def tell(sentence: str) -> None:
+            _tell(sentence)
+            scene.note(sentence)
+
+        node.subscribe(scene.add)
+        node.watch = watch
+        _tell(f"view: {page.url}")
+        yield tell
 
 
 @contextmanager

@@ -31,6 +31,9 @@ ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", metavar="C", help="configuration; default: robot.yaml beside the bag, else none"),
 ]
+RrdOption = Annotated[
+    Path | None, typer.Option("--rrd", metavar="FILE", dir_okay=False, help="also write the run for rerun's viewer")
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
 SchedulerOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")

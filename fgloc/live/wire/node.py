@@ -36,6 +36,7 @@ class Node:
         live: the run; None until the topics that it needs are there.
         intake: what comes in.
         published: messages sent, by kind.
+        watch: given every event that comes in, also a truth's.
     """
 
     def __init__(
@@ -44,7 +45,6 @@ class Node:
         config: Config,
         landmarks: LandmarkMap | None,
         state: Path | None = None,
-        watch: Callable[[Event], None] | None = None,
     ) -> None:
         """Announce the outputs; input is looked for by `run`.
 
@@ -53,13 +53,12 @@ class Node:
             config: all settings.
             landmarks: the map; None: landmarks are estimated.
             state: as `Live` has it.
-            watch: given every event that comes in, also a truth's.
         """
         self.live: Live | None = None
         self._config = config
         self._landmarks = landmarks
         self._state = state
-        self._watch = watch
+        self.watch: Callable[[Event], None] | None = None
         self._subscribers: list[Callable[[Estimate], None]] = [self._on_estimate]
         self._clock = WireClock(participant)
         self._outputs = Outputs(participant)
@@ -131,8 +130,8 @@ class Node:
 
     def _push(self, event: Event) -> None:
         self._odom.add(event)
-        if self._watch is not None:
-            self._watch(event)
+        if self.watch is not None:
+            self.watch(event)
         assert self.live is not None  # nothing is read before
         try:
             self.live.push(event)

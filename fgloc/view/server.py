@@ -1,0 +1,110 @@
+"""A page on loopback that shows a live run, served by rerun's own server as a process beside this one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from fgloc.errors import OutputError
+from fgloc.view.scene import Scene, import_rerun, new_stream
+
+_HOST = "127.0.0.1"
+_START_S = 15.0
+_STOP_S = 2.0
+_MEMORY = "256MB"  # of the past that a browser which comes late still gets
+
+
+class Page:
+    """The server, and the stream that goes into it. Close it, or use it in a ``with``.
+
+    Attributes:
+        url: of the page.
+    """
+
+    def __init__(self, port: int = 0) -> None:
+        """Start the server; ``port`` 0: a free one.
+
+        It listens on loopback only, and reports no usage statistics to rerun's makers (the page in the browser asks).
+
+        Raises:
+            OutputError: rerun is not installed, or its server does not start.
+        """
+        import_rerun()
+        self._folder = tempfile.TemporaryDirectory(prefix="fgloc-view-")
+        program = Path(sys.executable).with_name("rerun")
+        data_port, page_port = _free_port(), port or _free_port()
+        environment = {**os.environ, "XDG_CONFIG_HOME": self._folder.name, "XDG_DATA_HOME": self._folder.name}
+        options = ["--bind", _HOST, "--port", str(data_port), "--web-viewer-port", str(page_port)]
+        quiet: dict[str, Any] = {"env": environment, "stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+        try:
+            subprocess.run([program, "analytics", "disable"], stderr=subprocess.DEVNULL, check=True, **quiet)
+            self._server = subprocess.Popen(
+                [program, "--serve-web", *options, "--server-memory-limit", _MEMORY],
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for this process, which then ends the server
+                **quiet,
+            )
+        except (OSError, subprocess.CalledProcessError) as error:
+            self._folder.cleanup()
+            raise OutputError(
+                f"{program}: rerun's server does not start ({error}); install fgloc[view] anew"
+            ) from error
+        source = f"rerun+http://{_HOST}:{data_port}/proxy"
+        self.url = f"http://{_HOST}:{page_port}/?url={quote(source, safe='')}"
+        self._wait_for(data_port, page_port)
+        self._stream = new_stream()
+        self._stream.connect_grpc(source)
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def scene(self, max_gap_s: float) -> Scene:
+        """What is shown; ``max_gap_s`` as `Scene` has it."""
+        return Scene(self._stream, max_gap_s)
+
+    def close(self) -> None:
+        """End the server."""
+        self._stream.disconnect()
+        self._end()
+
+    def _end(self) -> None:
+        """End the server: a script of Python's, and the program that it runs."""
+        for kind in (signal.SIGTERM, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._server.pid, kind)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._server.wait(_STOP_S)
+        self._folder.cleanup()
+
+    def _wait_for(self, *ports: int) -> None:
+        deadline = time.monotonic() + _START_S
+        for port in ports:
+            while not _answers(port):
+                if self._server.poll() is not None or time.monotonic() > deadline:
+                    self._end()
+                    raise OutputError(f"rerun's server does not listen on {_HOST}:{port}; is the port taken?")
+                time.sleep(0.02)
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind((_HOST, 0))
+        return int(free.getsockname()[1])
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as client:
+        client.settimeout(0.2)
+        return client.connect_ex((_HOST, port)) == 0
