@@ -11,13 +11,14 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-all check format bench clean
+.PHONY: help demo test test-all check equal format bench clean
 
 help:
 	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
 	@echo "make test      the quick tests"
 	@echo "make test-all  all tests"
 	@echo "make check     ruff format, ruff, mypy"
+	@echo "make equal     whether the bundled samples' results are those of the committed file, bit by bit"
 	@echo "make bench     the figures of the README"
 	@echo "make clean     remove .venv, caches and demo-out/"
 
@@ -34,6 +35,9 @@ check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+equal: .venv/.dev
+	$(BIN)/python -m benchmarks.equal
 
 format: .venv/.dev
 	$(BIN)/ruff format .

@@ -24,6 +24,7 @@ from fgloc.types import (
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MAX_PATIENCE_NS = 1_000_000_000
+_NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
 
@@ -68,7 +69,8 @@ class Stepper:
         self._history_ns = int(config.history_s * 1e9)
         self._lag_ns = int(lag_s * 1e9)
         self._clock = ClockGuard(gate)
-        self._jumps: list[str] = []
+        self._jumps: list[str] = []  # the first few ...
+        self._jump_count = 0  # ... of so many
         self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
         self._index = 0
         self._segment = 0
@@ -104,9 +106,9 @@ class Stepper:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
-        notes = self._jumps[:10]
-        if len(self._jumps) > 10:
-            notes.append(f"the clock jumped {len(self._jumps)} times in all")
+        notes = list(self._jumps)
+        if self._jump_count > _NAMED_JUMPS:
+            notes.append(f"the clock jumped {self._jump_count} times in all")
         for topic, (count, ahead_ns) in self._offsets.items():
             if count >= 10:
                 notes.append(
@@ -201,19 +203,22 @@ class Stepper:
         steps: list[Step] = []
         if self._last_ns is None:
             lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending)
-            self._jumps.append(
-                f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped"
-            )
+            self._tell_jump(f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped")
         else:
             jump_s = (event.stamp_ns - self._newest_ns) * 1e-9
             steps = self._finish()
             self._segment += 1
-            self._jumps.append(
+            self._tell_jump(
                 f"the clock jumped {'ahead' if jump_s > 0 else 'back'} by {abs(jump_s):.1f} s at "
                 f"{event.stamp_ns * 1e-9:.3f} s: segment {self._segment} begins"
             )
         self._reset()
         return steps
+
+    def _tell_jump(self, note: str) -> None:
+        self._jump_count += 1
+        if self._jump_count <= _NAMED_JUMPS:
+            self._jumps.append(note)
 
     # --- steps out ---
 

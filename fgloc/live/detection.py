@@ -68,12 +68,10 @@ class DetectionWorker:
     def arrived(self, image: Queued) -> None:
         """Count an image in; of too many the oldest that the worker does not have is dropped. Hold the condition."""
         self._images.append(image)
-        while len(self._images) > self._most:
-            oldest = next((q for q in self._images if q.state is not State.DETECTING), None)
-            if oldest is None:
-                return
+        waiting = [q for q in self._images if q.state is not State.DETECTING]
+        if len(waiting) > self._most:
             self.dropped += 1
-            self.discard(oldest)
+            self.discard(waiting[0])
 
     def discard(self, image: Queued) -> None:
         """An image is of no use any more, or was used. Hold the condition."""

@@ -178,7 +178,7 @@ class Engine:
         if not facts.topic_is_used(event):
             return self._refuse(item, event)
         if self._run.parts is not None:
-            if (facts.incomplete or type(event) not in facts.first) and facts.note(event):
+            if facts.is_news(event) and facts.note(event):
                 self.worker.detector = self._run.build().detector
             return self._admit(item)
         facts.note(event)
@@ -203,9 +203,9 @@ class Engine:
         event = item.event
         if event is None:
             return
-        passed = self._run.check(event)
+        passed = self._run.check(event) if self._run.facts.is_there(event) else None
         with self.changed:
-            if passed is None or (item.is_image and self.worker.detector is None):
+            if passed is None:
                 return self.worker.discard(item)
             if item.state is State.GONE:
                 return

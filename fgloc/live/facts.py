@@ -52,7 +52,6 @@ class LiveFacts:
 
     Attributes:
         roles: topic of each role that is there.
-        first: the first event of each kind.
     """
 
     name = "the live stream"
@@ -61,25 +60,40 @@ class LiveFacts:
         """Take the roles that are to be waited for (None: whatever comes), and the camera if it is known already."""
         self.camera = camera
         self.roles: dict[Role, str] = {}
-        self.first: dict[type[Event], Event] = {}
+        self._seen: dict[type[Event], Event] = {}
         self.image_size: tuple[int, int] | None = None
         self.expected = None if expected is None else frozenset(expected) - _NOT_BUILT_FROM
         self._config = config
         self._topics: dict[Role, str] = {}  # the first topic of each role; others are not used
         self._transforms: dict[tuple[str, str], list[TransformEvent]] = {}
         self._frames: FrameTree | None = None
+        self._incomplete = False  # a role has come in that lacks something
 
     def topic_is_used(self, event: Event) -> bool:
         """Whether the event is of the one topic that plays its role."""
         role = ROLE_OF.get(type(event))
         return role is None or self._topics.setdefault(role, event.topic) == event.topic
 
+    @property
+    def first(self) -> Mapping[type[Event], Event]:
+        """The first event of each kind whose role is there."""
+        return {kind: event for kind, event in self._seen.items() if self.is_there(event)}
+
+    def is_there(self, event: Event) -> bool:
+        """Whether all is known that is needed to use an event."""
+        role = ROLE_OF.get(type(event))
+        return role is None or role in _NOT_BUILT_FROM or role in self.roles
+
+    def is_news(self, event: Event) -> bool:
+        """Whether the event may tell what the run is not yet built from."""
+        return self._incomplete or type(event) not in self._seen
+
     def note(self, event: Event) -> bool:
         """Take in an event; whether a role is there now that was not before."""
         if isinstance(event, TransformEvent):
             self._add_transform(event)
         else:
-            self.first.setdefault(type(event), event)
+            self._seen.setdefault(type(event), event)
         if isinstance(event, ImageEvent) and self.image_size is None:
             try:
                 height, width = decode(event).shape
@@ -90,12 +104,8 @@ class LiveFacts:
         for role, topic in self._topics.items():
             if role not in self.roles and role not in _NOT_BUILT_FROM and not self._missing(role):
                 self.roles[role] = topic
+        self._incomplete = any(r not in self.roles and r not in _NOT_BUILT_FROM for r in self._topics)
         return len(self.roles) > before
-
-    @property
-    def incomplete(self) -> bool:
-        """Whether a role has come in that lacks something."""
-        return any(r not in self.roles and r not in _NOT_BUILT_FROM for r in self._topics)
 
     def waiting_for(self) -> tuple[str, ...]:
         """What is missing, a phrase each."""
@@ -133,14 +143,14 @@ class LiveFacts:
 
     def _missing(self, role: Role) -> str:
         """What the sensor of a role cannot be built without; "" if it is all there."""
-        corners = role == "sightings" and CornersEvent in self.first
+        corners = role == "sightings" and CornersEvent in self._seen
         if role not in _WITH_CAMERA or self.camera is not None or not (role == "image" or corners):
             return ""
-        if CameraInfoEvent not in self.first and self._config.camera.file is None:
+        if CameraInfoEvent not in self._seen and self._config.camera.file is None:
             return "no CameraInfo yet, and no camera.file"
         if given_pose(self._config, "optical") is not None:
             return ""
-        info = self.first.get(CameraInfoEvent) or self.first.get(ImageEvent) or self.first.get(CornersEvent)
+        info = self._seen.get(CameraInfoEvent) or self._seen.get(ImageEvent) or self._seen.get(CornersEvent)
         frame = info.frame_id if isinstance(info, CameraInfoEvent | ImageEvent | CornersEvent) else ""
         base = base_frame(self, self._config, self.first)
         if frame.lstrip("/") != base.lstrip("/") and not (frame in self.frames and base in self.frames):

@@ -49,7 +49,8 @@ class Whereabouts:
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._speaking_for = self._speaking_against = 0  # sightings
-        self._jumps: list[FloatArray] = []
+        self._jumps: list[FloatArray] = []  # the first few ...
+        self._jump_count = 0  # ... of so many
         self._told = False  # whether a pose that is not confirmed has been told
         places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
         self._places: FloatArray = np.array(places).reshape(-1, 2)
@@ -229,16 +230,18 @@ class Whereabouts:
 
     def found(self, believed: Belief, place: Belief) -> None:
         """The robot was found at another place than it was believed to be at."""
-        self._jumps.append(se2.between(believed.pose, place.pose))
+        self._jump_count += 1
+        if self._jump_count <= _NAMED:
+            self._jumps.append(se2.between(believed.pose, place.pose))
         self.lost = self._given = False
         self._initializer.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know, one sentence each."""
-        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps[:_NAMED]]
-        if len(self._jumps) > _NAMED:
-            said.append(f"... and {len(self._jumps) - _NAMED} times more")
+        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps]
+        if self._jump_count > _NAMED:
+            said.append(f"... and {self._jump_count - _NAMED} times more")
         if self._never_found:
             said.append(
                 "the sightings never told where on the map the robot is: its poses are LOST, and right relative to one "
