@@ -15,9 +15,9 @@ from typing import Any
 from urllib.parse import quote
 
 from fgloc.errors import OutputError
+from fgloc.view.private import HOST, PrivatePage
 from fgloc.view.scene import Scene, import_rerun, new_stream
 
-_HOST = "127.0.0.1"
 _START_S = 15.0
 _STOP_S = 2.0
 _MEMORY = "256MB"  # of the past that a browser which comes late still gets
@@ -33,7 +33,7 @@ class Page:
     def __init__(self, port: int = 0) -> None:
         """Start the server; ``port`` 0: a free one.
 
-        It listens on loopback only, and reports no usage statistics to rerun's makers (the page in the browser asks).
+        It listens on loopback only, and neither it nor the page in the browser connects to any other machine.
 
         Raises:
             OutputError: rerun is not installed, or its server does not start.
@@ -41,9 +41,9 @@ class Page:
         import_rerun()
         self._folder = tempfile.TemporaryDirectory(prefix="fgloc-view-")
         program = Path(sys.executable).with_name("rerun")
-        data_port, page_port = _free_port(), port or _free_port()
+        data_port, page_port = _free_port(), _free_port()
         environment = {**os.environ, "XDG_CONFIG_HOME": self._folder.name, "XDG_DATA_HOME": self._folder.name}
-        options = ["--bind", _HOST, "--port", str(data_port), "--web-viewer-port", str(page_port)]
+        options = ["--bind", HOST, "--port", str(data_port), "--web-viewer-port", str(page_port)]
         quiet: dict[str, Any] = {"env": environment, "stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
         try:
             subprocess.run([program, "analytics", "disable"], stderr=subprocess.DEVNULL, check=True, **quiet)
@@ -58,9 +58,14 @@ class Page:
             raise OutputError(
                 f"{program}: rerun's server does not start ({error}); install fgloc[view] anew"
             ) from error
-        source = f"rerun+http://{_HOST}:{data_port}/proxy"
-        self.url = f"http://{_HOST}:{page_port}/?url={quote(source, safe='')}"
+        source = f"rerun+http://{HOST}:{data_port}/proxy"
         self._wait_for(data_port, page_port)
+        try:
+            self._page = PrivatePage(page_port, port)
+        except OSError as error:
+            self._end()
+            raise OutputError(f"port {port} cannot be served ({error.strerror}); choose another one") from error
+        self.url = f"http://{HOST}:{self._page.port}/?url={quote(source, safe='')}"
         self._stream = new_stream()
         self._stream.connect_grpc(source)
 
@@ -77,6 +82,7 @@ class Page:
     def close(self) -> None:
         """End the server."""
         self._stream.disconnect()
+        self._page.close()
         self._end()
 
     def _end(self) -> None:
@@ -94,17 +100,17 @@ class Page:
             while not _answers(port):
                 if self._server.poll() is not None or time.monotonic() > deadline:
                     self._end()
-                    raise OutputError(f"rerun's server does not listen on {_HOST}:{port}; is the port taken?")
+                    raise OutputError(f"rerun's server does not listen on {HOST}:{port}; is the port taken?")
                 time.sleep(0.02)
 
 
 def _free_port() -> int:
     with socket.socket() as free:
-        free.bind((_HOST, 0))
+        free.bind((HOST, 0))
         return int(free.getsockname()[1])
 
 
 def _answers(port: int) -> bool:
     with socket.socket() as client:
         client.settimeout(0.2)
-        return client.connect_ex((_HOST, port)) == 0
+        return client.connect_ex((HOST, port)) == 0
