@@ -163,13 +163,12 @@ class Scene:
             truth = list(self._truth)
         stamps = [stamp for stamp, _ in truth]
         after = bisect.bisect_left(stamps, stamp_ns)
-        if after == len(stamps) or (after == 0 and stamps[0] != stamp_ns):
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return truth[after][1]
+        if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > self._max_gap_ns:
             return None
-        before = max(after - 1, 0)
-        if stamps[after] - stamps[before] > self._max_gap_ns:
-            return None
-        poses = np.array([truth[before][1], truth[after][1]])
-        around = np.array([stamps[before], max(stamps[after], stamps[before] + 1)], dtype=np.int64)
+        poses = np.array([truth[after - 1][1], truth[after][1]])
+        around = np.array(stamps[after - 1 : after + 1], dtype=np.int64)
         return np.asarray(se2.interpolate(around, poses, np.array([stamp_ns], dtype=np.int64))[0])
 
 

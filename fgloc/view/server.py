@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,7 +17,6 @@ from fgloc.view.private import HOST, PrivatePage
 from fgloc.view.scene import Scene, import_rerun, new_stream
 
 _START_S = 15.0
-_STOP_S = 2.0
 _MEMORY = "256MB"  # of the past that a browser which comes late still gets
 
 
@@ -40,7 +37,7 @@ class Page:
         """
         import_rerun()
         self._folder = tempfile.TemporaryDirectory(prefix="fgloc-view-")
-        program = Path(sys.executable).with_name("rerun")
+        program = _program()
         data_port, page_port = _free_port(), _free_port()
         environment = {**os.environ, "XDG_CONFIG_HOME": self._folder.name, "XDG_DATA_HOME": self._folder.name}
         options = ["--bind", HOST, "--port", str(data_port), "--web-viewer-port", str(page_port)]
@@ -86,12 +83,8 @@ class Page:
         self._end()
 
     def _end(self) -> None:
-        """End the server: a script of Python's, and the program that it runs."""
-        for kind in (signal.SIGTERM, signal.SIGKILL):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._server.pid, kind)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._server.wait(_STOP_S)
+        self._server.kill()  # it has nothing to save
+        self._server.wait()
         self._folder.cleanup()
 
     def _wait_for(self, *ports: int) -> None:
@@ -102,6 +95,17 @@ class Page:
                     self._end()
                     raise OutputError(f"rerun's server does not listen on {HOST}:{port}; is the port taken?")
                 time.sleep(0.02)
+
+
+def _program() -> Path:
+    """Rerun's program itself: the script of that name starts it as a process of its own, which is harder to end."""
+    package = find_spec("rerun_cli")
+    folders = [] if package is None else package.submodule_search_locations or []
+    names = ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun")
+    program = next((file for folder in folders for name in names if (file := Path(folder) / name).is_file()), None)
+    if program is None:
+        raise OutputError("rerun has no viewer here; install it anew: pip install 'fgloc[view]'")
+    return program
 
 
 def _free_port() -> int:
