@@ -21,7 +21,7 @@ from pydantic import TypeAdapter
 
 from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
 from benchmarks.adaptive_scores import Figures, lost, score
-from fgloc.ablation.failures import AnyFailure, Failure, Scene, generators, spoil
+from fgloc.ablation.failures import AnyFailure, Failure, Scene, corrupt, generators
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
@@ -193,8 +193,8 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
                 config,
                 "batch" if batch else "online",
                 on_step=note,
-                events=lambda _: spoil(chain, "recorded", iter(recorded.events), scenes),
-                sightings=lambda events: keep(spoil(chain, "sightings", events, scenes)),
+                events=lambda _: corrupt(chain, "recorded", iter(recorded.events), scenes),
+                sightings=lambda events: keep(corrupt(chain, "sightings", events, scenes)),
             )
         except EstimatorError:
             if estimates:

@@ -1,4 +1,4 @@
-"""Whether the bundled samples give the results of the committed file, bit by bit: `make equal` before and after a refactoring.
+"""Whether the bundled samples give the results of the committed file, bit by bit: `make equal`, around a refactoring.
 
 One line a sample and mode: a hash of poses, covariances and counts. Another processor may round differently: write the
 file anew there (`python -m benchmarks.equal --write`), from the commit that the change starts from.

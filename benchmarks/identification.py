@@ -28,10 +28,10 @@ from benchmarks.common import Row, main, not_run
 from datasets import mrclam
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
-from fgloc.motion import MotionModel, load_model, save_model
-from fgloc.motion.card import Kinematics, Split
-from fgloc.motion.load import model_of, read_model
 from fgloc.runner import find_beside, run
+from fgloc.sensors.learned import MotionModel, load_model, save_model
+from fgloc.sensors.learned.card import Kinematics, Split
+from fgloc.sensors.learned.load import model_of, read_model
 from fgloc.types import CommandEvent, FloatArray
 from training.adapt import adapted
 from training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig

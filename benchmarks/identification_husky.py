@@ -18,16 +18,16 @@ import numpy as np
 from benchmarks.common import Row
 from datasets import drive
 from fgloc.config import load_config
-from fgloc.motion import load_model
-from fgloc.motion.card import Input, Split
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.runner import find_beside
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.card import Input, Split
 from fgloc.types import Event, TruthEvent
 from training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from training.data import Run, make_run
 from training.evaluate import evaluate
-from training.heard import Heard
+from training.heard import TopicTimes
 from training.rollouts import Rollout, roll_model, roll_wheels
 from training.train import train
 
@@ -94,7 +94,7 @@ def _windows(source: Path, steps: range, part: str, scratch: Path) -> list[Run]:
         if truth[-1].stamp_ns < window[0].stamp_ns + round((_HISTORY_S + _HORIZON_S) * 1e9):
             continue
         stamps, poses = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
-        runs.append(make_run(f"{part}_{k}", Heard(window, settings), stamps, poses, _DT_S, _HISTORY_S, _DATA))
+        runs.append(make_run(f"{part}_{k}", TopicTimes(window, settings), stamps, poses, _DT_S, _HISTORY_S, _DATA))
     return runs
 
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks.common import Row
 from datasets.sim.suite import BUNDLED, Job, jobs, load_suite, record_suite
-from fgloc.motion import load_model
-from fgloc.motion.card import Input, Split
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.card import Input, Split
 from training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from training.data import Run, load_run
 from training.evaluate import STEP_S, evaluate
@@ -32,18 +32,18 @@ _QUICK_S = 40.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class _Record:
     name: str
     scenario: str
     inputs: tuple[Input, ...]
 
 
 _CASES = (
-    _Case("mu02", "slick", ("commands", "gyro")),
-    _Case("mu01", "slippery", ("commands", "gyro")),
-    _Case("radii", "unequal_radii", ("commands", "wheels")),
-    _Case("patches", "patches", ("commands", "gyro", "effort")),
-    _Case("patches_plain", "patches", ("commands",)),
+    _Record("mu02", "slick", ("commands", "gyro")),
+    _Record("mu01", "slippery", ("commands", "gyro")),
+    _Record("radii", "unequal_radii", ("commands", "wheels")),
+    _Record("patches", "patches", ("commands", "gyro", "effort")),
+    _Record("patches_plain", "patches", ("commands",)),
 )
 
 
@@ -85,7 +85,7 @@ def _jobs(quick: bool) -> list[Job]:
 
 
 def _rollouts(
-    case: _Case, seed: int, split: Split, runs: dict[str, Run], optimization: OptimizationConfig, scratch: Path
+    case: _Record, seed: int, split: Split, runs: dict[str, Run], optimization: OptimizationConfig, scratch: Path
 ) -> list[Rollout]:
     """The test runs, predicted by a model of the training runs."""
     config = TrainConfig(

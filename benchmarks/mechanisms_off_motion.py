@@ -16,7 +16,7 @@ from benchmarks.mechanisms_switch import (
 )
 from fgloc.types import FloatArray
 
-_TRUST = "fgloc.faults.motion_faults"
+_TRUST = "fgloc.robust.motion_faults"
 _GYRO = "fgloc.sensors.gyro"
 
 
@@ -47,33 +47,33 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_test",
         "GLR test of wheels against learned motion or gyro: slipping or dead wheels are left out.",
-        ("faults/glr_test.py", "faults/motion_faults.py"),
-        (Switch("fgloc.faults.glr_test:Disagreement._worst", Returns((0.0, 1))),),
-        Probe("fgloc.faults.glr_test:Disagreement.judge", lambda verdict, *_: verdict.flagged),
+        ("robust/glr_test.py", "robust/motion_faults.py"),
+        (Switch("fgloc.robust.glr_test:GlrTest._worst", Returns((0.0, 1))),),
+        Probe("fgloc.robust.glr_test:GlrTest.judge", lambda verdict, *_: verdict.flagged),
         batch=True,
     ),
     Mechanism(
         "disagreement_scale",
         "Covariances of motion sources that disagree are scaled before the alarm.",
-        ("faults/glr_test.py", "fusion/motion.py"),
-        (Switch("fgloc.fusion.motion:MotionSources.combine", _unscaled),),
-        Probe("fgloc.fusion.motion:MotionSources.combine", _scaled),
+        ("robust/glr_test.py", "robust/motion_fusion.py"),
+        (Switch("fgloc.robust.motion_fusion:MotionFusion.combine", _unscaled),),
+        Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _scaled),
         batch=True,
     ),
     Mechanism(
         "disagreement_level",
         "Differences of the motion sources are compared with what is usual, not with their covariances alone.",
-        ("faults/glr_test.py",),
-        (Switch("fgloc.faults.glr_test:_LEAST_LEVEL", Constant(1.0)),),
-        Probe("fgloc.faults.glr_test:Disagreement.judge", lambda _, before, test, *args: test._level < 1.0),
+        ("robust/glr_test.py",),
+        (Switch("fgloc.robust.glr_test:_LEAST_LEVEL", Constant(1.0)),),
+        Probe("fgloc.robust.glr_test:GlrTest.judge", lambda _, before, test, *args: test._level < 1.0),
         batch=True,
     ),
     Mechanism(
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
-        ("fusion/motion.py",),
-        (Switch("fgloc.fusion.motion:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
-        Probe("fgloc.fusion.motion:MotionSources.combine", _without_wheels),
+        ("robust/motion_fusion.py",),
+        (Switch("fgloc.robust.motion_fusion:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
+        Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _without_wheels),
         batch=True,
     ),
     Mechanism(
@@ -87,27 +87,27 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "failure_kind",
         "Tells frozen encoders and one dead wheel from slip.",
-        ("faults/motion_faults.py",),
+        ("robust/motion_faults.py",),
         (Switch(f"{_TRUST}:SourceTrust._failure", Returns("slip")),),
         Probe(f"{_TRUST}:SourceTrust._failure", lambda kind, *_: kind != "slip"),
     ),
     Mechanism(
         "doubtful_wheels",
         "Flagged wheels that nothing replaces stay, with a covariance that allows for the fault.",
-        ("fusion/motion.py",),
-        (Switch("fgloc.fusion.motion:MotionSources._doubtful", Argument(1)),),
-        Probe("fgloc.fusion.motion:MotionSources._doubtful", called),
+        ("robust/motion_fusion.py",),
+        (Switch("fgloc.robust.motion_fusion:MotionFusion._doubtful", Argument(1)),),
+        Probe("fgloc.robust.motion_fusion:MotionFusion._doubtful", called),
         batch=True,
     ),
     Mechanism(
         "source_correlation",
         "Errors of wheels and learned motion are taken as correlated, as calibrated.",
-        ("motion/joint.py", "fusion/motion.py"),
+        ("sensors/learned/joint.py", "robust/motion_fusion.py"),
         (
-            Switch("fgloc.motion.joint:JointCalibration.decorrelate", _learned_alone),
-            Switch("fgloc.motion.joint:JointCalibration.difference_cov", _summed),
+            Switch("fgloc.sensors.learned.joint:JointCalibration.decorrelate", _learned_alone),
+            Switch("fgloc.sensors.learned.joint:JointCalibration.difference_cov", _summed),
         ),
-        Probe("fgloc.motion.joint:JointCalibration.decorrelate", called),
+        Probe("fgloc.sensors.learned.joint:JointCalibration.decorrelate", called),
         batch=True,
     ),
     Mechanism(

@@ -18,9 +18,9 @@ from benchmarks.mechanisms_switch import (
     something,
 )
 
-_GATE = "fgloc.graph.gating"
-_POSE_FIT = "fgloc.graph.pose_fit"
-_VOTES = "fgloc.graph.moved_landmark_votes:Quarantine"
+_GATE = "fgloc.robust.association"
+_POSE_FIT = "fgloc.relocalization.pose_fit"
+_VOTES = "fgloc.robust.moved_landmark_votes:LandmarkExclusion"
 _NO_KERNEL = 1e6  # sigmas
 
 
@@ -58,28 +58,28 @@ def _unblurred(real: Function) -> Function:
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "fit_kernel",
-        "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not spoil the pose.",
-        ("graph/pose_fit.py",),
+        "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not corrupt the pose.",
+        ("relocalization/pose_fit.py",),
         (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
     ),
     Mechanism(
         "gate",
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
-        ("graph/gating.py",),
+        ("robust/association.py",),
         (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
         batch=True,
     ),
     Mechanism(
         "corrected_nis",
         "Far from linear the NIS is taken at the pose that prediction and sighting make likeliest.",
-        ("graph/gating.py", "graph/joint.py"),
+        ("robust/association.py", "graph/joint.py"),
         (Switch(f"{_GATE}:correct", _linear_nis), Switch(f"{_GATE}:Weights._agreed", _testing)),
         batch=True,
     ),
     Mechanism(
         "joint_compatibility",
         "Of sightings that exclude each other, an uncertain prediction keeps the largest set that agrees.",
-        ("graph/gating.py",),
+        ("robust/association.py",),
         (Switch(f"{_GATE}:Weights._agreed", Argument(3)),),
         Probe(f"{_GATE}:Weights._agreed", lambda result, _, *args: result != args[3]),
         batch=True,
@@ -87,22 +87,22 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "misread_ids",
         "A refused marker where exactly one other marker of the map would be seen is taken for that other one.",
-        ("graph/gating.py", "graph/factors.py"),
-        (Switch(f"{_GATE}:Weights._read_again", Returns(())),),
-        Probe(f"{_GATE}:Weights._read_again", something),
+        ("robust/association.py", "graph/factors.py"),
+        (Switch(f"{_GATE}:Weights._reassociate", Returns(())),),
+        Probe(f"{_GATE}:Weights._reassociate", something),
         batch=True,
     ),
     Mechanism(
         "shared_information",
         "Sightings of one landmark within the correlation time of its errors share their information.",
-        ("graph/gating.py",),
+        ("robust/association.py",),
         (Switch(f"{_GATE}:Weights._share_information", lambda real: lambda self, m: (m, 1.0)),),
         Probe(f"{_GATE}:Weights._share_information", lambda result, *_: result[1] != 1.0),
     ),
     Mechanism(
         "overruled_prediction",
         "Refused sightings of two landmarks that agree on a place nearby widen the motion and are fused.",
-        ("graph/gating.py", "localizer.py"),
+        ("robust/association.py", "localizer.py"),
         (Switch(f"{_GATE}:Weights.overruled", Returns(None)),),
         Probe(f"{_GATE}:Weights.overruled", not_none),
         batch=True,
@@ -121,7 +121,7 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
     Mechanism(
         "moved_votes",
         "A landmark whose refused sightings agree on another place is named as moved and left out.",
-        ("graph/moved_landmark_votes.py",),
+        ("robust/moved_landmark_votes.py",),
         (Switch(f"{_VOTES}.disagree", Returns(None)),),
         Probe(f"{_VOTES}.disagree", lambda _, before, quarantine, *args: bool(quarantine.displacements)),
         batch=True,
@@ -129,7 +129,7 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
     Mechanism(
         "votes_misread_test",
         "Refused sightings that may be misread sightings of what stands there do not count as a move.",
-        ("graph/moved_landmark_votes.py",),
+        ("robust/moved_landmark_votes.py",),
         (Switch(f"{_VOTES}._misread", Returns(False)),),
         Probe(f"{_VOTES}._misread", something),
         batch=True,
@@ -137,8 +137,8 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
     Mechanism(
         "moved_beacons",
         "GLR over one filter for each beacon: names beacons that moved by less than the gate sees.",
-        ("graph/moved_landmark_glr.py", "faults/landmark_faults.py"),
-        (Switch("fgloc.faults.landmark_faults:Suspicion.look", Returns([])),),
-        Probe("fgloc.faults.landmark_faults:Suspicion.look", something),
+        ("robust/moved_landmark_glr.py", "robust/landmark_faults.py"),
+        (Switch("fgloc.robust.landmark_faults:LandmarkFaultMonitor.look", Returns([])),),
+        Probe("fgloc.robust.landmark_faults:LandmarkFaultMonitor.look", something),
     ),
 )

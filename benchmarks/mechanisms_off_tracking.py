@@ -17,15 +17,15 @@ from benchmarks.mechanisms_switch import (
     something,
 )
 
-_GATE = "fgloc.graph.gating"
+_GATE = "fgloc.robust.association"
 _SEARCH = "fgloc.relocalization.global_search"
-_WHERE = "fgloc.relocalization.tracking_state:Whereabouts"
+_WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
 
 
 def _without_contrary(real: Function) -> Function:
-    return lambda self, started: real(self, replace(started, contrary=frozenset()))
+    return lambda self, started: real(self, replace(started, outliers=frozenset()))
 
 
 def _at_prediction(real: Function) -> Function:
@@ -62,7 +62,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "A given first pose holds against sightings that contradict it from the start.",
         ("relocalization/tracking_state.py", "localizer.py"),
         (Switch(f"{_WHERE}.holds_given", _never),),
-        Probe(f"{_WHERE}.hold", lambda _, before, where, *args: where.holds_given),
+        Probe(f"{_WHERE}.hold", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,
     ),
     Mechanism(
@@ -77,7 +77,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "Sightings that contradict the place where the run starts are refused in the replay from there.",
         ("localizer.py", "relocalization/global_search.py"),
         (Switch("fgloc.localizer:Localizer._replay", _without_contrary),),
-        Probe("fgloc.localizer:Localizer._replay", lambda _, before, self, started: started.contrary),
+        Probe("fgloc.localizer:Localizer._replay", lambda _, before, self, started: started.outliers),
         batch=True,
     ),
     Mechanism(
@@ -97,7 +97,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "jump_compelling",
         "A place other than the tracked one has to explain nearly all, sharply, by two landmarks.",
         ("relocalization/pose_consensus.py",),
-        (Switch("fgloc.relocalization.pose_consensus:Agreed.compelling", _always),),
+        (Switch("fgloc.relocalization.pose_consensus:PoseConsensus.overrides_prior", _always),),
     ),
 )
 

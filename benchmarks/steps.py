@@ -24,13 +24,13 @@ from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.factors import motion_factor, pose_key, prior_factor
 from fgloc.graph.isam2 import isam2_params
-from fgloc.intake.keyframing import Stepper
-from fgloc.intake.validation import Gate
+from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
-from fgloc.motion import load_model
-from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
@@ -131,8 +131,8 @@ class _Chain:
 
     def __init__(self, world: _World, keep_times: bool = False) -> None:
         config = Config.model_validate({"wheels": {"source": "twist"}})
-        self.gate = Gate(config.gate, set(world.map.landmarks))
-        self.stepper = Stepper(config.keyframes, config.gate, config.estimator.lag_s)
+        self.gate = EventValidator(config.gate, set(world.map.landmarks))
+        self.stepper = KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s)
         model = load_model(_MODEL)
         wheels, landmarks = WheelMotion(config.wheels), LandmarkSensor(config, world.map, world.camera, None)
         learned = LearnedMotion(model, config.motion)

@@ -13,15 +13,15 @@ from fgloc.config import Config, Role
 from fgloc.diagnosis import Diagnosis
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, rpy_matrix
-from fgloc.intake.keyframing import Stepper
-from fgloc.intake.validation import Gate
+from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
-from fgloc.motion import load_model
-from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
@@ -51,10 +51,10 @@ class Assembly:
 
     config: Config
     landmark_map: LandmarkMap | None
-    gate: Gate
+    gate: EventValidator
     detector: MarkerDetector | None
-    detections: Gate  # what the detector found has the stamps of its images, which the gate has seen
-    stepper: Stepper
+    detections: EventValidator  # what the detector found has the stamps of its images, which the gate has seen
+    stepper: KeyframeBuilder
     wheels: WheelMotion
     landmarks: LandmarkSensor
     camera: Camera | None
@@ -68,7 +68,7 @@ class Assembly:
         """Everything refused by any part so far, by reason."""
         localizer, gyro = self.localizer, self.localizer.sources.gyro
         counters = [self.gate.rejections, self.detections.rejections, self.stepper.rejections, self.wheels.rejections]
-        counters += [self.landmarks.rejections, localizer.rejections, localizer.weights.rejections]
+        counters += [self.landmarks.rejections, localizer.rejections, localizer.association.rejections]
         counters += [] if self.learned is None else [self.learned.rejections]
         counters += [] if gyro is None else [gyro.rejections]
         total: Counter[str] = Counter()
@@ -160,10 +160,10 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     return Assembly(
         config=config,
         landmark_map=landmark_map,
-        gate=Gate(config.gate, known_ids),
+        gate=EventValidator(config.gate, known_ids),
         detector=detector,
-        detections=Gate(config.gate, known_ids),
-        stepper=Stepper(config.keyframes, config.gate, config.estimator.lag_s),
+        detections=EventValidator(config.gate, known_ids),
+        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s),
         wheels=wheels,
         landmarks=landmarks,
         camera=camera,

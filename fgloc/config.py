@@ -359,7 +359,7 @@ class Config(Section):
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
 _SHIPPED = "shipped:"
 _LONGEST = 80  # characters of a wrong value that are shown
-_MODELS = Path(__file__).parent / "motion" / "models"
+_MODELS = Path(__file__).parent / "sensors" / "learned" / "models"
 
 
 def yaml_of(config: Config, folder: Path) -> str:

@@ -10,23 +10,23 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.faults.landmark_faults import Suspicion
-from fgloc.faults.motion_faults import SourceTrust, Trust
-from fgloc.fusion.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
-from fgloc.fusion.motion import MotionSources, with_noise
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.gating import Weights
 from fgloc.graph.installation import installation_of
 from fgloc.graph.isam2 import IncrementalEstimator
-from fgloc.graph.measurement_log import Belief, Sighting
-from fgloc.motion.joint import JointCalibration
-from fgloc.motion.source import LearnedMotion
-from fgloc.relocalization.global_search import Start
-from fgloc.relocalization.tracking_state import CONTRADICTS, Whereabouts
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.global_search import InitialPose
+from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
+from fgloc.robust.association import Association
+from fgloc.robust.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
+from fgloc.robust.landmark_faults import LandmarkFaultMonitor
+from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
+from fgloc.robust.motion_fusion import MotionFusion, with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.timing import Stopwatch
@@ -37,7 +37,7 @@ from fgloc.types import (
     LandmarkMap,
     LandmarkMeasurement,
     Mode,
-    Readings,
+    MotionReadings,
     Step,
 )
 
@@ -87,27 +87,27 @@ class Localizer:
         )
         kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
         self.estimator: Estimator = kind(config.estimator, self.factors, keep_all)
-        self.weights = Weights(config, self.factors)
+        self.association = Association(config, self.factors)
         self.counts: Counter[str] = Counter()
         self.rejections: Counter[str] = Counter()
         self.stopwatch = Stopwatch()
-        self.sources = MotionSources(config, wheels, learned, joint, gyro, self.factors)
-        self.trust = SourceTrust(config.weights, self.sources, config.wheels.track)
+        self.sources = MotionFusion(config, wheels, learned, joint, gyro, self.factors)
+        self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
         self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
-        self._suspicion = Suspicion(config, landmark_map, self.estimator, self.weights)
-        self._whereabouts = Whereabouts(config, landmark_map, self.factors, keep_all)
+        self._landmark_faults = LandmarkFaultMonitor(config, landmark_map, self.estimator, self.association)
+        self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
-        self._prior: Belief | None = None  # where the segment starts, if that is known without sightings
-        self._restart: Belief | None = None  # where the next step is to begin anew
+        self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
+        self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
 
     def update(self, step: Step) -> Estimate | None:
         """Take in one step; return the newest pose, or None while the first pose is not yet known."""
-        blind_s = self._whereabouts.blind_s
-        self._whereabouts.elapse(step.dt)
+        blind_s = self._tracking.blind_s
+        self._tracking.advance_time(step.dt)
         if step.segment != self._segment or self._restart is not None:
             self._begin_segment(step)
-        elif not self._whereabouts.waiting and self._whereabouts.nowhere(self.estimator.belief):
+        elif not self._tracking.waiting and self._tracking.is_unlocalized(self.estimator.belief):
             self._get_lost()
         # 1. Measure: one call per sensor; a silent sensor yields nothing
         with self.stopwatch("motion"):
@@ -115,16 +115,16 @@ class Localizer:
         with self.stopwatch("sightings"):
             offset_s = self.factors.installation.time_offset(self.factors.believed)
             sightings = self._compensation.measure(step, offset_s)
-        if self._whereabouts.waiting:
+        if self._tracking.waiting:
             return self._initialize(step, readings, sightings)
         return self._advance(step, readings, sightings)
 
     @property
     def blind_s(self) -> float:
         """Time since the last fix [s]."""
-        return self._whereabouts.blind_s
+        return self._tracking.blind_s
 
-    def restart_at(self, belief: Belief) -> None:
+    def restart_at(self, belief: PoseWithCovariance) -> None:
         """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
 
         Sightings that contradict it do not hold: the map is searched.
@@ -137,22 +137,24 @@ class Localizer:
             self.finish()
         self._segment = step.segment
         self.sources.begin_segment()
-        self.trust.begin(step)
-        self.weights.begin_segment()
+        self.motion_faults.begin(step)
+        self.association.begin_segment()
         known, self._restart = self._restart, None
-        self._prior = self._whereabouts.begin_segment(self.estimator.belief, known)
+        self._prior = self._tracking.begin_segment(self.estimator.belief, known)
 
-    def _initialize(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
+    def _initialize(
+        self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]
+    ) -> Estimate | None:
         """Collect steps until the first pose is clear, then run them all through the estimator."""
         if self._prior is not None:
             prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
-            self._whereabouts.start_known()
+            self._tracking.start_known()
             return self._start(step, prior, sightings)
         motions = self.sources.combine(readings) or [self.sources.unknown(step, readings)]
-        started = self._whereabouts.collect(step, motions, sightings, readings)
+        started = self._tracking.collect(step, motions, sightings, readings)
         if started is None:
-            return self._advance(step, readings, ()) if self._whereabouts.lost else self._unconfirmed(step)
-        if self._whereabouts.lost:
+            return self._advance(step, readings, ()) if self._tracking.lost else self._unconfirmed(step)
+        if self._tracking.lost:
             return self._found(step, started.newest, [])
         estimates = self._replay(started)
         decisions = [d for estimate in estimates for d in estimate.decisions]
@@ -160,16 +162,16 @@ class Localizer:
 
     def _unconfirmed(self, step: Step) -> Estimate | None:
         """The pose before the sightings are enough to begin the graph with."""
-        belief = self._whereabouts.unconfirmed()
+        belief = self._tracking.unconfirmed()
         if belief is None:
             return None
         cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED)
 
-    def _replay(self, started: Start) -> list[Estimate]:
+    def _replay(self, started: InitialPose) -> list[Estimate]:
         """Run the collected steps through the estimator."""
         first, *rest = started.steps
-        self.weights.contrary = started.contrary
+        self.association.outliers = started.outliers
         self.sources.begin_segment()
         estimates = [self._start(first.step, started.first, first.sightings)]
         estimates += [self._advance(later.step, later.readings, later.sightings) for later in rest]
@@ -184,97 +186,97 @@ class Localizer:
         Returns:
             The estimates of its steps; none if there is nothing to make up for.
         """
-        started = self._whereabouts.give_up(blind)
+        started = self._tracking.give_up(blind)
         if started is None:
             return []
-        first, mode = self.estimator.k + 1, Mode.LOST if self._whereabouts.lost else Mode.UNCONFIRMED
+        first, mode = self.estimator.k + 1, Mode.LOST if self._tracking.lost else Mode.UNCONFIRMED
         estimates = [dataclasses.replace(estimate, mode=mode) for estimate in self._replay(started)]
         for k, frame in self.estimator.log.keyframes.items():
             frame.mode = mode if k >= first else frame.mode
         return estimates
 
-    def _start(self, step: Step, prior: Belief, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+    def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
-        believed, _, decisions = self._weigh(k, step, sightings, prior)
-        self._suspicion.start(prior, believed)
+        believed, _, decisions = self._associate(k, step, sightings, prior)
+        self._landmark_faults.start(prior, believed)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
-        self._whereabouts.fixed(bool(believed))
+        self._tracking.record_fix(bool(believed))
         return self._estimate(step, belief, decisions)
 
-    def _advance(self, step: Step, readings: Readings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+    def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
         # 2. Weigh: the motion sources against each other, back to where they began to disagree; the sightings against
         # the prediction; and the motion against sightings that agree it is wrong
         with self.stopwatch("weigh"):
-            trust = self.trust.judge(step, readings)
+            trust = self.motion_faults.judge(step, readings)
             decisions = self._revise(k, trust)
             motions = self.sources.combine(readings, trust.off, trust.scale)
             if not motions:
                 motions = [self.sources.unknown(step, readings)]
                 self.rejections["motion.silent"] += 1
             predicted = self.estimator.predict(motions)
-            believed, refused, weighed = self._weigh(k, step, sightings, predicted)
+            believed, refused, weighed = self._associate(k, step, sightings, predicted)
             place = None
             if not believed:
-                contrary = [
-                    s.measurement for s in refused if not self.weights.quarantine.holds(s.measurement.landmark_id)
+                outliers = [
+                    s.measurement for s in refused if not self.association.exclusion.holds(s.measurement.landmark_id)
                 ]
-                place = self._whereabouts.search(step, motions, contrary, readings, predicted)
+                place = self._tracking.search(step, motions, outliers, readings, predicted)
             if place is not None:
-                if not self._whereabouts.holds_given:
+                if not self._tracking.keeps_initial_pose:
                     return self._found(step, place, [*decisions, *weighed])
-                self._whereabouts.defy(predicted, place)
+                self._tracking.record_conflict(predicted, place)
                 decisions.append(place_decision(k, step.stamp_ns, predicted, place, CONTRADICTS))
-            fit, doubt = None, None
-            if not believed and not self._whereabouts.holds_given:
-                fit = self.weights.overruled(refused, weighed, predicted)
+            fit, extra_cov = None, None
+            if not believed and not self._tracking.keeps_initial_pose:
+                fit = self.association.nearby_consensus(refused, weighed, predicted)
             if fit is not None:
-                doubt = np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2)
-                motions = [with_noise(m, doubt=doubt) for m in motions]
+                extra_cov = np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2)
+                motions = [with_noise(m, extra_cov=extra_cov) for m in motions]
                 self.rejections["motion.overruled"] += 1
                 predicted = self.estimator.predict(motions)
-                believed, refused, weighed = self._weigh(k, step, sightings, predicted)
+                believed, refused, weighed = self._associate(k, step, sightings, predicted)
         # 3. Fuse
         with self.stopwatch("fuse"):
             rebuilt = self.estimator.rebuilt
-            kept = () if self._whereabouts.holds_given else refused
+            kept = () if self._tracking.keeps_initial_pose else refused
             belief = self.estimator.update(step.stamp_ns, step.dt, motions, believed, kept, predicted)
         if self.estimator.rebuilt > rebuilt:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
             weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
-        accused = self._suspicion.look(k, step.stamp_ns, motions, believed, kept)
+        accused = self._landmark_faults.look(k, step.stamp_ns, motions, believed, kept)
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
-            self._whereabouts.fixed()
+            self._tracking.record_fix()
         fix = belief if believed else None
-        self.sources.went(readings, fix)
+        self.sources.commit(readings, fix)
         if accused:  # the pose was corrected: no motion leads from where it was thought to be
             self.sources.begin_segment()
-            self.trust.reset()
+            self.motion_faults.reset()
         frame = self.estimator.log.keyframes[k]
-        frame.readings, frame.off, frame.scale, frame.doubt = readings, trust.off, trust.scale, doubt
+        frame.readings, frame.off, frame.scale, frame.extra_cov = readings, trust.off, trust.scale, extra_cov
         decisions += motion_decisions(
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else "", trust.scale
         )
         return self._estimate(step, frame.belief, [*decisions, *weighed, *accused])
 
-    def _weigh(
-        self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: Belief
-    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
+    def _associate(
+        self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """What is believed and refused, with the decisions; nothing against a given first pose that holds."""
-        weighed = self.weights.weigh(k, step.stamp_ns, sightings, predicted)
-        believed, refused, decisions = self._whereabouts.hold(*weighed)
+        weighed = self.association.judge(k, step.stamp_ns, sightings, predicted)
+        believed, refused, decisions = self._tracking.gate_initial_pose(*weighed)
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held
-        if self._whereabouts.holds_given:
-            self.weights.quarantine.forget()  # they all seem moved from there
+        if self._tracking.keeps_initial_pose:
+            self.association.exclusion.forget()  # they all seem moved from there
         return believed, refused, decisions
 
-    def _revise(self, k: int, trust: Trust) -> list[Decision]:
+    def _revise(self, k: int, trust: FaultVerdict) -> list[Decision]:
         """Weigh the motion of the steps before this one anew, back to where the disagreement began.
 
         Wheels that are wrong are left out; before that is certain, covariances are scaled.
@@ -295,27 +297,27 @@ class Localizer:
         self.estimator.revise(changed)
         return decisions
 
-    def _found(self, step: Step, place: Belief, decisions: Sequence[Decision]) -> Estimate:
+    def _found(self, step: Step, place: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         """Go on from a place that nothing connects with where the robot was believed to be."""
         if self.estimator.belief is not None:
             told = place_decision(self.estimator.k + 1, step.stamp_ns, self.estimator.belief, place, "jump")
             decisions = [*decisions, told]
-            self._whereabouts.found(self.estimator.belief, place)
+            self._tracking.found(self.estimator.belief, place)
         self.rejections["motion.jump"] += 1
         self.sources.begin_segment()
-        self.trust.reset()
-        self.weights.forget_contradictions()
+        self.motion_faults.reset()
+        self.association.forget_contradictions()
         estimate = self._start(step, place, ())
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 
     def _get_lost(self) -> None:
-        self.weights.quarantine.forget()
-        self._whereabouts.get_lost()
+        self.association.exclusion.forget()
+        self._tracking.get_lost()
 
-    def _estimate(self, step: Step, belief: Belief, decisions: Sequence[Decision]) -> Estimate:
+    def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
-        frame.step, frame.mode = step, self._whereabouts.mode
-        frame.added_cov = self._by_clock(step) + self._whereabouts.kidnapped_cov(self.weights.contradicting, belief)
+        frame.step, frame.mode = step, self._tracking.mode
+        frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
 
@@ -328,9 +330,9 @@ class Localizer:
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
         return (
-            *self._whereabouts.notes,
-            *moved_notes(self.weights.quarantine.displacements),
-            *flag_notes(self.trust.flags),
+            *self._tracking.notes,
+            *moved_notes(self.association.exclusion.displacements),
+            *flag_notes(self.motion_faults.flags),
         )
 
     def _count_landmarks(self, decisions: Sequence[Decision]) -> None:

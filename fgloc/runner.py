@@ -12,15 +12,15 @@ from typing import Literal
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
+from fgloc.calibration.clock_trials import clock_note, clock_trials
 from fgloc.calibration.contradictions import contradictions
 from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
-from fgloc.clock_trials import clock_note, clock_trials
 from fgloc.config import Config, Role
 from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.errors import EstimatorError
-from fgloc.intake.topic_activity import Attendance
+from fgloc.intake.topic_activity import TopicActivity
 from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
@@ -33,11 +33,11 @@ from fgloc.types import (
     Decision,
     Estimate,
     Event,
-    Heard,
     ImageEvent,
     RunResult,
     SightingsEvent,
     Step,
+    TopicTimes,
     Trajectory,
     TruthEvent,
 )
@@ -160,7 +160,7 @@ def run(
 
 def _hints(recording: Recording, parts: Assembly, replay: _Replay) -> tuple[list[str], list[str]]:
     """What does not fit together: surely, and what of the clocks is still to be tried."""
-    hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.attendance.missing()]
+    hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.activity.missing()]
     untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
     if parts.detector is not None and not parts.localizer.counts["corners"]:
         hints = [*image_hints(recording, parts.detector)[0], *hints]
@@ -200,7 +200,7 @@ class _Replay:
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
         self.blind = True  # no image and no sighting was recorded, not even an unusable one
-        self.attendance = Attendance(roles)
+        self.activity = TopicActivity(roles)
         self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
@@ -215,7 +215,7 @@ class _Replay:
             found = detect_stream(self._gated(events), self._detector, self._image_rejections)
             gated = self._regated(self._sightings(found))
         for event in gated:
-            self.attendance.hear(event.topic, event.stamp_ns)
+            self.activity.record(event.topic, event.stamp_ns)
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
@@ -253,9 +253,9 @@ class _Replay:
         total.update(self._image_rejections)
         return total
 
-    def spans(self) -> dict[str, Heard]:
+    def spans(self) -> dict[str, TopicTimes]:
         """When each topic was heard, from the first estimate on."""
-        return self.attendance.spans(self.estimates[0].stamp_ns if self.estimates else 0)
+        return self.activity.spans(self.estimates[0].stamp_ns if self.estimates else 0)
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
@@ -271,7 +271,7 @@ class _Replay:
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)
-                self.attendance.present(passed.topic)
+                self.activity.present(passed.topic)
             elif passed is not None:
                 yield passed
 

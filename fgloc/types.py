@@ -291,7 +291,7 @@ class MotionMeasurement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Readings:
+class MotionReadings:
     """What each motion source says of one step, as if it were alone; None where it is silent."""
 
     wheels: MotionMeasurement | None = None
@@ -396,7 +396,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class TopicTimes:
     """When a topic was heard.
 
     ``times`` are in seconds from the first estimate; of very many only one in ``every`` is kept.
@@ -464,7 +464,7 @@ class RunResult:
     wall_s: float
     truth: Trajectory | None = None
     landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
-    spans: Mapping[str, Heard] = field(default_factory=dict)  # by topic
+    spans: Mapping[str, TopicTimes] = field(default_factory=dict)  # by topic
     source: Path | None = None
     found: InstallationFound | None = None
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.keyframing import Stepper
+from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -87,15 +87,15 @@ def image(t, data: bytes = b"\xff\xd8", compressed=True, width=0, height=0, step
     return ImageEvent(ns(t), ns(t), "/image", "cam", encoding, compressed, width, height, step, False, array)
 
 
-def stepper(lag_s: float = 10.0, gate: GateConfig | None = None, **keyframes) -> Stepper:
-    return Stepper(KeyframesConfig(**keyframes), gate or GateConfig(), lag_s)
+def stepper(lag_s: float = 10.0, gate: GateConfig | None = None, **keyframes) -> KeyframeBuilder:
+    return KeyframeBuilder(KeyframesConfig(**keyframes), gate or GateConfig(), lag_s)
 
 
 def in_order_of_receipt(*streams: Iterable[Event]) -> list[Event]:
     return sorted((e for stream in streams for e in stream), key=lambda e: e.received_ns)
 
 
-def run(target: Stepper, events: Iterable[Event]) -> list[Step]:
+def run(target: KeyframeBuilder, events: Iterable[Event]) -> list[Step]:
     """All steps of a recording."""
     return [step for event in events for step in target.push(event)] + target.flush()
 

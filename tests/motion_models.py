@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.motion import ModelCard
-from fgloc.motion.card import CHANNELS, FAMILIES
-from fgloc.motion.load import Tensors
+from fgloc.sensors.learned import ModelCard
+from fgloc.sensors.learned.card import CHANNELS, FAMILIES
+from fgloc.sensors.learned.load import Tensors
 
 _EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -11,8 +11,8 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import yaw_quaternion
-from fgloc.intake.keyframing import Stepper
-from fgloc.intake.validation import Gate
+from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
@@ -182,8 +182,8 @@ class Chain:
     """Gate, stepper and localizer, joined as the runner joins them."""
 
     def __init__(self, settings: Config, landmark_map: LandmarkMap | None, learned=None, keep_all=False) -> None:
-        self.gate = Gate(settings.gate, None if landmark_map is None else set(landmark_map.landmarks))
-        self.stepper = Stepper(settings.keyframes, settings.gate, settings.estimator.lag_s)
+        self.gate = EventValidator(settings.gate, None if landmark_map is None else set(landmark_map.landmarks))
+        self.stepper = KeyframeBuilder(settings.keyframes, settings.gate, settings.estimator.lag_s)
         self.wheels = WheelMotion(settings.wheels)
         markers = landmark_map is not None and any(m.size_m for m in landmark_map.landmarks.values())
         sensor = LandmarkSensor(settings, landmark_map, CAMERA if markers else None, None)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fgloc.se2 import rotate_cov, wrap_array
-from fgloc.types import Decision, Heard, Landmark, LandmarkMap, Mode, RunResult, Trajectory
+from fgloc.types import Decision, Landmark, LandmarkMap, Mode, RunResult, TopicTimes, Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -43,8 +43,8 @@ def figure_eight(seed=0, n=300, truth=True, modes=None):
             {0: _standing(0, 4.0, 0.0, np.pi), 7: Landmark(7, np.array([0.0, 2.6, 0.0]), np.eye(3), 0.0)}
         ),
         spans={
-            "/odom": Heard(np.arange(0.0, 30.0, 0.05), 600, 1, 0.05),
-            "/camera": Heard(np.r_[np.arange(0, 10, 0.1), np.arange(20, 30, 0.1)], 200, 1, 10.1),
+            "/odom": TopicTimes(np.arange(0.0, 30.0, 0.05), 600, 1, 0.05),
+            "/camera": TopicTimes(np.r_[np.arange(0, 10, 0.1), np.arange(20, 30, 0.1)], 200, 1, 10.1),
         },
         source=Path("first_run"),
         first_pose_s=0.4,

@@ -12,7 +12,7 @@ from fgloc.config import Config, WheelsConfig
 from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent
 from training.config import DataConfig
 from training.data import Run, make_run
-from training.heard import Heard
+from training.heard import TopicTimes
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
@@ -63,7 +63,7 @@ def sensing(seed: int, seconds: float = 60.0, bias: float = 0.0) -> Run:
     commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
     geometry = {"left_radius": RADIUS, "right_radius": RADIUS, "track": TRACK}
     config = Config(wheels=WheelsConfig(source="ticks", **geometry))
-    heard = Heard([*commands, *sensed(seed, seconds, bias)], config)
+    heard = TopicTimes([*commands, *sensed(seed, seconds, bias)], config)
     return make_run(f"run{seed}", heard, stamps, poses, 0.1, 2.0, DataConfig())
 
 

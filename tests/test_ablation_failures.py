@@ -11,7 +11,7 @@ from event_makers import command, corners, image, imu, joints, marker_pose, odom
 from pydantic import TypeAdapter, ValidationError
 
 from fgloc import se2
-from fgloc.ablation.failures import AnyFailure, Scene, generators, spoil
+from fgloc.ablation.failures import AnyFailure, Scene, corrupt, generators
 from fgloc.config import Config, WheelsConfig
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.images import decode
@@ -283,7 +283,7 @@ def test_moved_marker_moves_the_map_by_the_distance():
     moved = failure.spoil_map(MAP, at).landmarks
     shifts = {i: np.linalg.norm(moved[i].position - MAP.landmarks[i].position) for i in MAP.landmarks}
     assert sorted(round(s, 9) for s in shifts.values()) == [0.0, 0.0, 0.0, 0.4, 0.4]
-    assert at.touched["moved_marker"] == 2
+    assert at.affected["moved_marker"] == 2
     for i, shift in shifts.items():
         turned = moved[i].rotation.T @ MAP.landmarks[i].rotation
         assert math.acos(np.clip((np.trace(turned) - 1) / 2, -1, 1)) == pytest.approx(0.5 if shift else 0.0, abs=1e-7)
@@ -387,8 +387,8 @@ def test_odometry_reset_counts_from_zero():
 
 def test_nan_wheels():
     after = apply("wheel_nan", driving(), when={"share": 0.5})
-    spoiled = [e for e in of(OdometryEvent, after) if np.isnan(e.linear).all() and np.isnan(e.position).all()]
-    assert 30 < len(spoiled) < 70
+    corrupted = [e for e in of(OdometryEvent, after) if np.isnan(e.linear).all() and np.isnan(e.position).all()]
+    assert 30 < len(corrupted) < 70
     assert 30 < sum(np.isnan(e.position).all() for e in of(JointsEvent, after)) < 70
 
 
@@ -459,8 +459,8 @@ def test_failures_compose_and_draw_independently():
     def run(failures, seed, first=0):
         rngs = generators(2, seed)[first:]
         scenes = [Scene(0, 10.0, Config(), tuple(MAP.landmarks), rng) for rng in rngs]
-        events = spoil(failures, "recorded", iter(driving()), scenes)
-        return list(spoil(failures, "sightings", events, scenes)), scenes
+        events = corrupt(failures, "recorded", iter(driving()), scenes)
+        return list(corrupt(failures, "sightings", events, scenes)), scenes
 
     both, scenes = run(chain, 3)
     alone, _ = run(chain[1:], 3, first=1)
@@ -468,4 +468,4 @@ def test_failures_compose_and_draw_independently():
     assert len(of(CommandEvent, alone)) == 100
     ids = [[s.landmark_id for e in of(RangeBearingEvent, r) for s in e.sightings] for r in (both, alone)]
     assert ids[0] == ids[1]
-    assert scenes[0].touched["dropout"] == 100 - len(of(CommandEvent, both))
+    assert scenes[0].affected["dropout"] == 100 - len(of(CommandEvent, both))

@@ -74,10 +74,10 @@ def made(bag):
                 if variant == "full" and error is None:
                     record = Record(key=key, outcome="refused", error="EstimatorError: <no> pose", cost=COST)
                 else:
-                    touched = {"dropout": 5} if failure == "blind" else {}
+                    affected = {"dropout": 5} if failure == "blind" else {}
                     track = {"estimate": [(0, 0), (1, error or 0)], "truth": [(0, 0), (1, 0)]}
                     figures = {"ate_mean_m": error if variant == "full" else 0.5, "coverage": {"3": 0.99}}
-                    record = Record(key=key, outcome="done", figures=figures, touched=touched, track=track, cost=COST)
+                    record = Record(key=key, outcome="done", figures=figures, affected=affected, track=track, cost=COST)
                 records[key] = record
     return jobs, records
 

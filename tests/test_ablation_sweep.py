@@ -101,12 +101,12 @@ def test_sweep_answers_what_a_failure_costs(folder, swept):
     by_cell = {(j.cell.variant, j.cell.failure, j.cell.severity): records[j.key] for j in jobs_of(folder)}
     assert all(r.outcome == "done" for r in records.values())
     assert by_cell["full", "none", None].figures["ate_mean_m"] < 0.1
-    assert by_cell["full", "blind", 3.0].touched == {"dropout": 12}
+    assert by_cell["full", "blind", 3.0].affected == {"dropout": 12}
     assert by_cell["full", "blind", 3.0].modes["DEAD_RECKONING"] > 0.0
     assert by_cell["full", "dead", None].figures["ate_mean_m"] > by_cell["full", "none", None].figures["ate_mean_m"]
     alone = by_cell["wheels alone", "none", None]
     assert alone.figures["factors"] == {"prior": 1, "wheels": alone.figures["keyframes"] - 1}
-    assert by_cell["wheels alone", "blind", 1.0].touched == {}  # it is blind anyway: the report says so
+    assert by_cell["wheels alone", "blind", 1.0].affected == {}  # it is blind anyway: the report says so
     assert len(alone.track.estimate) == len(alone.track.truth) > 20
 
 

@@ -13,8 +13,8 @@ from datasets.bag import BagWriter
 from fgloc.assembly import assemble, given_pose
 from fgloc.config import Config, RecordingConfig
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
-from fgloc.motion.load import save_model
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.learned.load import save_model
 
 START_NS = 1_700_000_000_000_000_000
 K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]

@@ -21,8 +21,9 @@ from benchmarks.mechanisms_report import report, without_effect
 from benchmarks.mechanisms_rows import Scope, over_before, wanted
 from benchmarks.mechanisms_runs import file_name, named, outcome
 from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
-from fgloc.graph import gating, pose_fit
-from fgloc.graph.gating import Weights
+from fgloc.relocalization import pose_fit
+from fgloc.robust import association
+from fgloc.robust.association import Association
 from fgloc.types import LandmarkMap
 
 SOURCE = '''
@@ -94,16 +95,16 @@ def test_names_are_unique_and_modules_exist():
 
 
 def test_probes_watch_what_is_there_and_put_it_back():
-    real = Weights._agreed
+    real = Association._agreed
     with watched(MECHANISMS) as counts:
-        assert Weights._agreed is not real
-    assert Weights._agreed is real
+        assert Association._agreed is not real
+    assert Association._agreed is real
     assert not counts
 
 
 def test_a_switch_of_what_is_gone_says_so():
     with pytest.raises(AttributeError, match="delete its row"):
-        Switch("fgloc.graph.gating:Weights._never_there", Returns(None)).place()
+        Switch("fgloc.robust.association:Association._never_there", Returns(None)).place()
 
 
 def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():
@@ -159,7 +160,7 @@ def test_several_at_once_are_all_off_and_have_one_file():
     both = named("gate+fit_kernel")
     with both.off():
         assert pose_fit.cauchy_k(None, None) > 1e3
-        assert gating.chi2_bound(0.99, 2) == math.inf
+        assert association.chi2_bound(0.99, 2) == math.inf
     name = file_name(Cell(3, "none", both.name))
     assert "together" in name
     assert name != file_name(Cell(3, "none", "gate+misread_ids"))

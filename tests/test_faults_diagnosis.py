@@ -32,8 +32,8 @@ from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
-from fgloc.intake.keyframing import Stepper
-from fgloc.intake.topic_activity import Attendance
+from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.topic_activity import TopicActivity
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import find_beside, run
 from fgloc.sensors.maps import write_map
@@ -119,7 +119,7 @@ def diagnose(made, landmark_map, camera=None, settings=None, place=None) -> tupl
     """Steps of these events, watched by a diagnosis; what it says."""
     settings = settings or config()
     wheels = WheelMotion(settings.wheels)
-    stepper = Stepper(settings.keyframes, settings.gate, settings.estimator.lag_s)
+    stepper = KeyframeBuilder(settings.keyframes, settings.gate, settings.estimator.lag_s)
     seen_by = "sightings" if camera is None else "image"
     diagnosis = Diagnosis(settings, landmark_map, camera, place, seen_by, np.array([0.0, 0.0, 1.0]))
     for step in [step for event in made for step in stepper.push(event)] + stepper.flush():
@@ -329,13 +329,13 @@ def test_fault_19_and_52_are_among_the_notes_of_a_run(tmp_path):
 
 
 def test_fault_69_topics_that_never_speak_are_named():
-    attendance = Attendance({"odometry": "/odom", "image": "/camera/image", "truth": "/truth"})
-    attendance.hear("/odom", START)
+    attendance = TopicActivity({"odometry": "/odom", "image": "/camera/image", "truth": "/truth"})
+    attendance.record("/odom", START)
     attendance.present("/truth")
     (note,) = attendance.missing()
     assert note.startswith("/camera/image (image): nothing usable was heard")
     assert "quality of service" in note
-    attendance.hear("/camera/image", START)
+    attendance.record("/camera/image", START)
     assert attendance.missing() == ()
 
 
@@ -348,10 +348,10 @@ def test_fault_69_a_topic_recorded_without_messages_is_named():
 
 
 def test_fault_24_attendance_stays_bounded_and_keeps_count():
-    attendance = Attendance({})
+    attendance = TopicActivity({})
     for i in range(250_000):
-        attendance.hear("/imu", START + i * 10_000_000)
-    attendance.hear("/imu", START + 250_000 * 10_000_000 + 5_000_000_000)
+        attendance.record("/imu", START + i * 10_000_000)
+    attendance.record("/imu", START + 250_000 * 10_000_000 + 5_000_000_000)
     heard = attendance.spans(START)["/imu"]
     assert len(heard.times) <= 100_000
     assert heard.count == 250_001

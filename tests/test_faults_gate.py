@@ -23,13 +23,13 @@ from event_makers import (
 from fgloc import se2
 from fgloc.config import GateConfig, WheelsConfig
 from fgloc.errors import ConfigError
-from fgloc.intake.validation import Gate
+from fgloc.intake.validation import EventValidator
 from fgloc.sensors.wheels import WheelMotion
 
 
 @pytest.fixture
 def gate():
-    return Gate(GateConfig(), known_ids={0, 1, 2})
+    return EventValidator(GateConfig(), known_ids={0, 1, 2})
 
 
 def total(steps, config=None):
@@ -427,14 +427,14 @@ def test_fault_50_id_not_in_the_map(gate):
     assert gate.check(range_bearing(1.0, (99, 1.0, 0.0))) is None
     assert gate.rejections == {"sightings.unknown_id": 2}
     assert any(note.endswith(": 17, 99") for note in gate.notes)
-    free = Gate(GateConfig())  # no map: every id may turn out to be a landmark
+    free = EventValidator(GateConfig())  # no map: every id may turn out to be a landmark
     assert free.check(corners(1.0, 17)) is not None
 
 
 def test_fault_54_id_zero_works_like_any_other(gate):
     for event in (corners(1.0, 0), range_bearing(1.0, (0, 1.0, 0.0)), marker_pose(1.0, 0)):
         assert gate.check(event) is event
-    without = Gate(GateConfig(), known_ids={1})
+    without = EventValidator(GateConfig(), known_ids={1})
     assert without.check(corners(1.0, 0)) is None
 
 

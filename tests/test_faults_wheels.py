@@ -13,11 +13,11 @@ from robot_world import CAMERA, SPEED, START_NS, TURN, Chain, World, config, nee
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.localizer import Localizer
-from fgloc.motion import load_model, save_model
-from fgloc.motion.card import Kinematics
-from fgloc.motion.source import LearnedMotion
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.card import Kinematics
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.types import ImuEvent, OdometryEvent
 
 TRACK = 0.3

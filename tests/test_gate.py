@@ -16,13 +16,13 @@ from event_makers import (
 )
 
 from fgloc.config import GateConfig
-from fgloc.intake.validation import Gate
+from fgloc.intake.validation import EventValidator
 from fgloc.types import CameraInfoEvent, TransformEvent, TruthEvent
 
 
 @pytest.fixture
 def gate():
-    return Gate(GateConfig())
+    return EventValidator(GateConfig())
 
 
 GOOD = [

@@ -16,12 +16,12 @@ from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.factors import LandmarkFactors, gaussian, landmark_key, motion_factor, pose_key
-from fgloc.graph.gating import Weights
 from fgloc.graph.installation import Installation
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.joint import fuse
-from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog
+from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 from fgloc.graph.observation import cartesian
+from fgloc.robust.association import Association
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import (
     Camera,
@@ -239,14 +239,14 @@ def replay(seed: int, kind: str = "fixed_lag", lag_s: float = 10.0, **kwargs):
     landmarks, rows = drive(seed, **kwargs)
     factors = LandmarkFactors(landmarks)
     estimator = IncrementalEstimator(EstimatorConfig(kind=kind, lag_s=lag_s), factors, keep_all=True)
-    beliefs = [estimator.start(0, Belief(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4])))]
+    beliefs = [estimator.start(0, PoseWithCovariance(np.zeros(3), np.diag([1e-4, 1e-4, 1e-4])))]
     for k, (_, motions, sightings) in enumerate(rows[1:], start=1):
         held = [factors.sighting(k, m, None) for m in sightings]
         beliefs.append(estimator.update(k * 10**8, 0.1, motions, held))
     return estimator, factors, beliefs, [truth for truth, _, _ in rows]
 
 
-def nees(belief: Belief, truth: np.ndarray) -> float:
+def nees(belief: PoseWithCovariance, truth: np.ndarray) -> float:
     error = se2.log(se2.between(belief.pose, truth))
     return float(error @ np.linalg.solve(belief.cov, error))
 
@@ -281,7 +281,7 @@ def test_nees_is_consistent_over_seeds():
         estimator, factors, beliefs, truths = replay(seed)
         result = BatchSmoother(estimator.log, factors, BatchConfig(), 0.999999).result()
         values["online"].append(nees(beliefs[-1], truths[-1]))
-        values["batch"].append(nees(Belief(result.poses[75], result.covs[75]), truths[75]))
+        values["batch"].append(nees(PoseWithCovariance(result.poses[75], result.covs[75]), truths[75]))
     low, high = chi2.ppf([0.001, 0.999], 3 * 12)
     for name, sample in values.items():
         assert low < sum(sample) < high, name
@@ -318,7 +318,7 @@ def test_fault_67_an_exception_in_gtsam_rebuilds_the_window_without_the_offender
     walls = LandmarkFactors(wall_map())
     seen = corner_sighting(np.zeros(3), wall_map().landmarks[0])
     estimator = IncrementalEstimator(EstimatorConfig(), walls)
-    estimator.start(0, Belief(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
+    estimator.start(0, PoseWithCovariance(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)
     for k in range(1, 10):
         estimator.update(k * 10**8, 0.1, [motion])
@@ -339,7 +339,7 @@ def test_a_first_pose_that_is_hardly_known_is_no_reason_to_drop_sightings(kind, 
     landmarks = wall_map()
     walls = LandmarkFactors(landmarks, Installation({"wheels.radius": installed}))
     estimator = IncrementalEstimator(EstimatorConfig(kind=kind, lag_s=1.0), walls)
-    estimator.start(0, Belief(np.zeros(3), np.diag([100.0, 100.0, 10.0])))
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.diag([100.0, 100.0, 10.0])))
     by = {"wheels.radius": (np.array([0.05, 0.0, 0.0]), 0.0)} if installed else {}
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.05, 0.0, 0.0]), np.diag([7e-5, 1e-6, 1e-4]), by)
     for k in range(1, 40):
@@ -359,7 +359,7 @@ def test_a_marker_behind_the_camera_says_nothing(kind):
     walls = LandmarkFactors(wall_map())
     seen = corner_sighting(np.zeros(3), wall_map().landmarks[0])
     estimator = kind(EstimatorConfig(), walls)
-    estimator.start(0, Belief(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
+    estimator.start(0, PoseWithCovariance(np.array([6.0, 0.0, 0.0]), np.eye(3) * 1e-4))
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)
     belief = estimator.update(10**8, 0.1, [motion], [walls.sighting(1, seen, 3.0)])
     assert estimator.rebuilt == 0
@@ -374,9 +374,9 @@ def test_a_marker_right_in_front_of_the_camera_is_no_reason_to_fail(depth):
     seen = replace(corner_sighting(np.zeros(3), wall_map().landmarks[0]), jitter_s=0.01, twist=np.array([0.5, 0, 0.5]))
     pose = np.array([4.0 - 0.1 - depth, 0.2, 0.0])
     estimator = IncrementalEstimator(EstimatorConfig(), walls)
-    estimator.start(0, Belief(pose, np.eye(3) * 1e-2))
+    estimator.start(0, PoseWithCovariance(pose, np.eye(3) * 1e-2))
     predicted = estimator.predict([MotionMeasurement("wheels", 0, 1, np.zeros(3), np.eye(3) * 1e-6)])
-    believed, refused, _ = Weights(Config(), walls).weigh(1, 10**8, [seen], predicted)
+    believed, refused, _ = Association(Config(), walls).judge(1, 10**8, [seen], predicted)
     assert not believed
     assert len(refused) == 1
     stay = MotionMeasurement("wheels", 0, 1, np.zeros(3), np.eye(3) * 1e-6)
@@ -395,9 +395,9 @@ def after_a_slip(*seen) -> tuple[np.ndarray, list[str]]:
     """Where the chain puts a robot at the origin that it believed to be 6 cm and 0.03 rad off, and its decisions."""
     walls = LandmarkFactors(wall_map())
     estimator = IncrementalEstimator(EstimatorConfig(), walls)
-    estimator.start(0, Belief(np.array([-0.1, 0.0, 0.0]), np.eye(3) * 1e-8))
+    estimator.start(0, PoseWithCovariance(np.array([-0.1, 0.0, 0.0]), np.eye(3) * 1e-8))
     slipped = MotionMeasurement("wheels", 0, 10**8, np.array([0.16, 0.0, 0.03]), np.diag([0.06, 0.06, 0.03]) ** 2)
-    believed, _, decisions = Weights(Config(), walls).weigh(1, 10**8, seen, estimator.predict([slipped]))
+    believed, _, decisions = Association(Config(), walls).judge(1, 10**8, seen, estimator.predict([slipped]))
     return estimator.update(10**8, 0.1, [slipped], believed).pose, [d.reason for d in decisions]
 
 
@@ -431,9 +431,9 @@ def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
     motion = MotionMeasurement("wheels", 0, 1, np.array([0.02, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
     offender = walls.sighting(31, corner_sighting(np.zeros(3), landmarks.landmarks[0]), 3.0)
 
-    def filtered(offend: bool) -> Belief:
+    def filtered(offend: bool) -> PoseWithCovariance:
         estimator = IncrementalEstimator(EstimatorConfig(lag_s=1.0), walls)
-        estimator.start(0, Belief(np.zeros(3), np.eye(3) * 1e-2))
+        estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-2))
         for k in range(1, 31):
             seen = point_sighting(np.array([0.02 * k, 0.0, 0.0]), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
             estimator.update(k * 10**8, 0.1, [motion], [walls.sighting(k, seen, None)])
@@ -452,11 +452,11 @@ def test_a_rebuilt_window_counts_the_sightings_of_its_oldest_keyframe_once():
 def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(kind):
     """The beliefs before the correction are still in the log, and still wrong."""
     estimator = kind(EstimatorConfig(), LandmarkFactors(wall_map()))
-    estimator.start(0, Belief(np.zeros(3), np.eye(3) * 1e-4))
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4))
     step = [MotionMeasurement("wheels", 0, 10**8, np.array([0.1, 0.0, 0.0]), np.eye(3) * 1e-4)]
     for k in range(1, 4):
         estimator.update(k * 10**8, 0.1, step)
-    estimator.correct(Belief(np.array([0.3, 0.5, 0.0]), np.eye(3) * 1e-4), 7)
+    estimator.correct(PoseWithCovariance(np.array([0.3, 0.5, 0.0]), np.eye(3) * 1e-4), 7)
     for k in range(4, 7):
         estimator.update(k * 10**8, 0.1, step)
     estimator.revise({2: step, 3: step})
@@ -467,25 +467,25 @@ def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(k
 def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
     landmarks = wall_map()
     factors = LandmarkFactors(landmarks)
-    weights = Weights(Config(), factors)
+    weights = Association(Config(), factors)
     truth = np.zeros(3)
     m = corner_sighting(np.array([0.0, 0.6, 0.1]), landmarks.landmarks[0])
-    sure = Belief(truth, np.diag([1e-4, 1e-4, 1e-4]))
-    believed, refused, decisions = weights.weigh(0, 0, [m], sure)
+    sure = PoseWithCovariance(truth, np.diag([1e-4, 1e-4, 1e-4]))
+    believed, refused, decisions = weights.judge(0, 0, [m], sure)
     assert not believed
     assert [d.reason for d in decisions] == ["gate"]
     assert weights.rejections["sightings.gate"] == 1
-    unsure = Belief(truth, np.diag([0.5, 0.5, 0.1]))
-    believed, refused, _ = weights.weigh(1, 0, [m], unsure)
+    unsure = PoseWithCovariance(truth, np.diag([0.5, 0.5, 0.1]))
+    believed, refused, _ = weights.judge(1, 0, [m], unsure)
     assert len(believed) == 1
     assert not refused
 
 
 def test_weights_refuse_markers_behind_the_camera():
     landmarks = wall_map()
-    weights = Weights(Config(), LandmarkFactors(landmarks))
+    weights = Association(Config(), LandmarkFactors(landmarks))
     m = corner_sighting(np.zeros(3), landmarks.landmarks[0])
-    _, refused, decisions = weights.weigh(0, 0, [m], Belief(np.array([6.0, 0.0, 0.0]), np.eye(3)))
+    _, refused, decisions = weights.judge(0, 0, [m], PoseWithCovariance(np.array([6.0, 0.0, 0.0]), np.eye(3)))
     assert len(refused) == 1
     assert decisions[0].reason == "behind_camera"
 
@@ -493,12 +493,12 @@ def test_weights_refuse_markers_behind_the_camera():
 def test_repeated_sightings_share_their_information():
     config = Config.model_validate({"landmarks": {"repeat_s": 1.0}})
     landmarks = wall_map()
-    weights = Weights(config, LandmarkFactors(landmarks))
-    belief = Belief(np.zeros(3), np.eye(3) * 1e-2)
+    weights = Association(config, LandmarkFactors(landmarks))
+    belief = PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-2)
     first = point_sighting(np.zeros(3), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
     later = RangeBearingMeasurement(250_000_000, 9, first.range_m, first.bearing_rad, first.cov)
-    a, _, _ = weights.weigh(0, 0, [first], belief)
-    b, _, decisions = weights.weigh(1, 250_000_000, [later], belief)
+    a, _, _ = weights.judge(0, 0, [first], belief)
+    b, _, decisions = weights.judge(1, 250_000_000, [later], belief)
     assert np.allclose(a[0].measurement.cov, first.cov)
     assert np.allclose(b[0].measurement.cov, 4.0 * first.cov)
     assert decisions[0].weight == pytest.approx(0.25)
@@ -510,9 +510,9 @@ def test_fault_68_a_batch_of_many_poses_does_not_overflow_the_stack():
     factors = LandmarkFactors(wall_map())
     log, pose, cov = MeasurementLog(10.0, keep_all=True), np.zeros(3), np.diag([1e-6, 1e-6, 1e-6])
     for k in range(n):
-        prior = Belief(pose, np.eye(3) * 1e-4) if k == 0 else None
+        prior = PoseWithCovariance(pose, np.eye(3) * 1e-4) if k == 0 else None
         motions = (MotionMeasurement("wheels", k - 1, k, motion, cov),) if k else ()
-        log.append(Keyframe(k, k * 10**8, 0.1 * k, Belief(pose, np.eye(3)), prior, motions))
+        log.append(Keyframe(k, k * 10**8, 0.1 * k, PoseWithCovariance(pose, np.eye(3)), prior, motions))
         pose = se2.compose(pose, motion)
     result = BatchSmoother(log, factors, BatchConfig(), 0.9999).result()
     assert len(result.covs) == n

@@ -10,7 +10,7 @@ from robot_world import CAMERA, config, polar, project, standing
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.relocalization.global_search import Initializer, Start
+from fgloc.relocalization.global_search import GlobalSearch, InitialPose
 from fgloc.types import (
     CornerMeasurement,
     Landmark,
@@ -48,14 +48,14 @@ class Search:
     """An initializer fed with steps of equal motion."""
 
     def __init__(self, the_map: LandmarkMap, **sections) -> None:
-        self.initializer = Initializer(config(**sections), the_map, LandmarkFactors(the_map))
+        self.initializer = GlobalSearch(config(**sections), the_map, LandmarkFactors(the_map))
         self.pose, self.stamp_ns = TRUTH, 0
 
     @property
     def next_pose(self):
         return se2.compose(self.pose, MOTION) if self.stamp_ns else self.pose
 
-    def step(self, *sightings) -> Start | None:
+    def step(self, *sightings) -> InitialPose | None:
         """``sightings`` are functions of the true pose."""
         self.pose = self.next_pose
         self.stamp_ns += STEP_NS
@@ -64,7 +64,7 @@ class Search:
         return self.initializer.collect(step, [motion], [make(self.pose) for make in sightings])
 
 
-def close(start: Start | None, pose, metres: float, radians: float) -> bool:
+def close(start: InitialPose | None, pose, metres: float, radians: float) -> bool:
     if start is None:
         return False
     x, y, yaw = np.abs(se2.log(se2.between(start.newest.pose, pose)))
@@ -220,7 +220,7 @@ def test_fault_51_beacons_that_contradict_one_another_begin_no_run():
     search = Search(landmark_map(a, b, c, d, e))
     start = search.step(*seen, lambda pose: seen_point(pose, d), lambda pose: seen_point(pose, e))
     assert close(start, search.pose, 0.02, 0.02)
-    assert {landmark_id for _, landmark_id in start.contrary} == {2}
+    assert {landmark_id for _, landmark_id in start.outliers} == {2}
 
 
 def test_a_new_search_waits_as_long_as_the_first_did():

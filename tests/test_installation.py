@@ -26,15 +26,15 @@ from robot_world import (
 
 from fgloc import se2
 from fgloc.config import BatchConfig, Config, EstimatorConfig, GyroConfig
-from fgloc.fusion.motion import MotionSources
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationBelief, installation_of
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.localizer import Localizer
+from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
@@ -116,11 +116,11 @@ def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> RangeBearingMeasureme
     return RangeBearingMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
 
 
-def correlated(rng, n: int) -> tuple[Belief, InstallationBelief]:
+def correlated(rng, n: int) -> tuple[PoseWithCovariance, InstallationBelief]:
     A = rng.normal(size=(3 + n, 3 + n)) * 0.003
     P = A @ A.T + 1e-6 * np.eye(3 + n)
     known = InstallationBelief(rng.normal(0.0, 0.005, n), P[3:, 3:])
-    return Belief(np.array([0.3, -0.2, 0.4]), P[:3, :3], P[:3, 3:], known), known
+    return PoseWithCovariance(np.array([0.3, -0.2, 0.4]), P[:3, :3], P[:3, 3:], known), known
 
 
 def test_prediction_is_that_of_the_dense_joint_gaussian():
@@ -189,7 +189,7 @@ def test_correction_is_that_of_the_dense_joint_gaussian():
 def test_a_correction_that_does_not_settle_says_so():
     factors = LandmarkFactors(POINTS, Installation({}))
     m = replace(seen_from(np.zeros(3), 0, np.random.default_rng(0)), range_m=math.nan)
-    belief = Belief(np.zeros(3), np.eye(3))
+    belief = PoseWithCovariance(np.zeros(3), np.eye(3))
     assert correct(belief, InstallationBelief(np.zeros(0), np.zeros((0, 0))), [m], factors) is None
 
 
@@ -206,7 +206,7 @@ def test_online_with_an_installation_equals_the_batch(kind, lag_s):
     truth_theta = rng.normal(0.0, SIGMAS[:4])
     made = ExtendedKalmanFilter if kind == "ekf" else IncrementalEstimator
     estimator = made(EstimatorConfig(kind=kind, lag_s=lag_s), factors, keep_all=True)
-    estimator.start(0, Belief(np.zeros(3), np.eye(3) * 1e-6))
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-6))
     truth, step, Q = np.zeros(3), np.array([0.04, 0.0, 0.02]), np.diag([0.002, 0.001, 0.002]) ** 2
     by_radius = se2.log(step)
     for k in range(1, 60):
@@ -256,7 +256,7 @@ def readings_with(theta: dict[str, float], later_s: float = 0.0, **gains):
     installation = Installation(dict.fromkeys(theta, 0.01))
     factors = LandmarkFactors(None, installation)
     factors.believed = replace(factors.believed, mean=np.array(list(theta.values())))
-    some = MotionSources(settings, WheelMotion(settings.wheels), gyro=Gyro(GyroConfig()), factors=factors)
+    some = MotionFusion(settings, WheelMotion(settings.wheels), gyro=Gyro(GyroConfig()), factors=factors)
     some.read(turning(0, later_s=later_s))
     return some.read(turning(1, later_s=later_s))
 
@@ -407,7 +407,7 @@ def test_a_marker_that_hangs_elsewhere_by_centimetres_is_found():
     for name, truth in (("map.7.x_m", 0.012), ("map.7.y_m", -0.01)):
         pairs, prior, chain, _ = found_in(world, settings, name, gyro=False)
         check_found(pairs, truth, prior)
-    assert not chain.localizer.weights.quarantine.displacements
+    assert not chain.localizer.association.exclusion.displacements
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -17,8 +17,8 @@ from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
-BASE = {"types", "errors", "config", "frames", "se2", "selfcal"}
-PARTS = {"recording", "sensors", "motion", "graph"}
+BASE = {"types", "errors", "config", "frames", "se2", "stats"}
+PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
 ONLY = {  # the one place that may import a library
     "rosbags": "recording",

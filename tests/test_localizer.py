@@ -29,9 +29,9 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.config import MotionConfig
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.pose_fit import joint_fit
-from fgloc.motion import load_model, save_model
-from fgloc.motion.source import LearnedMotion
+from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import CornerMeasurement, LandmarkMap, Mode
 
@@ -120,7 +120,7 @@ def test_an_unknown_map_is_estimated_up_to_the_first_pose():
     errors = [position_error(e, se2.between(start, world.truth(e.stamp_ns))) for e in estimates]
     assert np.mean(errors) < 0.1
     sightings = chain.localizer.counts["range_bearing"]
-    early = chain.localizer.weights.rejections["sightings.seen_too_seldom"]
+    early = chain.localizer.association.rejections["sightings.seen_too_seldom"]
     assert early == (settings.landmarks.min_sightings - 1) * len(truth)
     assert sightings + early == 2 * 18 * 10
 
@@ -254,10 +254,10 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
-    counts = chain.localizer.weights.rejections
+    counts = chain.localizer.association.rejections
     assert sum(counts[f"sightings.{why}"] for why in ("gate", "quarantined", "contradicts_start")) == len(refused)
     assert counts["sightings.quarantined"] > 40
-    moved_by = chain.localizer.weights.quarantine.displacements
+    moved_by = chain.localizer.association.exclusion.displacements
     assert list(moved_by) == [2]
     assert np.allclose(moved_by[2], (0.0, 0.4), atol=0.05)
     assert any("marker 2 does not stand where" in note for note in chain.localizer.notes)

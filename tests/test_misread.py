@@ -10,8 +10,8 @@ import pytest
 from robot_world import CAMERA, SIGMA_PX, Chain, World, config, position_error, project, room, standing
 
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.gating import Weights
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.robust.association import Association
 from fgloc.types import CornerMeasurement, CornersEvent, Landmark, LandmarkMap
 
 SHARE = 0.4
@@ -56,7 +56,7 @@ def test_a_misread_marker_is_used_as_what_hangs_there():
     told = [d for e in estimates for d in e.decisions]
     wrong = [d for d in told if d.reason == "misread"]
     assert len(wrong) > 100
-    assert chain.localizer.weights.rejections["sightings.misread"] == len(wrong)
+    assert chain.localizer.association.rejections["sightings.misread"] == len(wrong)
     believed = {(d.stamp_ns, d.landmark_id) for d in told if d.kind == "corners" and not d.reason}
     hung = {(stamp, i) for (stamp, _), were in truth.items() for i in were}
     assert len(believed - hung) <= 0.01 * len(believed)  # what is believed was seen
@@ -75,8 +75,8 @@ def test_without_another_that_is_believed_it_may_be_the_robot_that_is_elsewhere(
     """A robot that was carried on by the spacing of equal markers must not take each of them for the next one."""
     row = LandmarkMap({i: hanging(i, -1.2 + 0.6 * i) for i in range(5)}, "DICT_4X4_50")
     seen = [measured(row, 1, read=4), measured(row, 2)] if believed else [measured(row, i, read=i + 1) for i in (1, 2)]
-    weights = Weights(config(), LandmarkFactors(row))
-    sightings, refused, decisions = weights.weigh(1, 10**9, seen, Belief(np.zeros(3), np.eye(3) * 1e-6))
+    weights = Association(config(), LandmarkFactors(row))
+    sightings, refused, decisions = weights.judge(1, 10**9, seen, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-6))
     assert sorted(s.measurement.landmark_id for s in sightings) == ([1, 2] if believed else [])
     assert [d.reason for d in decisions if d.landmark_id in (3, 4)].count("misread") == believed
     assert len(refused) == (0 if believed else 2)
@@ -86,7 +86,7 @@ def test_of_two_that_hang_there_neither_is_taken():
     twins = [hanging(1, -0.4), hanging(2, 0.2), hanging(3, -0.401), hanging(4, 1.2)]
     row = LandmarkMap({m.landmark_id: m for m in twins}, "DICT_4X4_50")
     seen = [measured(row, 2), measured(row, 1, read=4)]
-    weights = Weights(config(), LandmarkFactors(row))
-    sightings, _, decisions = weights.weigh(1, 10**9, seen, Belief(np.zeros(3), np.eye(3) * 1e-6))
+    weights = Association(config(), LandmarkFactors(row))
+    sightings, _, decisions = weights.judge(1, 10**9, seen, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-6))
     assert [s.measurement.landmark_id for s in sightings] == [2]
     assert [d.reason for d in decisions] == ["", "gate"]

@@ -13,7 +13,7 @@ from motion_models import make_card, make_tensors
 from fgloc import se2
 from fgloc.config import MotionConfig, NoiseDensity
 from fgloc.errors import ModelError
-from fgloc.motion import (
+from fgloc.sensors.learned import (
     DisplacementModel,
     LearnedMotion,
     MotionModel,
@@ -22,9 +22,9 @@ from fgloc.motion import (
     load_model,
     save_model,
 )
-from fgloc.motion.card import Kind
-from fgloc.motion.commands import CommandTrack
-from fgloc.motion.forms import noise_density
+from fgloc.sensors.learned.card import Kind
+from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.forms import noise_density
 from fgloc.types import CommandEvent, Step
 
 SECOND = 1_000_000_000
@@ -103,8 +103,8 @@ def test_ensemble_is_the_mean_and_doubts_where_its_members_differ(rng: np.random
     together = load_model(path).predict(known(events, start), start, start + SECOND // 10, None)
     assert together is not None
     np.testing.assert_allclose(se2.log(together.motion) / 0.1, np.mean(twists, axis=0), atol=1e-6)
-    doubt = 2.0 * np.var(twists, axis=0)
-    np.testing.assert_allclose(np.diag(together.cov) / 0.1, np.mean(variances, axis=0) + doubt, rtol=1e-4)
+    extra_cov = 2.0 * np.var(twists, axis=0)
+    np.testing.assert_allclose(np.diag(together.cov) / 0.1, np.mean(variances, axis=0) + extra_cov, rtol=1e-4)
 
 
 def test_velocity_without_network_is_a_first_order_lag(rng: np.random.Generator, tmp_path: Path) -> None:

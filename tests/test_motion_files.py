@@ -15,7 +15,7 @@ from motion_models import make_card, make_tensors
 from safetensors.numpy import save_file
 
 from fgloc.errors import ModelError
-from fgloc.motion import ModelCard, load_model, save_model
+from fgloc.sensors.learned import ModelCard, load_model, save_model
 
 
 @pytest.fixture

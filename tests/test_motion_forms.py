@@ -9,8 +9,8 @@ import pytest
 import torch
 from synthetic_robot import synthetic
 
-from fgloc.motion import load_model
-from fgloc.motion.card import FAMILIES, Kind, Split
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.card import FAMILIES, Kind, Split
 from training import train as training
 from training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from training.evaluate import Figures, evaluate

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from real_data import real_data
 
-import fgloc.motion
+import fgloc.sensors.learned
 from datasets import mrclam
-from fgloc.motion import load_model
-from fgloc.motion.card import Kinematics
+from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.card import Kinematics
 from fgloc.types import CommandEvent
 from training.config import DataConfig
 from training.data import make_run
 from training.evaluate import evaluate
 from training.rollouts import roll_kinematics, roll_model
 
-MODELS = Path(fgloc.motion.__file__).parent / "models"
+MODELS = Path(fgloc.sensors.learned.__file__).parent / "models"
 
 
 def test_shipped_models_load() -> None:

@@ -12,8 +12,8 @@ from motion_models import make_card, make_tensors
 from fgloc import se2
 from fgloc.config import MotionConfig
 from fgloc.errors import ConfigError, ModelError
-from fgloc.motion import LearnedMotion, load_model, save_model
-from fgloc.motion.signals import Signal, SignalReader, Signals
+from fgloc.sensors.learned import LearnedMotion, load_model, save_model
+from fgloc.sensors.learned.signals import Signal, SignalReader, Signals
 from fgloc.types import CommandEvent, ImuEvent, JointsEvent, Step
 
 SECOND = 1_000_000_000

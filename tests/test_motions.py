@@ -14,20 +14,20 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig
-from fgloc.fusion.decision_log import motion_decisions
-from fgloc.fusion.motion import MotionSources, with_noise
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse, predict
-from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.localizer import Localizer
-from fgloc.motion import load_model, save_model
-from fgloc.motion.joint import JointCalibration
-from fgloc.motion.source import LearnedMotion
+from fgloc.robust.decision_log import motion_decisions
+from fgloc.robust.motion_fusion import MotionFusion, with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.types import CommandEvent, ImuEvent, MotionMeasurement, Readings, Step
+from fgloc.types import CommandEvent, ImuEvent, MotionMeasurement, MotionReadings, Step
 
 W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2
 L_W, L_N = np.linalg.cholesky(W), np.linalg.cholesky(N)
@@ -49,9 +49,9 @@ def learned_motion(tmp_path, kind="displacement", **card) -> LearnedMotion:
     return LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
 
 
-def sources(learned=None, joint=None, gyro=None, **sections) -> MotionSources:
+def sources(learned=None, joint=None, gyro=None, **sections) -> MotionFusion:
     settings = Config.model_validate(sections)
-    return MotionSources(settings, WheelMotion(settings.wheels), learned, joint, gyro)
+    return MotionFusion(settings, WheelMotion(settings.wheels), learned, joint, gyro)
 
 
 def names(motions) -> list[str]:
@@ -61,7 +61,7 @@ def names(motions) -> list[str]:
 def test_the_pair_says_what_the_joint_gaussian_says(tmp_path):
     """Of all unbiased combinations of two measurements with correlated errors the best one, to the last digit."""
     both = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
-    motion, cov = fuse(both.combine(Readings(WHEELS, LEARNED)))
+    motion, cov = fuse(both.combine(MotionReadings(WHEELS, LEARNED)))
     # the conditional of the joint, written out: x from [z_w; z_n] = [I; I] x + [e_w; e_n]
     P = np.linalg.inv(np.block([[W, C.T], [C, N]]))
     H = np.vstack([np.eye(3), np.eye(3)])
@@ -70,7 +70,7 @@ def test_the_pair_says_what_the_joint_gaussian_says(tmp_path):
     expected = se2.compose(WHEELS.motion, se2.exp(expected_cov @ H.T @ P @ np.concatenate([np.zeros(3), d])))
     assert motion == pytest.approx(expected, abs=1e-12)
     assert cov == pytest.approx(expected_cov, rel=1e-9)
-    independent, too_small = fuse(sources(learned_motion(tmp_path)).combine(Readings(WHEELS, LEARNED)))
+    independent, too_small = fuse(sources(learned_motion(tmp_path)).combine(MotionReadings(WHEELS, LEARNED)))
     assert np.linalg.det(too_small) < 0.7 * np.linalg.det(expected_cov)
     assert np.abs(independent - expected).max() > 1e-4
 
@@ -81,7 +81,7 @@ def test_the_pair_is_honest_over_samples(tmp_path):
     model = learned_motion(tmp_path)
     made = {"joint": sources(model, JointCalibration(W, N, C)), "independent": sources(model)}
     for e in rng.multivariate_normal(np.zeros(6), np.block([[W, C.T], [C, N]]), 400):
-        readings = Readings(
+        readings = MotionReadings(
             replace(WHEELS, motion=se2.compose(truth, se2.exp(e[:3]))),
             replace(LEARNED, motion=se2.compose(truth, se2.exp(e[3:]))),
         )
@@ -95,7 +95,7 @@ def test_the_pair_is_honest_over_samples(tmp_path):
 
 
 def test_what_enters_when_a_source_is_not_believed(tmp_path):
-    all_say = Readings(WHEELS, LEARNED, GYRO)
+    all_say = MotionReadings(WHEELS, LEARNED, GYRO)
     some = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
     assert names(some.combine(all_say)) == ["wheels", "learned", "gyro"]
     dead = some.combine(all_say, {"wheels": "frozen"})
@@ -109,7 +109,7 @@ def test_what_enters_when_a_source_is_not_believed(tmp_path):
 
 
 def test_sources_that_disagree_are_known_less_well_together(tmp_path):
-    pair = Readings(WHEELS, LEARNED)
+    pair = MotionReadings(WHEELS, LEARNED)
     some = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
     motion, cov = fuse(some.combine(pair, scale=3.0))
     as_usual, usual = fuse(some.combine(pair))
@@ -121,20 +121,23 @@ def test_sources_that_disagree_are_known_less_well_together(tmp_path):
 
 
 def test_wheels_that_alone_know_the_way_are_kept_with_room_for_a_slip():
-    kept = sources().combine(Readings(WHEELS, None, GYRO), {"wheels": "slip"})
+    kept = sources().combine(MotionReadings(WHEELS, None, GYRO), {"wheels": "slip"})
     assert names(kept) == ["wheels", "gyro"]
     assert (np.diag(kept[0].cov) > 10.0 * np.diag(W)).all()
     assert kept[1].motion == pytest.approx([*WHEELS.motion[:2], GYRO.motion[2]])
     _, cov = fuse(kept)
     assert cov[2, 2] < 1.1e-5  # the gyro knows the turn still
-    assert sources().combine(Readings(None, None, GYRO)) == []  # and no more than that
+    assert sources().combine(MotionReadings(None, None, GYRO)) == []  # and no more than that
 
 
 def test_a_gyro_that_the_model_reads_does_not_enter_again(tmp_path):
     reading = sources(learned_motion(tmp_path, inputs=("commands", "gyro")))
-    assert names(reading.combine(Readings(WHEELS, LEARNED, GYRO))) == ["wheels", "learned"]
-    assert names(reading.combine(Readings(WHEELS, None, GYRO))) == ["wheels", "gyro"]
-    assert names(reading.combine(Readings(WHEELS, LEARNED, GYRO), {"learned": "distrusted"})) == ["wheels", "gyro"]
+    assert names(reading.combine(MotionReadings(WHEELS, LEARNED, GYRO))) == ["wheels", "learned"]
+    assert names(reading.combine(MotionReadings(WHEELS, None, GYRO))) == ["wheels", "gyro"]
+    assert names(reading.combine(MotionReadings(WHEELS, LEARNED, GYRO), {"learned": "distrusted"})) == [
+        "wheels",
+        "gyro",
+    ]
 
 
 def step(i: int, dt: float, omega=0.0) -> Step:
@@ -159,15 +162,15 @@ def test_commands_that_stand_in_for_wheels_are_left_out_beside_a_model_that_read
     assert beside.disagreement(readings) is None  # they are no witness of each other
 
 
-def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> Belief:
+def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> PoseWithCovariance:
     """Belief after 10 s, from the origin; ``off`` is what is known of radius, track and yaw_per_m."""
     names_ = ("wheels.radius", "wheels.track", "wheels.yaw_per_m")
     factors = LandmarkFactors(None, Installation(dict(zip(names_, sigmas, strict=True))))
     if len(factors.installation):
         factors.believed = replace(factors.believed, mean=np.array(off))
     settings = Config.model_validate({"wheels": {"source": "command", "noise": {}}})
-    some = MotionSources(settings, WheelMotion(settings.wheels), factors=factors)
-    belief = Belief(np.zeros(3), np.zeros((3, 3)))
+    some = MotionFusion(settings, WheelMotion(settings.wheels), factors=factors)
+    belief = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
     for i in range(round(10.0 / dt)):
         readings = some.read(step(i, dt))
         if readings.wheels is not None:
@@ -188,10 +191,18 @@ def test_systematic_errors_of_the_wheels_grow_with_the_way_however_it_is_cut():
 
 
 def test_factors_made_again_keep_what_sightings_said_against_them():
-    doubt = np.diag([0.01, 0.0, 0.04])
-    frame = Keyframe(1, 0, 0.1, Belief(np.zeros(3), np.eye(3)), readings=Readings(WHEELS), scale=4.0, doubt=doubt)
+    extra_cov = np.diag([0.01, 0.0, 0.04])
+    frame = Keyframe(
+        1,
+        0,
+        0.1,
+        PoseWithCovariance(np.zeros(3), np.eye(3)),
+        readings=MotionReadings(WHEELS),
+        scale=4.0,
+        extra_cov=extra_cov,
+    )
     (made,) = sources().combine_again(frame)
-    assert made.cov == pytest.approx(4.0 * W + doubt)
+    assert made.cov == pytest.approx(4.0 * W + extra_cov)
     assert with_noise(WHEELS).cov == pytest.approx(W)
 
 
@@ -200,7 +211,7 @@ def test_factors_made_again_keep_what_sightings_said_against_them():
     [({}, 1.0, (1.0, 1.0)), ({}, 9.0, (1 / 9, 1 / 4)), ({}, 0.25, (4.0, 2.0)), ({"wheels": "slip"}, 9.0, (0.0, 1 / 4))],
 )
 def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, off, scale, weights):
-    readings = Readings(WHEELS, LEARNED)
+    readings = MotionReadings(WHEELS, LEARNED)
     made = sources(learned_motion(tmp_path)).combine(readings, off, scale)
     rows = {d.kind: d for d in motion_decisions(3, made, readings, off, "", scale)}
     assert (rows["wheels"].weight, rows["learned"].weight) == pytest.approx(weights)

@@ -11,7 +11,7 @@ from robot_world import CAMERA, SIGMA_PX, Chain, World, beacons, polar, position
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.moved_landmark_votes import Quarantine, displacement
+from fgloc.robust.moved_landmark_votes import LandmarkExclusion, displacement
 from fgloc.types import CornerMeasurement, LandmarkMap, RangeBearingMeasurement
 
 R = np.diag([0.015, 0.06]) ** 2
@@ -48,8 +48,8 @@ def test_the_displacement_of_a_moved_landmark_is_what_it_was_moved_by(by):
     assert np.median(found, axis=0) == pytest.approx(by, abs=0.08)
 
 
-def accused(sightings, factors, after: int = AFTER) -> Quarantine:
-    quarantine = Quarantine(after)
+def accused(sightings, factors, after: int = AFTER) -> LandmarkExclusion:
+    quarantine = LandmarkExclusion(after)
     for pose, m in sightings:
         quarantine.disagree([factors.sighting(0, m, 3.0)], 0, pose, factors)
     return quarantine
@@ -86,7 +86,7 @@ def test_fault_49_wrong_ids_scatter_and_name_nobody():
 def test_fault_49_one_landmark_now_and_then_misread_as_another_does_not_name_that_one():
     """Its refused sightings agree on a place, but somebody else stands there and is seen far more often."""
     rng, world = np.random.default_rng(6), beacons()
-    factors, quarantine, rarely = LandmarkFactors(world), Quarantine(AFTER), Quarantine(AFTER)
+    factors, quarantine, rarely = LandmarkFactors(world), LandmarkExclusion(AFTER), LandmarkExclusion(AFTER)
     for k, pose in enumerate(poses(6, 200)):
         wrong = factors.sighting(0, replace(beacon(pose, world.landmarks[0], rng), landmark_id=3), None)
         rarely.fits(0)
@@ -111,7 +111,7 @@ def test_a_landmark_that_is_only_ill_seen_is_not_named():
 
 def test_a_sighting_that_fits_now_and_then_clears_a_landmark():
     rng, world = np.random.default_rng(5), beacons()
-    factors, quarantine = LandmarkFactors(world), Quarantine(AFTER)
+    factors, quarantine = LandmarkFactors(world), LandmarkExclusion(AFTER)
     stands = moved(world.landmarks[2], 0.6, 0.4)
     for i, pose in enumerate(poses(5, 60)):
         quarantine.disagree([factors.sighting(0, beacon(pose, stands, rng), None)], 0, pose, factors)
@@ -131,6 +131,6 @@ def test_fault_51_a_moved_marker_that_is_put_back_does_no_harm_in_a_run():
     estimates = chain.run(events)
     reasons = [(e.stamp_ns, d.reason) for e in estimates for d in e.decisions if d.landmark_id == 7]
     assert sum(reason == "quarantined" for stamp, reason in reasons if stamp < at) > 3
-    assert set(chain.localizer.weights.quarantine.displacements) == {7}  # where it stands now is not asked
+    assert set(chain.localizer.association.exclusion.displacements) == {7}  # where it stands now is not asked
     assert {reason for _, reason in reasons[-10:]} == {"quarantined"}
     assert np.mean([position_error(e, late.truth(e.stamp_ns)) for e in estimates]) < 0.006

@@ -10,9 +10,9 @@ import fgloc.relocalization.global_search
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.pose_fit import joint_fit
 from fgloc.localizer import Localizer
-from fgloc.relocalization.global_search import Initializer
+from fgloc.relocalization.global_search import GlobalSearch
+from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.types import (
     Estimate,
     Landmark,
@@ -36,7 +36,7 @@ MOTION = np.array([0.02, 0.0, 0.0])
 class Wheels:
     """Exact motion of a robot that drives straight on."""
 
-    stands_in = False
+    from_commands = False
 
     def twist(self, step: Step, at_ns: int) -> np.ndarray:
         return MOTION * (1e9 / STEP_NS)
@@ -114,7 +114,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     rng = np.random.default_rng(0)
     standing = LandmarkMap({i: Landmark(i, np.array([*p, 0.5]), _WALL, 0.2) for i, p in enumerate(PLACES)})
     config = Config()
-    initializer = Initializer(config, standing, LandmarkFactors(standing))
+    initializer = GlobalSearch(config, standing, LandmarkFactors(standing))
     fits = []
     search = fgloc.relocalization.global_search
     monkeypatch.setattr(search, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))

@@ -11,7 +11,7 @@ from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.isam2 import IncrementalEstimator
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 KINDS = ("fixed_lag", "isam2", "ekf")
@@ -49,11 +49,11 @@ def estimator(kind: str, lag_s: float = 3.0, keep_all: bool = False, threshold: 
     config = EstimatorConfig(kind=kind, lag_s=lag_s, relinearize_threshold=threshold)
     made = ExtendedKalmanFilter if kind == "ekf" else IncrementalEstimator
     started = made(config, LandmarkFactors(MAP), keep_all)
-    started.start(0, Belief(np.zeros(3), 1e-4 * np.eye(3)))
+    started.start(0, PoseWithCovariance(np.zeros(3), 1e-4 * np.eye(3)))
     return started
 
 
-def follow(run: Estimator, drive: Drive, ks, motions) -> Belief:
+def follow(run: Estimator, drive: Drive, ks, motions) -> PoseWithCovariance:
     factors = LandmarkFactors(MAP)
     for k in ks:
         held = [factors.sighting(k, m, None) for m in drive.seen[k]]
@@ -61,7 +61,7 @@ def follow(run: Estimator, drive: Drive, ks, motions) -> Belief:
     return belief
 
 
-def assert_same(a: Belief, b: Belief, atol: float = 1e-6, rtol: float = 1e-3) -> None:
+def assert_same(a: PoseWithCovariance, b: PoseWithCovariance, atol: float = 1e-6, rtol: float = 1e-3) -> None:
     assert np.abs(se2.log(se2.between(a.pose, b.pose))).max() < atol
     assert np.abs(a.cov - b.cov).max() < rtol * np.abs(b.cov).max()
 
@@ -72,7 +72,7 @@ def follow_all(drive: Drive, n: int) -> Estimator:
     return run
 
 
-def settled(run: Estimator) -> Belief:
+def settled(run: Estimator) -> PoseWithCovariance:
     """Iterated to the end: a factor swapped for itself is one more iteration."""
     newest = run.log.keyframes[run.k]
     for _ in range(4):

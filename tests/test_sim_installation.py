@@ -22,7 +22,7 @@ from datasets.sim.suite import BUNDLED, load_suite
 from fgloc.config import Config, GateConfig, load_config
 from fgloc.errors import ConfigError
 from fgloc.frames import rpy_matrix
-from fgloc.intake.validation import Gate
+from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
 
@@ -188,7 +188,7 @@ def test_stamps_are_shifted_and_receive_times_are_not(tmp_path: Path) -> None:
 def test_the_intake_accepts_what_is_recorded(tmp_path: Path) -> None:
     record(SCENARIO, 6, tmp_path / "run", camera=False)
     for bag in (tmp_path / "run" / "bag", SAMPLES / "installed_run" / "bag"):
-        gate, last = Gate(GateConfig()), dict[str, int]()
+        gate, last = EventValidator(GateConfig()), dict[str, int]()
         with open_recording(bag, Config().recording) as recording:
             for event in recording.events():
                 assert gate.check(event) is not None

@@ -11,9 +11,9 @@ from world_bags import write_world
 from fgloc import se2
 from fgloc.assembly import assemble
 from fgloc.config import RecordingConfig
-from fgloc.motion.load import save_model
-from fgloc.motion.source import LearnedMotion
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.learned.load import save_model
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.smoothing import smooth_run, smoothed_velocities
 
 STEP_NS = 100_000_000

@@ -9,7 +9,7 @@ import pytest
 from robot_world import Chain, World, beacons, config, position_error, truth_at
 
 from fgloc import se2
-from fgloc.graph.moved_landmark_glr import Suspects
+from fgloc.robust.moved_landmark_glr import MovedLandmarkBank
 from fgloc.types import LandmarkMap, RangeBearingMeasurement
 
 COARSE = {"range_sigma_m": 0.2, "bearing_sigma_rad": 0.05}  # of which one sighting cannot show half a metre
@@ -32,7 +32,7 @@ def sighting(rng, pose, landmark, stamp_ns: int, as_id: int | None = None) -> Ra
 
 def listened(seed: int, world: LandmarkMap, shown: LandmarkMap, steps: int = 150, misread: float = 0.0):
     """Filters that hear one sighting a step of a robot on its circle, until one is accused; and after how many."""
-    rng, suspects = np.random.default_rng(seed), Suspects(world, repeat_s=0.0)
+    rng, suspects = np.random.default_rng(seed), MovedLandmarkBank(world, repeat_s=0.0)
     suspects.start(truth_at(0.0), *NONE)
     ids = sorted(world.landmarks)
     for k in range(1, steps + 1):
@@ -88,7 +88,7 @@ def test_an_accusation_puts_the_robot_where_angles_are_wrapped():
 def test_sightings_after_the_clock_went_back_share_nothing_with_those_before():
     world, covs = beacons(), []
     for before_ns in (10**9, 3600 * 10**9):
-        suspects = Suspects(world, repeat_s=2.0)
+        suspects = MovedLandmarkBank(world, repeat_s=2.0)
         for stamp_ns in (before_ns, 100 * 10**9):
             suspects.start(truth_at(0.0), *NONE)
             seen = sighting(np.random.default_rng(0), truth_at(0.0), world.landmarks[2], stamp_ns)
@@ -106,12 +106,12 @@ def drive(world: LandmarkMap, shown: LandmarkMap | None, seed: int, keep_all: bo
 def test_fault_51_a_beacon_moved_by_less_than_a_sighting_shows_is_named_and_its_harm_undone():
     world = beacons()
     made, chain, estimates = drive(world, moved(world, 3, 0.3, 0.25), seed=1, **COARSE)
-    by = chain.localizer.weights.quarantine.displacements
+    by = chain.localizer.association.exclusion.displacements
     assert list(by) == [3]
     assert by[3] == pytest.approx((0.3, 0.25), abs=0.15)
     (told,) = [d for e in estimates for d in e.decisions if d.reason == "landmark_moved"]
     assert told.landmark_id == 3
-    assert chain.localizer.weights.rejections["sightings.gate"] < 5  # it was not the gate that found it
+    assert chain.localizer.association.rejections["sightings.gate"] < 5  # it was not the gate that found it
     late = [position_error(e, made.truth(e.stamp_ns)) for e in estimates if e.stamp_ns > told.stamp_ns]
     assert np.mean(late) < 0.07
     log = chain.localizer.estimator.log.keyframes.values()
@@ -123,7 +123,7 @@ def test_in_a_run_where_nothing_was_moved_nobody_is_named(settings):
     world = beacons()
     for seed in range(2):
         _, chain, estimates = drive(world, None, seed, **settings)
-        assert not chain.localizer.weights.quarantine.displacements
+        assert not chain.localizer.association.exclusion.displacements
         assert not any(d.reason == "landmark_moved" for e in estimates for d in e.decisions)
 
 
@@ -132,4 +132,4 @@ def test_repeated_sightings_share_their_information_and_are_refused_all_the_same
     world = beacons()
     shown = moved(world, 2, 0.5, -0.4)
     _, chain, _ = drive(world, shown, seed=2, repeat_s=20.0)
-    assert list(chain.localizer.weights.quarantine.displacements) == [2]
+    assert list(chain.localizer.association.exclusion.displacements) == [2]

@@ -14,9 +14,9 @@ from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
-from fgloc.motion import load_model, save_model
-from fgloc.motion.card import Input, Kind, Split
-from fgloc.motion.load import read_model
+from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.card import Input, Kind, Split
+from fgloc.sensors.learned.load import read_model
 from training import evaluate as evaluation
 from training import optimize
 from training import train as training

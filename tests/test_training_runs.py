@@ -12,12 +12,12 @@ from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, se
 from datasets.bag import BagWriter
 from fgloc.config import Config, WheelsConfig
 from fgloc.errors import RecordingError
-from fgloc.motion import load_model
+from fgloc.sensors.learned import load_model
 from fgloc.types import Event, ImuEvent, JointsEvent
 from training import train as training
 from training.config import DataConfig
 from training.data import load_runs
-from training.heard import Heard
+from training.heard import TopicTimes
 from training.rollouts import roll_wheels
 
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
@@ -94,7 +94,7 @@ def test_the_gyros_bias_is_known_after_a_rest() -> None:
         angles = np.array([-turned, turned])
         events.append(JointsEvent(stamp, stamp, "/joints", JOINTS, angles, np.zeros(2), np.zeros(2)))
     wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
-    heard = Heard(events, Config(wheels=wheels))
+    heard = TopicTimes(events, Config(wheels=wheels))
     assert heard.gyro_bias(T0) == 0.0
     assert heard.gyro_bias(T0 + 5 * SECOND) == pytest.approx(bias, abs=1e-3)
     gyro = heard.signals(("gyro",), T0).gyro
@@ -114,9 +114,11 @@ def test_the_truth_teaches_the_gyros_bias_until_ten_seconds_before() -> None:
     commands, stamps, poses = drive(np.random.default_rng(3), 40.0)
     wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
     bias = 0.02
-    heard = Heard([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps, poses))
+    heard = TopicTimes([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps, poses))
     assert heard.gyro_bias(T0 + 5 * SECOND) == 0.0  # this robot sets out at once
     assert heard.gyro_bias(T0 + 35 * SECOND) == pytest.approx(bias, abs=2e-3)
     silent = (stamps > T0 + 1 * SECOND) & (stamps < T0 + 39 * SECOND)
-    mute = Heard([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps[~silent], poses[~silent]))
+    mute = TopicTimes(
+        [*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps[~silent], poses[~silent])
+    )
     assert mute.gyro_bias(T0 + 35 * SECOND) == 0.0

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from fgloc.config import Config, WeightsConfig
-from fgloc.faults.glr_test import Disagreement
-from fgloc.faults.motion_faults import SourceTrust
-from fgloc.fusion.motion import MotionSources
+from fgloc.robust.glr_test import GlrTest
+from fgloc.robust.motion_faults import MotionFaultMonitor
+from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.types import MotionMeasurement, Readings, Step
+from fgloc.types import MotionMeasurement, MotionReadings, Step
 
 DT = 0.1
 COV = np.diag([0.004, 0.001, 0.008]) ** 2  # of the difference over a step
@@ -21,7 +21,7 @@ TRACK = 0.3
 SPEED, TURN = 0.4, 0.5
 
 
-def judged(test: Disagreement, differences):
+def judged(test: GlrTest, differences):
     return [test.judge(DT, d, COV) for d in differences]
 
 
@@ -32,7 +32,7 @@ def white(rng: np.random.Generator, n: int) -> np.ndarray:
 def test_sources_that_agree_as_they_say_are_not_flagged():
     """Half an hour; the statistic is the largest of some twenty windows with three degrees of freedom."""
     rng = np.random.default_rng(0)
-    verdicts = judged(Disagreement(WeightsConfig()), white(rng, 18_000))
+    verdicts = judged(GlrTest(WeightsConfig()), white(rng, 18_000))
     alarms = sum(v.since > 0 for v in verdicts)
     assert alarms <= 1
     assert 12.0 < np.quantile([v.nis for v in verdicts], 0.999) < 30.0  # it does look at all windows
@@ -45,7 +45,7 @@ def test_a_small_constant_slip_is_found_within_a_window_and_its_beginning_told(s
     for seed in range(20):
         differences = white(np.random.default_rng(seed), 60)
         differences[30:] += slip
-        verdicts = judged(Disagreement(WeightsConfig()), differences)
+        verdicts = judged(GlrTest(WeightsConfig()), differences)
         first = next(i for i, v in enumerate(verdicts) if v.flagged)
         assert first >= 30
         delays.append(first - 29)
@@ -59,7 +59,7 @@ def test_a_small_constant_slip_is_found_within_a_window_and_its_beginning_told(s
 def test_the_onset_does_not_depend_on_the_length_of_the_steps():
     spans = []
     for dt in (0.05, 0.2):
-        test, n = Disagreement(WeightsConfig()), round(0.6 / dt)
+        test, n = GlrTest(WeightsConfig()), round(0.6 / dt)
         for _ in range(30):
             test.judge(dt, np.zeros(3), COV * dt / DT)
         for _ in range(n):
@@ -72,7 +72,7 @@ def test_the_onset_does_not_depend_on_the_length_of_the_steps():
 
 def test_a_flag_is_raised_once_held_and_released_after_agreement():
     config = WeightsConfig()
-    test = Disagreement(config)
+    test = GlrTest(config)
     slip, none = np.array([0.03, 0.0, 0.05]), np.zeros(3)
     during = judged(test, [slip] * 30)
     raised = [v.since for v in during if v.since]
@@ -93,7 +93,7 @@ def test_differences_usually_smaller_than_their_covariance_show_smaller_slips_an
     """Half the sigmas, and a slip of a sigma a step as given, so two of the true ones."""
     delays, smallest = {1.0: [], 0.5: []}, {1.0: 9.0, 0.5: 9.0}
     for seed, share in itertools.product(range(6), delays):
-        test, rng = Disagreement(WeightsConfig()), np.random.default_rng(seed)
+        test, rng = GlrTest(WeightsConfig()), np.random.default_rng(seed)
         calm = judged(test, share * white(rng, 600))
         assert not any(v.flagged for v in calm)
         smallest[share] = min(smallest[share], *(v.scale for v in calm[300:]))
@@ -116,10 +116,10 @@ class Witness:
             inputs = ("commands",)
 
 
-def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> SourceTrust:
+def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> MotionFaultMonitor:
     config = Config.model_validate({"weights": {"distrust": distrust, **weights}})
-    sources = MotionSources(config, WheelMotion(config.wheels), Witness() if learned else None)
-    trust = SourceTrust(config.weights, sources, track)
+    sources = MotionFusion(config, WheelMotion(config.wheels), Witness() if learned else None)
+    trust = MotionFaultMonitor(config.weights, sources, track)
     trust.begin(Step(0, 0, 10**18, 10**18))
     return trust
 
@@ -129,12 +129,12 @@ def reading(source: str, i: int, v: float, omega: float, cov=COV / 2) -> MotionM
     return MotionMeasurement(source, start, start + 10**8, np.array([v * DT, 0.0, omega * DT]), cov)
 
 
-def run(trust: SourceTrust, n: int, told, did=(SPEED, TURN), first: int = 0, witness: str = "learned"):
+def run(trust: MotionFaultMonitor, n: int, told, did=(SPEED, TURN), first: int = 0, witness: str = "learned"):
     found = []
     for i in range(first, first + n):
         wheels, other = reading("wheels", i, *told), reading(witness, i, *did)
         step = Step(i, 0, wheels.start_ns, wheels.stamp_ns)
-        found.append(trust.judge(step, Readings(wheels, **{witness: other})))
+        found.append(trust.judge(step, MotionReadings(wheels, **{witness: other})))
     return found
 
 
@@ -197,7 +197,7 @@ def test_without_a_witness_or_without_adaptation_nothing_is_flagged():
     alone = trust_in()
     for i in range(20):
         wheels = reading("wheels", i, *wild)
-        assert not alone.judge(Step(i, 0, wheels.start_ns, wheels.stamp_ns), Readings(wheels)).off
+        assert not alone.judge(Step(i, 0, wheels.start_ns, wheels.stamp_ns), MotionReadings(wheels)).off
 
 
 def test_known_failures_are_believed_in_their_intervals_alone():

@@ -8,8 +8,8 @@ from real_data import real_data
 from fgloc import se2
 from fgloc.config import GateConfig, KeyframesConfig, RecordingConfig, WheelsConfig
 from fgloc.frames import quaternion_yaw
-from fgloc.intake.keyframing import Stepper
-from fgloc.intake.validation import Gate
+from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import OdometryEvent
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.real_data
 def replay(path, received=()):
     """Steps, raw odometry, gate and stepper of a recording."""
     source = open_recording(path, RecordingConfig(received_stamps=received))
-    gate, stepper = Gate(GateConfig()), Stepper(KeyframesConfig(), GateConfig(), 10.0)
+    gate, stepper = EventValidator(GateConfig()), KeyframeBuilder(KeyframesConfig(), GateConfig(), 10.0)
     steps, raw = [], []
     for event in source.events():
         if isinstance(event, OdometryEvent):

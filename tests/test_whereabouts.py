@@ -57,7 +57,9 @@ def test_fault_52_a_map_shifted_as_a_whole_against_the_given_first_pose(kind):
     (told,) = [d for d in decisions if d.kind == "place"]
     assert told.reason == "contradicts initial_pose"
     assert told.weight == 0.0
-    assert math.hypot(*chain.localizer._whereabouts.defied[:2]) == pytest.approx(np.hypot(*SHIFT[:2]), abs=0.1)
+    assert math.hypot(*chain.localizer._tracking.initial_pose_conflict[:2]) == pytest.approx(
+        np.hypot(*SHIFT[:2]), abs=0.1
+    )
     (note,) = chain.localizer.notes  # of single markers that seem to be moved not a word
     assert "the given first pose" in note
     assert "correct estimator.initial_pose or the map" in note

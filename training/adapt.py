@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fgloc.errors import RecordingError
-from fgloc.motion.card import ModelCard
-from fgloc.motion.load import Tensors, model_of
+from fgloc.sensors.learned.card import ModelCard
+from fgloc.sensors.learned.load import Tensors, model_of
 from fgloc.types import FloatArray
 from training.config import AdaptationConfig
 from training.data import Run

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from fgloc.errors import ModelError
-from fgloc.motion.card import Split
+from fgloc.sensors.learned.card import Split
 from training.config import TrainConfig
 from training.data import Run
 

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from fgloc.config import Section
 from fgloc.errors import ConfigError
-from fgloc.motion.card import Input, Kind, Split
+from fgloc.sensors.learned.card import Input, Kind, Split
 
 
 class DataConfig(Section):

@@ -19,13 +19,13 @@ from scipy.signal import savgol_filter
 from fgloc.assembly import mounted_up
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
-from fgloc.motion.commands import CommandTrack
 from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
+from fgloc.sensors.learned.commands import CommandTrack
 from fgloc.types import CommandEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig
-from training.heard import Heard
+from training.heard import TopicTimes
 
 _FINE_S = 0.02  # the truth is resampled to this before it is smoothed
 
@@ -40,7 +40,7 @@ class Run:
     poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
     valid: NDArray[np.bool_]  # (n,) the truth was heard around this time, and can be true
-    heard: Heard
+    heard: TopicTimes
     track: CommandTrack  # time zero is origin_ns
 
     @property
@@ -80,7 +80,7 @@ def load_run(
     """
     whole = _read(path, config, truth_from)
     return make_run(
-        name, Heard(whole.sensed, whole.settings, whole.imu_up, whole.truth), *whole.truth, dt_s, history_s, config
+        name, TopicTimes(whole.sensed, whole.settings, whole.imu_up, whole.truth), *whole.truth, dt_s, history_s, config
     )
 
 
@@ -95,7 +95,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
     heard_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
     limits = [int(heard_ns[0]), *heard_ns[1:][np.diff(heard_ns) > config.apart_s * 1e9].tolist(), int(heard_ns[-1]) + 1]
     if len(limits) == 2:
-        heard = Heard(whole.sensed, whole.settings, whole.imu_up, whole.truth)
+        heard = TopicTimes(whole.sensed, whole.settings, whole.imu_up, whole.truth)
         return {name: make_run(name, heard, stamps, poses, dt_s, config.history_s, config)}
     runs: dict[str, Run] = {}
     sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
@@ -105,7 +105,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
         inside = (stamps >= first) & (stamps < last)
         if not inside.any() or not any(isinstance(event, CommandEvent) for event in part):
             continue
-        heard, label = Heard(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
+        heard, label = TopicTimes(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
             runs[label] = make_run(label, heard, stamps[inside], poses[inside], dt_s, config.history_s, config)
     if not runs:
@@ -143,7 +143,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
 
 def make_run(
     name: str,
-    heard: Heard | Sequence[CommandEvent],
+    heard: TopicTimes | Sequence[CommandEvent],
     truth_ns: NDArray[np.int64],
     truth: FloatArray,
     dt_s: float,
@@ -155,7 +155,7 @@ def make_run(
     Raises:
         RecordingError: commands and truth overlap too little.
     """
-    heard = heard if isinstance(heard, Heard) else Heard(heard)
+    heard = heard if isinstance(heard, TopicTimes) else TopicTimes(heard)
     commands = heard.commands
     order = np.unique(truth_ns, return_index=True)[1]
     truth_ns, truth = truth_ns[order], truth[order]

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from fgloc.errors import FglocError
-from fgloc.motion.card import Kinematics, ModelCard
-from fgloc.motion.load import load_model
+from fgloc.sensors.learned.card import Kinematics, ModelCard
+from fgloc.sensors.learned.load import load_model
 from fgloc.types import FloatArray
 from training.calibrate import nis
 from training.config import DataConfig

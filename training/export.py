@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.motion.card import ModelCard, Split
-from fgloc.motion.load import Tensors
+from fgloc.sensors.learned.card import ModelCard, Split
+from fgloc.sensors.learned.load import Tensors
 from training.config import TrainConfig
 from training.models import DisplacementNet, MotionNet, VelocityNet
 from training.recurrent import Trunk
@@ -14,7 +14,7 @@ _WARM_UP_S = 2.0  # a velocity model that is told no velocity starts from rest t
 
 
 def tensors_of(nets: list[MotionNet]) -> Tensors:
-    """Weights by the names that `fgloc.motion.load_model` expects; those of several networks stacked."""
+    """Weights by the names that `fgloc.sensors.learned.load_model` expects; those of several networks stacked."""
     out: Tensors = {}
     for i, members in enumerate(zip(*(net.layers() for net in nets), strict=True)):
         for name, tensors in zip(("weight", "bias"), zip(*members, strict=True), strict=True):

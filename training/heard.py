@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config, GyroConfig, WheelsConfig
 from fgloc.intake.event_buffer import EventBuffer
-from fgloc.motion.card import WheelJoints
-from fgloc.motion.signals import Signals, signals_of
 from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.learned.card import WheelJoints
+from fgloc.sensors.learned.signals import Signals, signals_of
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent, Step
 
@@ -23,7 +23,7 @@ _FIX_SIGMA = 0.002  # rad
 _MAX_TRUTH_GAP_NS = 200_000_000
 
 
-class Heard:
+class TopicTimes:
     """Commands, IMU, joints and odometry of one recording.
 
     Attributes:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from fgloc.errors import RecordingError
-from fgloc.motion.card import CHANNELS, Kinematics, Lag
-from fgloc.motion.displacement import measured_twists, signal_features
-from fgloc.motion.forms import calibrated
-from fgloc.motion.signals import Signals
+from fgloc.sensors.learned.card import CHANNELS, Kinematics, Lag
+from fgloc.sensors.learned.displacement import measured_twists, signal_features
+from fgloc.sensors.learned.forms import calibrated
+from fgloc.sensors.learned.signals import Signals
 from fgloc.types import FloatArray
 from training.config import NetworkConfig
 from training.data import Run

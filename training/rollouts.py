@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.errors import ModelError
-from fgloc.motion.card import ErrorMemory, Kinematics
-from fgloc.motion.forms import MotionModel, calibrated
-from fgloc.motion.signals import SignalReader
+from fgloc.sensors.learned.card import ErrorMemory, Kinematics
+from fgloc.sensors.learned.forms import MotionModel, calibrated
+from fgloc.sensors.learned.signals import SignalReader
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import FloatArray
 from training.data import Run

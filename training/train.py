@@ -21,9 +21,9 @@ except ModuleNotFoundError as missing:
 from tqdm import tqdm
 
 from fgloc.errors import ConfigError, FglocError, RecordingError
-from fgloc.motion.card import Kinematics, ModelCard, Split
-from fgloc.motion.load import Tensors, load_model, model_of, read_model, save_model
-from fgloc.motion.signals import Signal
+from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
+from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
+from fgloc.sensors.learned.signals import Signal
 from training.adapt import adapted
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from training.checkpoint import Checkpoints, Curve

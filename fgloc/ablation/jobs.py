@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict
 
 import fgloc
 from fgloc import se2
-from fgloc.ablation.failures import Scene, generators, spoil
+from fgloc.ablation.failures import Scene, corrupt, generators
 from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path, read_record, write_record
 from fgloc.ablation.suite import Cell
 from fgloc.assembly import resolved
@@ -173,19 +173,19 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
         map_file = cell.map
         if landmark_map is not None:
-            spoiled = landmark_map
+            corrupted = landmark_map
             for failure, scene in zip(cell.chain, scenes, strict=True):
-                spoiled = failure.spoil_map(spoiled, scene)
-            if spoiled is not landmark_map:
+                corrupted = failure.spoil_map(corrupted, scene)
+            if corrupted is not landmark_map:
                 map_file = Path(folder) / "map.yaml"
-                write_map(spoiled, map_file)
+                write_map(corrupted, map_file)
         result = run(
             cell.bag,
             map_file,
             config,
             cell.mode,
-            events=None if plain else lambda events: spoil(cell.chain, "recorded", events, scenes),
-            sightings=None if plain else lambda events: spoil(cell.chain, "sightings", events, scenes),
+            events=None if plain else lambda events: corrupt(cell.chain, "recorded", events, scenes),
+            sightings=None if plain else lambda events: corrupt(cell.chain, "sightings", events, scenes),
             detections=out / "detections" / f"{job.images}.npz" if job.folder is None else None,
         )
     config = result.config or config
@@ -195,15 +195,15 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         owner.unlink(missing_ok=True)  # the files may be those of a run with other settings
         write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
         write_text(owner, job.key)
-    touched: dict[str, int] = {}
+    affected: dict[str, int] = {}
     for scene in scenes:
-        for kind, n in scene.touched.items():
-            touched[kind] = touched.get(kind, 0) + n
+        for kind, n in scene.affected.items():
+            affected[kind] = affected.get(kind, 0) + n
     return {
         "figures": _figures(metrics),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "mistakes": result.mistakes,
-        "touched": touched,
+        "affected": affected,
         "track": _track(result, config),
     }
 

@@ -42,7 +42,7 @@ class Record(BaseModel):
     figures: dict[str, Any] = {}  # of Metrics, without times
     modes: dict[str, float] = {}  # mode -> share of the poses
     mistakes: tuple[str, ...] = ()  # of the set-up
-    touched: dict[str, int] = {}  # events that the failures changed, by kind
+    affected: dict[str, int] = {}  # events that the failures changed, by kind
     track: Track | None = None
     cost: Cost
 

@@ -91,7 +91,7 @@ def _as_json(
                 "severity": run.cell.severity,
                 "variant": run.cell.variant,
                 "seed": run.cell.seed,
-                **run.record.model_dump(mode="json", include={"outcome", "error", "figures", "modes", "touched"}),
+                **run.record.model_dump(mode="json", include={"outcome", "error", "figures", "modes", "affected"}),
             }
             for run in runs
         ],

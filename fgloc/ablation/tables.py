@@ -131,7 +131,7 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     here = select(runs, failure, severity, variant)
     at = "" if entry.severity is None else f" at {severity:g} {entry.severity.unit}".rstrip()
     name = failure[0].upper() + failure[1:]
-    if not any(run.record.touched for run in here if run.record.outcome == "done") and all(
+    if not any(run.record.affected for run in here if run.record.outcome == "done") and all(
         run.record.outcome == "done" for run in here
     ):
         return f"{name}{at} changed no message of these recordings: they say nothing about it."

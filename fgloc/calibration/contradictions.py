@@ -20,7 +20,7 @@ _MOST_NAMED = 5  # landmarks
 
 
 def contradictions(found: InstallationFound) -> tuple[str, ...]:
-    """A sentence for every given value that is contradicted, one for all landmarks; clocks: `fgloc.clock_trials`."""
+    """A sentence for every given value that is contradicted, one for all landmarks; clocks: `clock_trials`."""
     off = [s for s in found.settings if not s.name.startswith("stamp_offset_s.") and contradicted(s)]
     said = [f"{s.name} is {_number(s)}, {s.given:.6g} was given: set {_line(s)}." for s in off]
     return (*said, *_landmarks(found))

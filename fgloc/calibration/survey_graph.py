@@ -15,8 +15,8 @@ from fgloc.config import Config
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief, installation_of
-from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
-from fgloc.graph.pose_fit import cauchy_k
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
+from fgloc.relocalization.pose_fit import cauchy_k
 from fgloc.types import CornerMeasurement, FloatArray, Landmark, LandmarkMap
 
 _WIDE_M, _WIDE_RAD = 0.5, 0.5  # sigmas of an unknown marker: next to nothing is known of it
@@ -210,13 +210,20 @@ class SurveyGraph:
                 prior = None
                 if frame.prior is not None:
                     origin = n == 0 and not leg.free
-                    prior = Belief(frame.prior.pose, _ORIGIN) if origin else Belief(pose, _FREE)
-                believed: list[Sighting] = []
-                refused: list[Sighting] = []
+                    prior = PoseWithCovariance(frame.prior.pose, _ORIGIN) if origin else PoseWithCovariance(pose, _FREE)
+                believed: list[LandmarkFactor] = []
+                refused: list[LandmarkFactor] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
                     (believed if agrees else refused).append(factors.sighting(k, m, cauchy_k(m, self._config)))
                 log.keyframes[k] = Keyframe(
-                    k, frame.stamp_ns, 0.0, Belief(pose, _FREE), prior, frame.motions, tuple(believed), tuple(refused)
+                    k,
+                    frame.stamp_ns,
+                    0.0,
+                    PoseWithCovariance(pose, _FREE),
+                    prior,
+                    frame.motions,
+                    tuple(believed),
+                    tuple(refused),
                 )
         return log

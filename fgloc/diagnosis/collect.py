@@ -31,7 +31,7 @@ _FLOOR_RAD, _FLOOR_M, _FLOOR_SHARE = 0.01, 0.02, 0.01  # what wheels err over a 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spot:
+class RelativeSighting:
     """One sighting: time [s], landmark, place in the sensor's axes ``(3,)``, noise of bearing [rad] and range [m]."""
 
     at_s: float
@@ -41,7 +41,7 @@ class Spot:
     sigma_m: float
 
 
-class Spotter:
+class SightingCollector:
     """Turns sightings events into places in the sensor's own axes."""
 
     def __init__(
@@ -53,7 +53,7 @@ class Spotter:
         self._sensor = sensor
         self._place = T_base_sensor
 
-    def spots(self, event: SightingsEvent, at_s: float) -> Iterator[Spot]:
+    def spots(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
         """What was seen where."""
         if isinstance(event, CornersEvent) and self._map is None and self._config.markers.default_size_m is None:
             return
@@ -79,7 +79,9 @@ class Spotter:
                 sigma_rad, sigma_m = np.sqrt(np.diag(m.cov)).tolist()
             distance = float(np.linalg.norm(point))
             floor_m = _FLOOR_M + _FLOOR_SHARE * distance
-            yield Spot(at_s, m.landmark_id, point, math.hypot(sigma_rad, _FLOOR_RAD), math.hypot(sigma_m, floor_m))
+            yield RelativeSighting(
+                at_s, m.landmark_id, point, math.hypot(sigma_rad, _FLOOR_RAD), math.hypot(sigma_m, floor_m)
+            )
 
     def _in_sensor(self, x: float, y: float) -> FloatArray:
         """A place given in the base's plane, taken to be at the sensor's own height."""
@@ -94,7 +96,7 @@ class WindowCutter:
         self._segment = -1
         self._times: list[float] = []
         self._motions: list[FloatArray] = []
-        self._spots: list[Spot] = []
+        self._spots: list[RelativeSighting] = []
         self._last_spot_s = -math.inf
         self._origin_ns: int | None = None
         self.travelled: FloatArray = np.zeros(3)  # from the segment's first step to the oldest pose kept
@@ -115,7 +117,7 @@ class WindowCutter:
         """Whether a sightings event at this time would add something."""
         return abs(at_s - self._last_spot_s) >= _SPARSE_S and len(self._spots) < 2 * _MOST_SPOTS
 
-    def see(self, spot: Spot) -> None:
+    def see(self, spot: RelativeSighting) -> None:
         """Keep a sighting."""
         self._spots.append(spot)
         self._last_spot_s = spot.at_s

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
-from fgloc.diagnosis.collect import Spotter, WindowCutter
+from fgloc.diagnosis.collect import SightingCollector, WindowCutter
 from fgloc.diagnosis.frame_checks import first_pose_sentence
 from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
@@ -66,7 +66,7 @@ class Diagnosis:
         self._known: dict[int, FloatArray] | None = None
         if landmark_map is not None:
             self._known = {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
-        self._spotter = Spotter(
+        self._spotter = SightingCollector(
             config, landmark_map, LandmarkSensor(config, landmark_map, camera, T_base_sensor), self._place
         )
         self._cutter = WindowCutter()
@@ -92,7 +92,7 @@ class Diagnosis:
                 for spot in self._spotter.spots(event, at_s):
                     self._cutter.see(spot)
         for imu in step.imu:
-            self._gyro.hear(imu, self._cutter.seconds(imu.stamp_ns))
+            self._gyro.record(imu, self._cutter.seconds(imu.stamp_ns))
         travelled = self._cutter.travelled
         window = self._cutter.move(step, None if wheels is None else wheels.motion)
         if window is not None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
-from fgloc.intake.validation import Gate
+from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
 from fgloc.sensors.images import ImageError
 from fgloc.sensors.markers import Detector
@@ -104,7 +104,7 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         config: bounds of what is taken.
         detector: of markers; None: the recording holds corners.
     """
-    found, gate = Excerpt(), Gate(config.gate)
+    found, gate = Excerpt(), EventValidator(config.gate)
     role_of = {topic: role for role, topic in recording.roles.items()}
     first_image: int | None = None
     last_image = 0
@@ -136,7 +136,7 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
     return found
 
 
-def _take_motion(found: Excerpt, gate: Gate, event: Event) -> None:
+def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
     passed = gate.check(event)
     if isinstance(passed, JointsEvent | OdometryEvent | CommandEvent):
         found.motion.append(passed)

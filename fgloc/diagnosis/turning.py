@@ -37,7 +37,7 @@ class GyroWitness:
         self._times: list[float] = []
         self._rates: list[float] = []
 
-    def hear(self, event: ImuEvent, at_s: float) -> None:
+    def record(self, event: ImuEvent, at_s: float) -> None:
         """Take in a message; those of the step before come again and are passed over."""
         if self._up is None:
             return

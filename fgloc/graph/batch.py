@@ -26,8 +26,8 @@ from fgloc.graph.factors import (
     sighting_factors,
 )
 from fgloc.graph.installation import InstallationBelief
-from fgloc.graph.measurement_log import Keyframe, MeasurementLog, Sighting
-from fgloc.graph.pose_fit import chi2_bound
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
+from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
@@ -224,7 +224,9 @@ class BatchSmoother:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
 
-    def _sighting_factors(self, seen: Sequence[tuple[int, FloatArray, Sighting]]) -> Iterator[gtsam.NonlinearFactor]:
+    def _sighting_factors(
+        self, seen: Sequence[tuple[int, FloatArray, LandmarkFactor]]
+    ) -> Iterator[gtsam.NonlinearFactor]:
         """Of sightings with their keyframes and poses, keyframes in order."""
         if not self._factors.known or not seen:
             for _, _, s in seen:
@@ -270,7 +272,7 @@ def _with_deep_stack(work: Callable[[], _T]) -> _T:
         threading.stack_size(before)
 
 
-def _nis(sighting: Sighting, values: gtsam.Values) -> float:
+def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:
     """Squared whitened residual without the kernel, from ``e = k²/2 · log(1 + r²/k²)`` of each robust factor."""
     total = 0.0
     for factor in sighting.factors:
@@ -280,12 +282,12 @@ def _nis(sighting: Sighting, values: gtsam.Values) -> float:
     return total
 
 
-def _dof(sighting: Sighting) -> int:
+def _dof(sighting: LandmarkFactor) -> int:
     return sum(factor.dim() for factor in sighting.factors)
 
 
 def _initial(
-    frames: list[Keyframe], believed: Mapping[int, tuple[Sighting, ...]], factors: LandmarkFactors
+    frames: list[Keyframe], believed: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
     values = gtsam.Values()
     for frame in frames:
@@ -320,7 +322,7 @@ def _without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) ->
 
 
 def _landmarks(
-    believed: Mapping[int, tuple[Sighting, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
+    believed: Mapping[int, tuple[LandmarkFactor, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
 ) -> dict[int, Landmark]:
     landmarks = {}
     for m in (s.measurement for sightings in believed.values() for s in sightings):

@@ -10,7 +10,7 @@ from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.graph.joint import predict
-from fgloc.graph.measurement_log import Belief, Keyframe, MeasurementLog, Sighting
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.types import MotionMeasurement
 
 
@@ -28,7 +28,7 @@ class Estimator(ABC):
         self._factors = factors
         self.log = MeasurementLog(config.lag_s, keep_all or config.kind == "isam2")
         self.rebuilt = 0
-        self.belief: Belief | None = None
+        self.belief: PoseWithCovariance | None = None
         self._k = -1
         self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
         self._elapsed_s = 0.0
@@ -53,14 +53,16 @@ class Estimator(ABC):
         """Index of the newest keyframe, -1 before the first."""
         return self._k
 
-    def start(self, stamp_ns: int, prior: Belief, sightings: Sequence[Sighting] = ()) -> Belief:
+    def start(
+        self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LandmarkFactor] = ()
+    ) -> PoseWithCovariance:
         """Begin a segment: a first pose with a prior, unconnected to what was before."""
         self._k += 1
         self._elapsed_s += 1e-3
         frame = Keyframe(self._k, stamp_ns, self._elapsed_s, prior, prior=prior, sightings=tuple(sightings))
         return self._take(frame)
 
-    def predict(self, motions: Sequence[MotionMeasurement]) -> Belief:
+    def predict(self, motions: Sequence[MotionMeasurement]) -> PoseWithCovariance:
         """Where the robot is expected after the motions of one step (information-weighted), before any sighting.
 
         Raises:
@@ -75,10 +77,10 @@ class Estimator(ABC):
         stamp_ns: int,
         dt: float,
         motions: Sequence[MotionMeasurement],
-        sightings: Sequence[Sighting] = (),
-        refused: Sequence[Sighting] = (),
-        predicted: Belief | None = None,
-    ) -> Belief:
+        sightings: Sequence[LandmarkFactor] = (),
+        refused: Sequence[LandmarkFactor] = (),
+        predicted: PoseWithCovariance | None = None,
+    ) -> PoseWithCovariance:
         """Add one keyframe with its measurements; return the filtered pose.
 
         Args:
@@ -108,7 +110,7 @@ class Estimator(ABC):
             self._solve_again(sorted(motions))
             self._adopt(self.log.keyframes[self._k].belief)
 
-    def correct(self, belief: Belief, landmark_id: int) -> None:
+    def correct(self, belief: PoseWithCovariance, landmark_id: int) -> None:
         """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
         for frame in self.log.keyframes.values():
             of_it = tuple(s for s in frame.sightings if s.measurement.landmark_id == landmark_id)
@@ -124,13 +126,13 @@ class Estimator(ABC):
     def _begin_at(self, newest: Keyframe) -> None:
         """Forget what led to the belief of this keyframe, which stands as it is."""
 
-    def _take(self, frame: Keyframe) -> Belief:
+    def _take(self, frame: Keyframe) -> PoseWithCovariance:
         self._solve(frame)
         self.log.append(frame)
         self._adopt(frame.belief)
         return frame.belief
 
-    def _adopt(self, belief: Belief) -> None:
+    def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief
         if belief.installation is not None:
             self._factors.believed = belief.installation

@@ -16,7 +16,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.installation import Installation, InstallationBelief
-from fgloc.graph.measurement_log import Belief, Sighting
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations
 from fgloc.types import (
     CornerMeasurement,
@@ -99,7 +99,9 @@ def installed_motion_factor(
     return linear_factor(blocks, residual, values)
 
 
-def installed_prior_factor(k: int, prior: Belief, belief: InstallationBelief) -> list[gtsam.NonlinearFactor]:
+def installed_prior_factor(
+    k: int, prior: PoseWithCovariance, belief: InstallationBelief
+) -> list[gtsam.NonlinearFactor]:
     """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone."""
     known = prior.installation or belief
     values = gtsam.Values()
@@ -116,7 +118,7 @@ def installed_prior_factor(k: int, prior: Belief, belief: InstallationBelief) ->
 
 def sighting_factors(
     k: int,
-    sightings: Sequence[Sighting],
+    sightings: Sequence[LandmarkFactor],
     lines: Sequence[Linearized],
     pose: FloatArray,
     theta: FloatArray,
@@ -238,7 +240,7 @@ class LandmarkFactors:
 
     def sighting(
         self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, alone: LandmarkMeasurement | None = None
-    ) -> Sighting:
+    ) -> LandmarkFactor:
         """The measurement as the graph takes it at keyframe k.
 
         Raises:
@@ -246,14 +248,14 @@ class LandmarkFactors:
             CovarianceError: the measurement's covariance is not one.
         """
         if self._known is None:
-            return Sighting(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
+            return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
         if m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
         if not isinstance(m, CornerMeasurement) and (problem := _covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
-        return Sighting(m, alone or m, cauchy_k)
+        return LandmarkFactor(m, alone or m, cauchy_k)
 
     def observe(self, measurements: Sequence[LandmarkMeasurement]) -> Observations:
         """Sightings of the known map, prepared for being linearized."""

@@ -30,7 +30,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.joint import correct, is_linear
-from fgloc.graph.measurement_log import Belief, Keyframe
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.types import (
     FloatArray,
     LandmarkMeasurement,
@@ -56,7 +56,7 @@ class _Backend(Protocol):
 
     def pose(self, k: int) -> FloatArray: ...
 
-    def belief(self, k: int, n: int) -> Belief:
+    def belief(self, k: int, n: int) -> PoseWithCovariance:
         """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance."""
 
 
@@ -85,10 +85,10 @@ class _FixedLag:
     def pose(self, k: int) -> FloatArray:
         return _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
 
-    def belief(self, k: int, n: int) -> Belief:
+    def belief(self, k: int, n: int) -> PoseWithCovariance:
         pose = self.pose(k)
         if not n:
-            return Belief(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
+            return PoseWithCovariance(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
         return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
 
 
@@ -110,18 +110,18 @@ class _Full:
     def pose(self, k: int) -> FloatArray:
         return _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
 
-    def belief(self, k: int, n: int) -> Belief:
+    def belief(self, k: int, n: int) -> PoseWithCovariance:
         pose = self.pose(k)
         if not n:
-            return Belief(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
+            return PoseWithCovariance(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
         return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
 
 
-def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> Belief:
+def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
     x = pose_key(k)
     found = isam2.jointMarginalCovariance([x, INSTALLATION])
     known = InstallationBelief(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
-    return Belief(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
+    return PoseWithCovariance(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
 
 
 class IncrementalEstimator(Estimator):
@@ -158,7 +158,7 @@ class IncrementalEstimator(Estimator):
             except _GTSAM_ERRORS:
                 self._solve_carefully(frame, frame.belief)
 
-    def _solve_carefully(self, frame: Keyframe, initial: Belief) -> None:
+    def _solve_carefully(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
         """By QR, as long as the window holds what Cholesky fails at; if that fails too, the sightings are at fault."""
         predicted = frame.belief
         self._careful_until_s = frame.elapsed_s + self._config.lag_s
@@ -176,7 +176,7 @@ class IncrementalEstimator(Estimator):
         newest.linearized_at = newest.belief.pose
         newest.belief = self._replayed([*window, newest], newest.belief)
 
-    def _linearization(self, frame: Keyframe) -> Belief:
+    def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
         """Where to linearize: at the prediction or, far from linear, at what it and the sightings make likeliest."""
         if not frame.sightings or not self._factors.known or is_linear(frame.belief):
             return frame.belief
@@ -185,7 +185,7 @@ class IncrementalEstimator(Estimator):
         corrected = correct(frame.belief, known, measurements, self._factors)
         return frame.belief if corrected is None else corrected[0]
 
-    def _newest(self, k: int) -> Belief:
+    def _newest(self, k: int) -> PoseWithCovariance:
         assert self._backend is not None
         belief = self._backend.belief(k, len(self._factors.installation))
         if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
@@ -231,7 +231,7 @@ class IncrementalEstimator(Estimator):
             self.rebuilt += 1
             newest.belief = self._replayed([newest], initial)
 
-    def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: Belief | None = None) -> None:
+    def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: PoseWithCovariance | None = None) -> None:
         """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""
         if frame.prior is None and prior is None:
             self._slots[frame.k] = frame.elapsed_s, list(slots[: len(frame.motions)])
@@ -268,7 +268,7 @@ class IncrementalEstimator(Estimator):
         ]
 
     def _graph_of(
-        self, frame: Keyframe, initial: Belief, prior: Belief | None
+        self, frame: Keyframe, initial: PoseWithCovariance, prior: PoseWithCovariance | None
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Factors and first values of a keyframe; of the first one in a new backend, also of the installation."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -317,7 +317,7 @@ class IncrementalEstimator(Estimator):
             return
         self._landmarks[m.landmark_id] = initial
 
-    def _rebuild(self, frame: Keyframe, initial: Belief) -> None:
+    def _rebuild(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
         """Build the window again from the log, without the sightings of the offending step."""
         self.rebuilt += 1
         frame.refused = (*frame.refused, *frame.sightings)
@@ -327,7 +327,7 @@ class IncrementalEstimator(Estimator):
         except _GTSAM_ERRORS:  # an older sighting is at fault; what the window knew is in the prediction
             frame.belief = self._replayed([frame], initial)
 
-    def _replayed(self, frames: Sequence[Keyframe], initial: Belief) -> Belief:
+    def _replayed(self, frames: Sequence[Keyframe], initial: PoseWithCovariance) -> PoseWithCovariance:
         """Give these keyframes to a new backend; the belief of the last, whose pose starts at ``initial``."""
         self._backend = backend = self._new_backend()
         self._landmarks.clear()
@@ -337,7 +337,7 @@ class IncrementalEstimator(Estimator):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
-            start = initial if held.k == newest else Belief(held.at, held.belief.cov)
+            start = initial if held.k == newest else PoseWithCovariance(held.at, held.belief.cov)
             graph, values = self._graph_of(held, start, prior)
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
         return self._newest(newest)

@@ -15,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors, sighting_whitening, stacked
 from fgloc.graph.installation import Installation, InstallationBelief
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.observation import Linearized
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
@@ -55,8 +55,11 @@ def fuse_installed(
 
 
 def predict(
-    belief: Belief, known: InstallationBelief, installation: Installation, motions: Sequence[MotionMeasurement]
-) -> Belief:
+    belief: PoseWithCovariance,
+    known: InstallationBelief,
+    installation: Installation,
+    motions: Sequence[MotionMeasurement],
+) -> PoseWithCovariance:
     """Pose and installation after the motions of one step."""
     motion, cov, depends = fuse_installed(motions)
     D = np.zeros((3, len(installation)))
@@ -69,7 +72,7 @@ def predict(
     cross = np.zeros_like(D) if belief.cross is None else belief.cross
     across = A @ cross
     after = A @ belief.cov @ A.T + across @ D.T + D @ across.T + D @ known.cov @ D.T + cov
-    return Belief(se2.compose(belief.pose, motion), 0.5 * (after + after.T), across + D @ known.cov, known)
+    return PoseWithCovariance(se2.compose(belief.pose, motion), 0.5 * (after + after.T), across + D @ known.cov, known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +92,7 @@ class Innovation:
     cov: FloatArray
 
 
-def joint_cov(belief: Belief, known: InstallationBelief) -> FloatArray:
+def joint_cov(belief: PoseWithCovariance, known: InstallationBelief) -> FloatArray:
     """Covariance ``(3 + n, 3 + n)`` of pose and installation."""
     n = len(known.mean)
     P = np.zeros((3 + n, 3 + n))
@@ -117,11 +120,11 @@ def nis_of_each(found: Innovation, lines: Sequence[Linearized]) -> list[float]:
 
 
 def correct(
-    belief: Belief,
+    belief: PoseWithCovariance,
     known: InstallationBelief,
     measurements: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
-) -> tuple[Belief, float] | None:
+) -> tuple[PoseWithCovariance, float] | None:
     """Pose and installation that prediction and sightings make likeliest, by Gauss-Newton.
 
     Returns:
@@ -154,11 +157,13 @@ def correct(
     gain = P @ found.H.T
     after_cov = P - gain @ cho_solve(factor, gain.T, check_finite=False)
     after_cov = 0.5 * (after_cov + after_cov.T)
-    corrected = Belief(pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationBelief(theta, after_cov[3:, 3:]))
+    corrected = PoseWithCovariance(
+        pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationBelief(theta, after_cov[3:, 3:])
+    )
     return corrected, cost
 
 
-def is_linear(belief: Belief) -> bool:
+def is_linear(belief: PoseWithCovariance) -> bool:
     """Whether sightings are as good as linear over what the pose may be."""
     cov = belief.cov
     return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < _LINEAR_RAD**2)

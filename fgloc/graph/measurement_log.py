@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 
 from fgloc.graph.installation import InstallationBelief
-from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
+from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, MotionReadings, Step
 
 
 @dataclass(slots=True, eq=False)
-class Belief:
+class PoseWithCovariance:
     """A pose ``(3,)`` with the covariance ``(3, 3)`` of its right perturbation (the body frame).
 
     With the installation at that time, and the covariance ``(3, n)`` of the two; None: nothing connects them.
@@ -26,7 +26,7 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class LandmarkFactor:
     """A landmark measurement as the graph takes it: carried to its keyframe, with its kernel and its factors.
 
     Factors are immutable and may be held by any number of graphs.
@@ -45,17 +45,17 @@ class Keyframe:
     k: int
     stamp_ns: int
     elapsed_s: float  # the estimator's own time: runs on through clock jumps
-    belief: Belief  # filtered: initial value for the batch, prior for a rebuilt window
-    prior: Belief | None = None  # first keyframe of a segment
+    belief: PoseWithCovariance  # filtered: initial value for the batch, prior for a rebuilt window
+    prior: PoseWithCovariance | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
-    sightings: tuple[Sighting, ...] = ()
-    refused: tuple[Sighting, ...] = ()  # not believed online; for the cost of the batch
+    sightings: tuple[LandmarkFactor, ...] = ()
+    refused: tuple[LandmarkFactor, ...] = ()  # not believed online; for the cost of the batch
     step: Step | None = None  # what was heard, to be measured again
     mode: Mode = Mode.OK
-    readings: Readings = field(default_factory=Readings)  # what the motion sources said ...
+    readings: MotionReadings = field(default_factory=MotionReadings)  # what the motion sources said ...
     off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
     scale: float = 1.0  # on the covariances of sources that disagree
-    doubt: FloatArray | None = None  # added to the covariances of the motions that these make
+    extra_cov: FloatArray | None = None  # added to the covariances of the motions that these make
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
 
@@ -84,7 +84,7 @@ class MeasurementLog:
         if self.keep_all:
             while self._whole < keyframe.k and self.keyframes[self._whole].elapsed_s < horizon:
                 old = self.keyframes[self._whole]
-                old.belief = Belief(old.belief.pose, old.belief.cov)
+                old.belief = PoseWithCovariance(old.belief.pose, old.belief.cov)
                 self._whole += 1
             return
         while self.keyframes:

@@ -104,7 +104,7 @@ def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
     return "corners_small" if side < min_side_px else ""
 
 
-class Parts:
+class FieldChecks:
     """Judges the quaternions and covariances of events; what was assumed is noted."""
 
     def __init__(self, config: GateConfig, note: Callable[[str], None]) -> None:

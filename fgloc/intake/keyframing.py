@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
-from dataclasses import dataclass
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, Verdict
+from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -23,22 +23,14 @@ from fgloc.types import (
 )
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
-_MAX_PATIENCE_NS = 1_000_000_000
+_MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
 _NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
+_SIGHTINGS = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
 
 
-@dataclass(slots=True)
-class _Source:
-    """One topic's punctuality."""
-
-    newest_ns: int
-    patience_ns: int  # how long, by the newest stamp of all, its word is waited for
-    disorder_ns: int = 0  # how far it has stepped back behind its own newest stamp
-
-
-class Stepper:
+class KeyframeBuilder:
     """Turns gated events, in order of receipt, into contiguous steps.
 
     A keyframe is made at the stamp of each sightings event with a sighting, else every ``max_interval_s`` while a
@@ -47,8 +39,8 @@ class Stepper:
     Where nothing was heard, the step reaches to the next event, in pieces of at most 1 s.
 
     A keyframe is closed when every living source has spoken at or beyond it, or ``reorder_s`` later by the newest
-    stamp. Motion events older than the last keyframe are lost ("late"); their source is waited for longer from then on,
-    up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
+    stamp. Motion events older than the last keyframe are lost ("late"), sightings are not; their source is waited for
+    longer in the next minute, up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
 
     The first step of a segment has ``start_ns == stamp_ns``. Depends on the events alone, never on the wall clock.
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
@@ -93,7 +85,9 @@ class Stepper:
         self._last_ns: int | None = None  # the last keyframe
         self._first_ns = 0  # the segment's first keyframe
         self._newest_ns = 0  # newest stamp
-        self._sources: dict[str, _Source] = {}
+        self._received_ns = 0  # when the last event was received
+        self._reached: deque[tuple[int, int]] = deque(maxlen=_MOST_REACHED)  # newest stamps of late, and when they came
+        self._sources: dict[str, Punctuality] = {}
         self._pending: list[SightingsEvent] = []  # by stamp
         self._seen: set[tuple[int, str]] = set()  # sightings of the lag
         self._seen_order: deque[tuple[int, str]] = deque()
@@ -126,7 +120,7 @@ class Stepper:
 
     def push(self, event: Event) -> list[Step]:
         """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
-        if not isinstance(event, (*MOTION_EVENTS, CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        if not isinstance(event, (*MOTION_EVENTS, *_SIGHTINGS)):
             return []
         return self._take(self._clock.judge(event))
 
@@ -134,13 +128,13 @@ class Stepper:
         """The last steps of a recording: nothing more will come."""
         return self._take(self._clock.flush()) + self._finish()
 
-    def _take(self, verdicts: list[tuple[Verdict, Event]]) -> list[Step]:
+    def _take(self, verdicts: list[tuple[ClockVerdict, Event]]) -> list[Step]:
         steps: list[Step] = []
         for verdict, event in verdicts:
-            if verdict is Verdict.STRAY:
+            if verdict is ClockVerdict.OUTLIER:
                 self._stray(event)
                 continue
-            if verdict is Verdict.STARTS:
+            if verdict is ClockVerdict.STARTS:
                 steps += self._jump(event)
             self._insert(event)
             while (stamp_ns := self._candidate()) is not None and self._closed(stamp_ns):
@@ -151,21 +145,26 @@ class Stepper:
 
     def _insert(self, event: Event) -> None:
         stamp = event.stamp_ns
-        self._newest_ns = max(self._newest_ns, stamp)
+        if stamp > self._newest_ns:
+            self._newest_ns = stamp
+            self._reached.append((stamp, event.received_ns))
+        self._received_ns = event.received_ns
         source = self._sources.get(event.topic)
         if source is None:
-            source = self._sources[event.topic] = _Source(stamp, self._reorder_ns)
+            source = self._sources[event.topic] = Punctuality(stamp, event.received_ns, self._reorder_ns)
         elif stamp > source.newest_ns:
             source.newest_ns = stamp
-        else:
-            source.disorder_ns = max(source.disorder_ns, min(source.newest_ns - stamp, self._reorder_ns))
-        if isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        source.received_ns = event.received_ns
+        source.disorder_ns.add(min(source.newest_ns - stamp, self._reorder_ns), self._newest_ns)
+        late = self._last_ns is not None and stamp < self._last_ns
+        late_ns = self._newest_ns - stamp if late else 0
+        hopeless = late_ns > MAX_PATIENCE_NS and isinstance(event, _SIGHTINGS)  # they are used at whatever time
+        source.late_ns.add(0 if hopeless else late_ns, self._newest_ns)
+        if isinstance(event, _SIGHTINGS):
             self._insert_sightings(event)
             return
         name = _NAMES[type(event)]
-        if self._last_ns is not None and stamp < self._last_ns:
-            behind = self._newest_ns - stamp
-            source.patience_ns = max(source.patience_ns, min(5 * behind // 4, _MAX_PATIENCE_NS))
+        if late:
             self.rejections[f"{name}.late"] += 1
         elif not self._motion[type(event)].insert(event):
             self.rejections[f"{name}.duplicate"] += 1
@@ -193,7 +192,7 @@ class Stepper:
             self.rejections[f"{_NAMES.get(type(event), 'sightings')}.future"] += 1
             count, _ = self._offsets.get(event.topic, (0, 0))
             self._offsets[event.topic] = [count + 1, ahead]
-        elif isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        elif isinstance(event, _SIGHTINGS):
             self._insert_sightings(event)
         else:
             self.rejections[f"{_NAMES[type(event)]}.late"] += 1
@@ -245,15 +244,21 @@ class Stepper:
 
     def _closed(self, stamp_ns: int) -> bool:
         """Whether nothing before this time is still expected."""
-        newest = self._newest_ns
+        newest, waited_ns = self._newest_ns, self._waited(stamp_ns)
         if newest < stamp_ns + (self._reorder_ns if self._last_ns is None else 0):
             return False
         return all(
-            source.newest_ns >= stamp_ns + source.disorder_ns
-            or newest >= stamp_ns + source.patience_ns
-            or newest > source.newest_ns + _ALIVE_NS
+            source.newest_ns >= stamp_ns + source.disorder_ns.ns
+            or (newest >= stamp_ns + source.patience_ns and waited_ns >= source.patience_ns // 2)
+            or (newest > source.newest_ns + _ALIVE_NS and self._received_ns - source.received_ns >= _ALIVE_NS // 2)
             for source in self._sources.values()
         )
+
+    def _waited(self, stamp_ns: int) -> int:
+        """How long ago, by receive times, this stamp was reached: after a stall, topics come one after another."""
+        while len(self._reached) > 1 and self._reached[0][0] < stamp_ns:
+            self._reached.popleft()
+        return self._received_ns - self._reached[0][1] if self._reached else 0
 
     def _step(self, stamp_ns: int) -> Step:
         """Close the keyframe at this time."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from fgloc.config import GateConfig
-from fgloc.intake.field_checks import Changes, Parts, judge_corners
+from fgloc.intake.field_checks import Changes, FieldChecks, judge_corners
 from fgloc.types import (
     CornersEvent,
     MarkerCorners,
@@ -26,14 +26,14 @@ _KEPT_IDS = 1000
 S = TypeVar("S", MarkerCorners, MarkerPose, RangeBearing)
 
 
-class SightingsGate:
+class SightingsValidator:
     """Validates sightings; see `fgloc.gate.Gate`."""
 
     def __init__(
         self,
         config: GateConfig,
         known_ids: Collection[int] | None,
-        parts: Parts,
+        parts: FieldChecks,
         rejections: Counter[str],
         note: Callable[[str], None],
     ) -> None:

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from fgloc.config import Role
-from fgloc.types import Heard
+from fgloc.types import TopicTimes
 
 _MOST = 100_000  # times kept of a topic; of more, every second is dropped
 
 
-class Attendance:
+class TopicActivity:
     """Notes who was heard. A topic that is expected and never speaks is the trace of a mismatch that nobody reports.
 
     Example:
@@ -29,7 +29,7 @@ class Attendance:
         self._topics: dict[str, _Times] = {}
         self._silent = set(expected.values())
 
-    def hear(self, topic: str, stamp_ns: int) -> None:
+    def record(self, topic: str, stamp_ns: int) -> None:
         """Note a message that could be used."""
         times = self._topics.get(topic)
         if times is None:
@@ -55,7 +55,7 @@ class Attendance:
             if topic in self._silent
         )
 
-    def spans(self, origin_ns: int) -> dict[str, Heard]:
+    def spans(self, origin_ns: int) -> dict[str, TopicTimes]:
         """When each topic was heard, in seconds from a time."""
         return {topic: times.heard(origin_ns) for topic, times in sorted(self._topics.items())}
 
@@ -81,6 +81,6 @@ class _Times:
             self._kept = self._kept[::2]
             self._every *= 2
 
-    def heard(self, origin_ns: int) -> Heard:
+    def heard(self, origin_ns: int) -> TopicTimes:
         seconds = np.asarray((np.array(self._kept, dtype=np.int64) - origin_ns) * 1e-9, dtype=np.float64)
-        return Heard(seconds, self._count, self._every, self._longest * 1e-9)
+        return TopicTimes(seconds, self._count, self._every, self._longest * 1e-9)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from fgloc.intake.clock_guard import MOTION_EVENTS
-from fgloc.types import CornersEvent, Event, ImageEvent, MarkerPosesEvent, RangeBearingEvent
+from fgloc.types import CornersEvent, Event, ImageEvent, JointsEvent, MarkerPosesEvent, RangeBearingEvent
 
 _RESET_NS = 5_000_000_000  # a topic's delay that changes by more is not the network's
 _COUNT = 3  # messages that agree on the new delay, before ...
@@ -18,14 +18,30 @@ _SHARE = 0.1  # of a new delay in the mean
 _STAMPED = (*MOTION_EVENTS, ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent)
 
 
+Source = tuple[str, tuple[str, ...]]
+
+
+def source_of(event: Event) -> Source:
+    """Who speaks: a topic; of joint states, one for each set of joints, as wheels and arm may share the topic."""
+    return event.topic, event.names if isinstance(event, JointsEvent) else ()
+
+
 @dataclass(slots=True)
 class _Clock:
-    """What is known of one topic's stamps."""
+    """What is known of one source's stamps."""
 
     delay_ns: float  # usual receive time less stamp
     received_ns: int  # of the newest message
     offset_ns: int = 0  # added to its stamps
     held: list[Event] = field(default_factory=list)  # with another delay than usual
+
+    def change_ns(self, event: Event) -> int:
+        """How much later than usual a message seems."""
+        return _delay(event) - self.offset_ns - round(self.delay_ns)
+
+    def begin_anew(self, event: Event) -> None:
+        """Take its delay for the usual one."""
+        self.delay_ns, self.offset_ns = _delay(event), 0
 
 
 class TopicClocks:
@@ -39,7 +55,8 @@ class TopicClocks:
 
     def __init__(self) -> None:
         """Nothing has come in."""
-        self._clocks: dict[str, _Clock] = {}
+        self._clocks: dict[Source, _Clock] = {}
+        self._jump_ns: int | None = None  # how much later than before the last common jump made messages seem
         self._resets: dict[str, tuple[int, int]] = {}  # by topic: how often, offset of the last [ns]
 
     @property
@@ -55,10 +72,11 @@ class TopicClocks:
         """Events that may pass, in order of receipt: mostly this one."""
         if not isinstance(event, _STAMPED):
             return [event]
-        clock = self._clocks.get(event.topic)
+        source = source_of(event)
+        clock = self._clocks.get(source)
         delay = event.received_ns - event.stamp_ns
         if clock is None:
-            self._clocks[event.topic] = _Clock(delay, event.received_ns)
+            self._clocks[source] = _Clock(delay, event.received_ns)
             return [event]
         clock.received_ns = event.received_ns
         delay -= clock.offset_ns
@@ -86,7 +104,11 @@ class TopicClocks:
             yield from held
             held.clear()
         held.append(event)
-        if self._all_jumped(event.received_ns):
+        if self._jump_ns is not None and abs(clock.change_ns(event) - self._jump_ns) <= _AGREE_NS:
+            clock.begin_anew(event)
+            yield from held
+            held.clear()
+        elif self._all_jumped(event.received_ns):
             yield from self._jump()
         elif event.received_ns - held[0].received_ns > _PATIENCE_NS:
             yield from held
@@ -95,15 +117,16 @@ class TopicClocks:
     def _witnessed(self, now_ns: int) -> list[Event]:
         """A topic came with its usual delay: one that has been held for a while is alone with its own."""
         released: list[Event] = []
-        for topic, clock in self._clocks.items():
+        for clock in self._clocks.values():
             if len(clock.held) >= _COUNT and now_ns - clock.held[0].received_ns >= _SPAN_NS:
-                released += self._rebase(clock, topic)
+                released += self._rebase(clock)
         return released
 
-    def _rebase(self, clock: _Clock, topic: str) -> list[Event]:
+    def _rebase(self, clock: _Clock) -> list[Event]:
         """Correct a topic's stamps so that its delay is the usual one again."""
         mean = sum(_delay(e) for e in clock.held) // len(clock.held)
         clock.offset_ns = mean - round(clock.delay_ns)
+        topic = clock.held[0].topic
         self._resets[topic] = (self._resets.get(topic, (0, 0))[0] + 1, clock.offset_ns)
         released, clock.held = [_shifted(e, clock.offset_ns) for e in clock.held], []
         return released
@@ -117,7 +140,8 @@ class TopicClocks:
         held = self.flush()
         for clock in self._clocks.values():
             if clock.held:
-                clock.delay_ns, clock.offset_ns = _delay(clock.held[-1]), 0
+                self._jump_ns = clock.change_ns(clock.held[-1])
+                clock.begin_anew(clock.held[-1])
                 clock.held = []
         yield from held
 

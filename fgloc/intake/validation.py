@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import GateConfig
-from fgloc.intake.field_checks import PLANAR, Changes, Parts
-from fgloc.intake.sighting_validation import EMPTIED, SightingsGate
+from fgloc.intake.field_checks import PLANAR, Changes, FieldChecks
+from fgloc.intake.sighting_validation import EMPTIED, SightingsValidator
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -46,7 +46,7 @@ class _Topic:
     back: bool = False  # the last stamp was far behind the newest
 
 
-class Gate:
+class EventValidator:
     """Validates events one by one; what it lets through can be computed with.
 
     An event comes back as it was, or as a repaired copy, or not at all (None). Repairs:
@@ -79,8 +79,8 @@ class Gate:
         self.rejections: Counter[str] = Counter()
         self._config = config
         self._notes: dict[str, None] = {}  # an ordered set
-        self._parts = Parts(config, self._note)
-        self._sightings = SightingsGate(config, known_ids, self._parts, self.rejections, self._note)
+        self._parts = FieldChecks(config, self._note)
+        self._sightings = SightingsValidator(config, known_ids, self._parts, self.rejections, self._note)
         self._seen: Counter[str] = Counter()  # events by sensor
         self._topics: dict[str, _Topic] = {}
         self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 
 from fgloc.errors import EstimatorError, FglocError
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import Reception, role_of
 from fgloc.live.run import OnlineRun
@@ -44,7 +44,7 @@ class Engine:
         self.step_s = self.longest_s = 0.0
         self._run = run
         self._startup_s = startup_s
-        self._inbox: deque[Queued | Belief] = deque()
+        self._inbox: deque[Queued | PoseWithCovariance] = deque()
         self._line: deque[Queued] = deque()  # gated, in order; only the estimation thread changes it
         self._held: deque[Queued] = deque(maxlen=_MOST_EVENTS)  # before the parts are built
         self._first_ns: int | None = None
@@ -75,7 +75,7 @@ class Engine:
                     self.worker.discard(lost)
             self.changed.notify_all()
 
-    def reset_pose(self, belief: Belief) -> None:
+    def reset_pose(self, belief: PoseWithCovariance) -> None:
         """Queue a pose to go on from."""
         with self.changed:
             self.check_alive()
@@ -151,7 +151,7 @@ class Engine:
                 self._working = False
                 self.changed.notify_all()
 
-    def _next_batch(self) -> list[Queued | Belief] | None:
+    def _next_batch(self) -> list[Queued | PoseWithCovariance] | None:
         """What has come in, possibly nothing when only an image is done; None at the end."""
         with self.changed:
             self.changed.wait_for(lambda: self._closing or self._inbox or self._image_done())
@@ -168,9 +168,9 @@ class Engine:
         done = bool(self._line) and self._line[0].state not in _UNFOUND
         return done or self.worker.error is not None
 
-    def _take(self, item: Queued | Belief) -> None:
+    def _take(self, item: Queued | PoseWithCovariance) -> None:
         """Take an event through the gate, or hold it until the parts are built."""
-        if isinstance(item, Belief):
+        if isinstance(item, PoseWithCovariance):
             return self._run.reset_pose(item)
         event, facts = item.event, self._run.facts
         if event is None:  # an image that was dropped

@@ -12,14 +12,14 @@ from typing import Any, TypeVar
 
 from fgloc import se2
 from fgloc.assembly import Assembly
-from fgloc.fusion.motion import MotionSources
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.joint import predict
-from fgloc.graph.measurement_log import Belief
-from fgloc.intake.clock_guard import ClockGuard, Verdict
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.status import LivePose
-from fgloc.motion.source import LearnedMotion
+from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import (
     CommandEvent,
@@ -49,7 +49,7 @@ class _Anchor:
     """A keyframe to carry on from: the estimate, and the motion sources as they were then."""
 
     stamp_ns: int
-    belief: Belief
+    belief: PoseWithCovariance
     known: InstallationBelief
     added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
     mode: Mode
@@ -86,9 +86,9 @@ class Extrapolator:
         """Take in a motion event that passed the gate."""
         with self._lock:
             for verdict, judged in self._clock.judge(event):
-                if verdict is Verdict.STRAY:
+                if verdict is ClockVerdict.OUTLIER:
                     continue
-                if verdict is Verdict.STARTS:
+                if verdict is ClockVerdict.STARTS:
                     for events in self._events.values():
                         events.clear()
                     self._anchors.clear()
@@ -111,7 +111,7 @@ class Extrapolator:
             known = belief.installation or installation.believed
             off, scale = frame.off, frame.scale
         else:
-            belief, known, off, scale = Belief(estimate.pose, body), installation.believed, {}, 1.0
+            belief, known, off, scale = PoseWithCovariance(estimate.pose, body), installation.believed, {}, 1.0
         made = _Anchor(
             stamp_ns=estimate.stamp_ns,
             belief=belief,
@@ -175,9 +175,9 @@ class Extrapolator:
         first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
 
-    def _carried(self, anchor: _Anchor, step: Step) -> Belief:
+    def _carried(self, anchor: _Anchor, step: Step) -> PoseWithCovariance:
         parts, localizer = self._parts, self._parts.localizer
-        sources = MotionSources(
+        sources = MotionFusion(
             self._config,
             anchor.wheels,
             None if anchor.learned is None else anchor.learned.fork(anchor.learned.model),

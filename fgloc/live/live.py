@@ -12,14 +12,14 @@ import numpy as np
 
 from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError, OutputError
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.engine import Engine
 from fgloc.live.events import EventMaker
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
 from fgloc.live.status import LivePose, LiveStatus
-from fgloc.motion import load_model
+from fgloc.sensors.learned import load_model
 from fgloc.sensors.maps import load_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
 
@@ -116,7 +116,7 @@ class Live(EventMaker):
         mean, spread = np.asarray(pose, dtype=float), np.asarray(sigmas, dtype=float)
         if not (mean.shape == spread.shape == (3,) and np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
             raise EstimatorError(f"pose {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0")
-        self._engine.reset_pose(Belief(mean, np.diag(spread**2)))
+        self._engine.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
         """Have a function called with every keyframe's estimate, in the estimation thread: it should be quick.

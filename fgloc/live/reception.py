@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fgloc.intake.topic_clocks import TopicClocks
+from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
 from fgloc.live.facts import ROLE_OF
 from fgloc.live.status import TopicMeter, TopicStatus
 from fgloc.types import Event
@@ -40,7 +40,7 @@ class Reception:
     def __init__(self) -> None:
         """Nothing has arrived."""
         self.dropped: Counter[str] = Counter()
-        self._publishers: dict[str, _Publisher] = {}
+        self._publishers: dict[Source, _Publisher] = {}
         self._meters: dict[str, TopicMeter] = {}
         self._clocks = TopicClocks()
         self._notes: dict[str, None] = {}  # an ordered set
@@ -48,7 +48,7 @@ class Reception:
     def receive(self, event: Event, publisher: str) -> list[Event]:
         """The events that are to be used now: mostly this one; see `TopicClocks`."""
         role = role_of(event)
-        first = self._publishers.setdefault(event.topic, _Publisher(publisher, event.received_ns))
+        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
         if not first.has_the_topic(publisher, event.received_ns):
             self.dropped[role] += 1
             self.note(

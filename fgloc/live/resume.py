@@ -9,7 +9,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import quaternion_yaw
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.state import OdometryState, RunState, row3
 from fgloc.types import FloatArray, Mode, OdometryEvent, Step
 
@@ -29,7 +29,7 @@ def odometry_state(event: OdometryEvent) -> OdometryState | None:
     return OdometryState(topic=event.topic, frame_id=event.frame_id, stamp_ns=event.stamp_ns, pose=row3(pose))
 
 
-def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> tuple[Belief | None, str]:
+def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> tuple[PoseWithCovariance | None, str]:
     """The pose at the first step of a new run.
 
     Args:
@@ -46,7 +46,7 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
         gap_s = max((wall_ns - state.saved_ns) * 1e-9, 0.0)
     if state.mode not in _KNOWN:
         return None, f"Resumed {gap_s:.1f} s later, without a pose: the last run was {state.mode}."
-    saved = Belief(np.array(state.pose), np.array(state.cov))
+    saved = PoseWithCovariance(np.array(state.pose), np.array(state.cov))
     motion = _by_odometry(state, step, gap_s)
     if motion is not None:
         cov, how = _odometry_cov(state, motion, gap_s, config), "the odometry went on and tells the motion since"
@@ -55,7 +55,7 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
         speed, turn = max(state.fastest[0], _LEAST_SPEED), max(state.fastest[1], _LEAST_TURN)
         cov = np.diag(np.square([speed * gap_s, speed * gap_s, turn * gap_s]) + 1e-9)
     ad = se2.adjoint(se2.inverse(motion))
-    belief = Belief(se2.compose(saved.pose, motion), ad @ saved.cov @ ad.T + cov)
+    belief = PoseWithCovariance(se2.compose(saved.pose, motion), ad @ saved.cov @ ad.T + cov)
     x, y, yaw = np.sqrt(np.diag(belief.cov))
     if max(x, y) > _USELESS_M or yaw > _USELESS_RAD:
         return None, f"Resumed {gap_s:.1f} s later; {how}, so the pose is searched for on the whole map."

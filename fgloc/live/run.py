@@ -11,7 +11,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble_stream
 from fgloc.config import Config
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.facts import LiveFacts
 from fgloc.live.resume import carried_over, odometry_state
@@ -78,7 +78,7 @@ class OnlineRun:
         self._map = landmark_map
         self._fingerprint = fingerprint(landmark_map)
         self._resumed = resumed
-        self._reset: Belief | None = None  # a pose that was given, for the next step
+        self._reset: PoseWithCovariance | None = None  # a pose that was given, for the next step
         self._last_step: Step | None = None
         self._odometry: OdometryEvent | None = None
         self._fastest = (0.0, 0.0)
@@ -104,7 +104,7 @@ class OnlineRun:
         self.extrapolator = Extrapolator(parts)
         return parts
 
-    def reset_pose(self, belief: Belief) -> None:
+    def reset_pose(self, belief: PoseWithCovariance) -> None:
         """Go on from this pose at the next step."""
         self._reset, self._resumed = belief, None
 
@@ -167,7 +167,7 @@ class OnlineRun:
         if gyro is not None and state.gyro is not None:
             gyro.resume(state.gyro.bias, state.gyro.bias_variance)
         for landmark_id, displacement in state.excluded.items():
-            localizer.weights.quarantine.accuse(landmark_id, np.array(displacement))
+            localizer.association.exclusion.accuse(landmark_id, np.array(displacement))
         self._fastest = state.fastest
 
     def snapshot(self) -> RunState | None:
@@ -182,7 +182,7 @@ class OnlineRun:
             max(self._fastest[1], abs(float(twist[2]))),
         )
         installed = localizer.estimator.installed
-        moved = localizer.weights.quarantine.displacements
+        moved = localizer.association.exclusion.displacements
         return RunState(
             map_fingerprint=self._fingerprint,
             saved_ns=time.time_ns(),

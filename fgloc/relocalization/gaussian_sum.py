@@ -18,7 +18,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.joint import fuse
-from fgloc.graph.measurement_log import Belief
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, RangeBearingMeasurement
 
 _RING = 24  # pieces of a ring, 15 degrees apart
@@ -64,7 +64,7 @@ class GaussianSum:
         for m in beacons[:: -(-len(beacons) // _MAX_SIGHTINGS) or 1]:
             self._take(m)
 
-    def belief(self) -> Belief | None:
+    def belief(self) -> PoseWithCovariance | None:
         """Mean and covariance of the whole sum, with what the bent rings add; None before the first sighting."""
         if not len(self.poses):
             return None
@@ -81,14 +81,14 @@ class GaussianSum:
         off = np.column_stack([x - mean[0], y - mean[1], se2.wrap_array(yaw - middle)])
         mean[2] = se2.wrap(middle + float(share @ off[:, 2]))
         off[:, 2] -= share @ off[:, 2]
-        return Belief(mean, se2.rotate_cov((off * share[:, None]).T @ off, -float(mean[2])))
+        return PoseWithCovariance(mean, se2.rotate_cov((off * share[:, None]).T @ off, -float(mean[2])))
 
-    def likeliest(self) -> Belief | None:
+    def likeliest(self) -> PoseWithCovariance | None:
         """The hypothesis with the largest weight; None before the first sighting."""
         if not len(self.poses):
             return None
         best = int(self.log_weights.argmax())
-        return Belief(self.poses[best], self.covs[best])
+        return PoseWithCovariance(self.poses[best], self.covs[best])
 
     def _predict(self, motion: FloatArray, cov: FloatArray) -> None:
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])

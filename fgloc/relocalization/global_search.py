@@ -13,10 +13,10 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import fuse
-from fgloc.graph.measurement_log import Belief
-from fgloc.graph.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import GaussianSum
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, Agreed, SightingKey, apart
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, SightingKey, apart
+from fgloc.relocalization.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
@@ -26,8 +26,8 @@ from fgloc.types import (
     LandmarkMeasurement,
     MarkerPoseMeasurement,
     MotionMeasurement,
+    MotionReadings,
     RangeBearingMeasurement,
-    Readings,
     Step,
 )
 
@@ -52,17 +52,17 @@ _RETRY_NS = 800_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Collected:
+class SearchStep:
     """One step of the time before the first pose was known."""
 
     step: Step
     motions: tuple[MotionMeasurement, ...]
     sightings: tuple[LandmarkMeasurement, ...]
-    readings: Readings
+    readings: MotionReadings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class InitialPose:
     """The place that explains the collected sightings.
 
     Attributes:
@@ -72,13 +72,13 @@ class Start:
         contrary: sightings that contradict the place, by stamp and landmark: the weak prior could not refuse them.
     """
 
-    steps: tuple[Collected, ...]
-    first: Belief
-    newest: Belief
-    contrary: frozenset[SightingKey]
+    steps: tuple[SearchStep, ...]
+    first: PoseWithCovariance
+    newest: PoseWithCovariance
+    outliers: frozenset[SightingKey]
 
 
-class Initializer:
+class GlobalSearch:
     """Collects steps while the pose is unknown.
 
     Attributes:
@@ -94,8 +94,8 @@ class Initializer:
         self._keep_all = keep_all
         self._map = landmark_map
         self._factors = factors
-        self._steps: deque[Collected] = deque()
-        self._earlier: list[Collected] = []  # with keep_all: before those, since the segment began
+        self._steps: deque[SearchStep] = deque()
+        self._earlier: list[SearchStep] = []  # with keep_all: before those, since the segment began
         self._first = False  # whether the segment has had no pose yet
         self.hypotheses = GaussianSum(config, landmark_map)
         self._since_ns: int | None = None  # the first sighting of the search
@@ -125,9 +125,9 @@ class Initializer:
         step: Step,
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkMeasurement],
-        readings: Readings | None = None,
+        readings: MotionReadings | None = None,
         known: bool = False,
-    ) -> Start | None:
+    ) -> InitialPose | None:
         """Add a step; return the start once one place explains what was seen.
 
         Args:
@@ -138,7 +138,7 @@ class Initializer:
             known: the robot is believed to be elsewhere. Then it takes two landmarks, and nearly everything to agree:
                 some wrong ids agree with some place always.
         """
-        self._steps.append(Collected(step, tuple(motions), tuple(sightings), readings or Readings()))
+        self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
         while self._steps[0].step.stamp_ns < horizon or len(self._steps) > _MAX_STEPS:
             forgotten = self._steps.popleft()
@@ -151,7 +151,7 @@ class Initializer:
         best = self._solve(known) if sightings and self._due(step.stamp_ns) else None
         if best is None:
             return None
-        return self._start(Belief(best.fit.pose, best.fit.cov), best.contrary)
+        return self._start(PoseWithCovariance(best.fit.pose, best.fit.cov), best.outliers)
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
@@ -162,7 +162,7 @@ class Initializer:
         self._tried_ns = stamp_ns
         return True
 
-    def give_up(self) -> Start | None:
+    def give_up(self) -> InitialPose | None:
         """The segment is over: all its steps, from the likeliest place; None if none are kept.
 
         Without any sighting the first pose is put at the map's origin, and the others are relative to it.
@@ -172,17 +172,17 @@ class Initializer:
         likeliest = self.hypotheses.likeliest()
         if likeliest is not None:
             return self._start(likeliest, frozenset())
-        origin = Belief(np.zeros(3), ORIGIN.copy())
+        origin = PoseWithCovariance(np.zeros(3), ORIGIN.copy())
         return dataclasses.replace(self._start(origin, frozenset()), first=origin)
 
-    def _start(self, newest: Belief, contrary: frozenset[SightingKey]) -> Start:
+    def _start(self, newest: PoseWithCovariance, outliers: frozenset[SightingKey]) -> InitialPose:
         self.waiting = False
         steps = (*self._earlier, *self._steps)
-        first = Belief(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
+        first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
         self.forget()
-        return Start(steps, first, newest, contrary)
+        return InitialPose(steps, first, newest, outliers)
 
-    def _solve(self, known: bool) -> Agreed | None:
+    def _solve(self, known: bool) -> PoseConsensus | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2:
             return None  # one landmark alone may have been moved, or misread
@@ -201,9 +201,9 @@ class Initializer:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
-        if not best.certain or (known and not best.compelling):
+        if not best.certain or (known and not best.overrides_prior):
             return None
-        if not known and not self._checked(best, here) and not (best.sharp and self._waited()):
+        if not known and not self._checked(best, here) and not (best.well_determined and self._waited()):
             return None
         return best
 
@@ -212,10 +212,10 @@ class Initializer:
         since = self._steps[-1].step.stamp_ns - (self._since_ns or 0)
         return since > _PATIENCE * self._config.estimator.initialise_s * 1e9
 
-    def _checked(self, best: Agreed, sightings: Sequence[LandmarkMeasurement]) -> bool:
+    def _checked(self, best: PoseConsensus, sightings: Sequence[LandmarkMeasurement]) -> bool:
         """Whether beacons tell this place even if any one of them is left out: so that no single one can feign it."""
         agreeing = [
-            m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.contrary
+            m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
         few = self._map is not None and len(self._map) < _CHECKABLE
         if few or not all(isinstance(m, RangeBearingMeasurement) for m in agreeing):
@@ -226,7 +226,7 @@ class Initializer:
                 return False
         return True
 
-    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> Agreed | None:
+    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
         fit = self._fit(place, sightings, _ITERATIONS)
         if fit is None:
@@ -249,15 +249,15 @@ class Initializer:
         residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in heard}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
-        contrary = [m for m in sightings if not any(m is other for other in agreeing)]
-        return Agreed(
+        outliers = [m for m in sightings if not any(m is other for other in agreeing)]
+        return PoseConsensus(
             fit,
             share,
             len(residuals),
             sum(residuals.values()) - 3,
             frozenset(told),
-            frozenset(m.landmark_id for m in contrary) - frozenset(told),
-            frozenset((m.stamp_ns, m.landmark_id) for m in contrary),
+            frozenset(m.landmark_id for m in outliers) - frozenset(told),
+            frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
@@ -298,7 +298,7 @@ class Initializer:
                 motion, cov = se2.compose(motion, back), se2.compose_cov(cov, back, ad @ step_cov @ ad.T)
 
 
-def _travelled(steps: Sequence[Collected]) -> FloatArray:
+def _travelled(steps: Sequence[SearchStep]) -> FloatArray:
     """``T_oldest_newest``."""
     travelled = np.zeros(3)
     for collected in steps[1:]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
-from fgloc.graph.pose_fit import Fit
+from fgloc.relocalization.pose_fit import Fit
 from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
@@ -29,7 +29,7 @@ SightingKey = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Agreed:
+class PoseConsensus:
     """A place, fitted to the sightings that it explains: their share of all, and of how many landmarks they are.
 
     The share is of the information, because of what was carried far any place explains anything; that of a landmark
@@ -41,8 +41,8 @@ class Agreed:
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
     agreeing: frozenset[int]  # landmarks that it explains ...
-    opposing: frozenset[int]  # ... and those that it does not
-    contrary: frozenset[SightingKey]  # sightings that it does not
+    outlier_landmarks: frozenset[int]  # ... and those that it does not
+    outliers: frozenset[SightingKey]  # sightings that it does not
 
     @property
     def certain(self) -> bool:
@@ -50,18 +50,18 @@ class Agreed:
         if self.share < _LEAST_SHARE.get(self.landmarks, _LEAST_SHARE_OF_MANY) or self.fit.dof < 4:
             return False
         whole = self.share >= _WHOLE_SHARE
-        if (self.opposing or not whole) and self.redundancy < REDUNDANT:
+        if (self.outlier_landmarks or not whole) and self.redundancy < REDUNDANT:
             return False
         cost, sigma = (MAX_COST_PER_DOF, MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
         return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
 
     @property
-    def sharp(self) -> bool:
+    def well_determined(self) -> bool:
         """Whether it is known well enough to be a place although nothing checks it."""
         return bool((np.sqrt(np.diag(self.fit.cov)) <= _SHARP * MAX_SIGMA).all())
 
     @property
-    def compelling(self) -> bool:
+    def overrides_prior(self) -> bool:
         """Whether it says that the robot is not where it was believed to be."""
         known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
         return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * REDUNDANT

@@ -11,10 +11,19 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.gating import NEAR_M, NEAR_RAD
-from fgloc.graph.measurement_log import Belief, Sighting
-from fgloc.relocalization.global_search import ORIGIN, Initializer, Start
-from fgloc.types import Decision, FloatArray, LandmarkMap, LandmarkMeasurement, Mode, MotionMeasurement, Readings, Step
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.global_search import ORIGIN, GlobalSearch, InitialPose
+from fgloc.robust.association import NEAR_M, NEAR_RAD
+from fgloc.types import (
+    Decision,
+    FloatArray,
+    LandmarkMap,
+    LandmarkMeasurement,
+    Mode,
+    MotionMeasurement,
+    MotionReadings,
+    Step,
+)
 
 _NAMED = 3  # jumps
 _CONFIRMED = 2  # sightings in excess of those that speak against it: more confirm a given pose
@@ -25,7 +34,7 @@ _WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misre
 _ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
-class Whereabouts:
+class Tracking:
     """Looks for the robot while its place is unknown or contradicted, and keeps the time since the last fix.
 
     A first pose that was given, and that sightings contradict from the start, holds against them: whether it or the map
@@ -33,7 +42,8 @@ class Whereabouts:
 
     Attributes:
         lost: nothing explains where the robot is.
-        defied: how far ``(3,)`` from the given first pose, in its frame, sightings put the robot; None: they did not.
+        initial_pose_conflict: pose ``(3,)`` at which sightings put the robot, in the frame of the given first pose that
+            they contradict; None: they did not.
     """
 
     def __init__(
@@ -43,9 +53,9 @@ class Whereabouts:
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
         self._known = factors.known
-        self._initializer = Initializer(config, landmark_map, factors, keep_all)
+        self._search = GlobalSearch(config, landmark_map, factors, keep_all)
         self.lost = False
-        self.defied: FloatArray | None = None
+        self.initial_pose_conflict: FloatArray | None = None
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._speaking_for = self._speaking_against = 0  # sightings
@@ -56,7 +66,9 @@ class Whereabouts:
         self._places: FloatArray = np.array(places).reshape(-1, 2)
         self._never_found = False
 
-    def begin_segment(self, last: Belief | None, known: Belief | None = None) -> Belief | None:
+    def begin_segment(
+        self, last: PoseWithCovariance | None, known: PoseWithCovariance | None = None
+    ) -> PoseWithCovariance | None:
         """The clock jumped, or the run begins; where the robot starts, if that is known without sightings.
 
         Args:
@@ -64,18 +76,22 @@ class Whereabouts:
             known: where it starts, by what the user or an earlier run says.
         """
         self.lost = self._given = self._told = False
-        self._initializer.reset()
+        self._search.reset()
         if known is not None:
             return known
         given = self._config.initial_pose
         if given is not None and last is None:
             self._given, self._speaking_for, self._speaking_against = True, 0, 0
-            return Belief(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
+            return PoseWithCovariance(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
         if self._known:
             return None
-        return Belief(np.zeros(3), ORIGIN.copy()) if last is None else Belief(last.pose, _ANYWHERE.copy())
+        return (
+            PoseWithCovariance(np.zeros(3), ORIGIN.copy())
+            if last is None
+            else PoseWithCovariance(last.pose, _ANYWHERE.copy())
+        )
 
-    def elapse(self, seconds: float) -> None:
+    def advance_time(self, seconds: float) -> None:
         """Time goes on."""
         self._clock_s += seconds
 
@@ -85,57 +101,57 @@ class Whereabouts:
         return self._clock_s - self._fix_s
 
     @property
-    def dark(self) -> bool:
+    def dead_reckoning(self) -> bool:
         """Whether the last fix is so long ago that the robot is dead reckoning."""
         return self.blind_s > self._config.dead_reckoning_after_s
 
     @property
     def waiting(self) -> bool:
         """Whether the pose is looked for on the whole map."""
-        return self._initializer.waiting
+        return self._search.waiting
 
     @property
     def mode(self) -> Mode:
         """Of the newest estimate."""
         if self.lost:
             return Mode.LOST
-        return Mode.DEAD_RECKONING if self.dark else Mode.OK
+        return Mode.DEAD_RECKONING if self.dead_reckoning else Mode.OK
 
     @property
-    def holds_given(self) -> bool:
+    def keeps_initial_pose(self) -> bool:
         """Whether sightings speak against a given first pose, and no more of them for it."""
         return self._given and self._speaking_against >= max(self._speaking_for, 1)
 
-    def hold(
-        self, believed: list[Sighting], refused: list[Sighting], decisions: list[Decision]
-    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
-        """Judge a given first pose by what `Weights.weigh` makes of sightings; while it holds, believe none of them.
+    def gate_initial_pose(
+        self, believed: list[LandmarkFactor], refused: list[LandmarkFactor], decisions: list[Decision]
+    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
+        """Judge a given first pose by what `Association.judge` makes of sightings; while it holds, accept none of them.
 
         One that agrees with a contradicted pose does so by accident, and would drag it along.
         """
-        if self.dark and not self._speaking_against:  # it is the motion that may be wrong by now
+        if self.dead_reckoning and not self._speaking_against:  # it is the motion that may be wrong by now
             self._given = False
         self._speaking_for += len(believed)
         self._speaking_against += len(refused)
         if self._speaking_for > self._speaking_against + _CONFIRMED:
             self._given = False
-        if not self.holds_given:
+        if not self.keeps_initial_pose:
             return believed, refused, decisions
         told = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
         return [], [*refused, *believed], told
 
-    def fixed(self, believed: bool = True) -> None:
+    def record_fix(self, believed: bool = True) -> None:
         """The robot is where it is believed to be; ``believed``: sightings said so."""
         self._fix_s = self._clock_s
         if believed:
             self.lost = False
-            self._initializer.forget()
+            self._search.forget()
 
-    def defy(self, believed: Belief, place: Belief) -> None:
+    def record_conflict(self, believed: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """Sightings agree on another place than the given one."""
-        self.defied = se2.between(believed.pose, place.pose)
+        self.initial_pose_conflict = se2.between(believed.pose, place.pose)
 
-    def kidnapped_cov(self, contradicting: int, belief: Belief) -> FloatArray:
+    def kidnapped_cov(self, contradicting: int, belief: PoseWithCovariance) -> FloatArray:
         """What is added to the covariance ``(3, 3)`` of a pose that all landmarks seen since the last fix contradict.
 
         Either each of them is wrong by itself, or the robot was carried away, and may be where the landmarks are.
@@ -155,9 +171,9 @@ class Whereabouts:
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""
         self.lost = True
-        self._initializer.waiting = True
+        self._search.waiting = True
 
-    def nowhere(self, belief: Belief | None) -> bool:
+    def is_unlocalized(self, belief: PoseWithCovariance | None) -> bool:
         """Whether the pose is so little known that only a search of the map can find it again."""
         if belief is None or not self._known:
             return False
@@ -166,30 +182,30 @@ class Whereabouts:
 
     def start_known(self) -> None:
         """The pose is known; stop looking for it."""
-        self._initializer.waiting = False
+        self._search.waiting = False
 
     def collect(
         self,
         step: Step,
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkMeasurement],
-        readings: Readings,
-    ) -> Start | None:
+        readings: MotionReadings,
+    ) -> InitialPose | None:
         """While waiting: add a step; the start once it is clear."""
-        return self._initializer.collect(step, motions, sightings, readings)
+        return self._search.collect(step, motions, sightings, readings)
 
-    def unconfirmed(self) -> Belief | None:
+    def unconfirmed(self) -> PoseWithCovariance | None:
         """Where the robot is by the sightings so far, before they are enough to check one another.
 
         Told from when the pose is known well enough for a sighting to be judged by it.
         """
-        belief = self._initializer.hypotheses.belief()
-        if belief is None or (not self._told and self.nowhere(belief)):
+        belief = self._search.hypotheses.belief()
+        if belief is None or (not self._told and self.is_unlocalized(belief)):
             return None
         self._told = True
         return belief
 
-    def give_up(self, blind: bool) -> Start | None:
+    def give_up(self, blind: bool) -> InitialPose | None:
         """The segment is over, and its first pose was not found: what is to be replayed, and from where.
 
         Args:
@@ -197,9 +213,9 @@ class Whereabouts:
         """
         if not self.waiting or self.lost:
             return None
-        belief = self._initializer.hypotheses.belief()
-        start = self._initializer.give_up() if blind or belief is not None else None
-        if start is not None and (belief is None or self.nowhere(belief)):
+        belief = self._search.hypotheses.belief()
+        start = self._search.give_up() if blind or belief is not None else None
+        if start is not None and (belief is None or self.is_unlocalized(belief)):
             self._never_found = True
             self.get_lost()
         return start
@@ -208,33 +224,33 @@ class Whereabouts:
         self,
         step: Step,
         motions: Sequence[MotionMeasurement],
-        contrary: Sequence[LandmarkMeasurement],
-        readings: Readings,
-        predicted: Belief,
-    ) -> Belief | None:
+        outliers: Sequence[LandmarkMeasurement],
+        readings: MotionReadings,
+        predicted: PoseWithCovariance,
+    ) -> PoseWithCovariance | None:
         """While nothing is believed, look for another place that explains what is refused: the robot may be there.
 
         Returns:
             A place told by two landmarks or more, and far from the predicted one: nearer ones are the business of
-            `Weights.overruled`, unless the first pose was given.
+            `Association.nearby_consensus`, unless the first pose was given.
         """
-        searching = bool(contrary) or self._initializer.searching
-        told = self.holds_given and self.defied is not None
+        searching = bool(outliers) or self._search.searching
+        told = self.keeps_initial_pose and self.initial_pose_conflict is not None
         if not searching or told or self.waiting or not self._adaptive:
             return None
-        started = self._initializer.collect(step, motions, contrary, readings, known=True)
-        if started is None or self.holds_given:
+        started = self._search.collect(step, motions, outliers, readings, known=True)
+        if started is None or self.keeps_initial_pose:
             return None if started is None else started.newest
         x, y, yaw = se2.between(predicted.pose, started.newest.pose)
         return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
 
-    def found(self, believed: Belief, place: Belief) -> None:
+    def found(self, believed: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was believed to be at."""
         self._jump_count += 1
         if self._jump_count <= _NAMED:
             self._jumps.append(se2.between(believed.pose, place.pose))
         self.lost = self._given = False
-        self._initializer.forget()
+        self._search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -248,10 +264,10 @@ class Whereabouts:
                 "another at best (from the map's origin on if nothing was seen); give estimator.initial_pose, or let "
                 "the robot see more landmarks"
             )
-        if self.defied is not None:
+        if self.initial_pose_conflict is not None:
             said.append(
-                f"sightings contradict the given first pose: they put the robot {_far(self.defied)} off and were "
-                "refused; correct estimator.initial_pose or the map, or leave the first pose to the sightings"
+                f"sightings contradict the given first pose: they put the robot {_far(self.initial_pose_conflict)} off "
+                "and were refused; correct estimator.initial_pose or the map, or leave the first pose to the sightings"
             )
         return tuple(said)
 

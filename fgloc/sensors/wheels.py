@@ -68,7 +68,7 @@ class WheelMotion:
         return self._chosen
 
     @property
-    def stands_in(self) -> bool:
+    def from_commands(self) -> bool:
         """Whether there are no wheels to hear, and commands stand in for them."""
         return self._chosen == "command"
 

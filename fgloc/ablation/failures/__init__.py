@@ -54,7 +54,7 @@ AnyFailure = Annotated[
 """Any failure, as a suite names it by its ``kind``."""
 
 
-def spoil(
+def corrupt(
     failures: Sequence[Failure],
     stage: Literal["recorded", "sightings"],
     events: Iterator[Event],
@@ -79,4 +79,4 @@ def generators(count: int, seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng([seed, index]) for index in range(count)]
 
 
-__all__ = ["AnyFailure", "Failure", "Scene", "generators", "spoil"]
+__all__ = ["AnyFailure", "Failure", "Scene", "corrupt", "generators"]

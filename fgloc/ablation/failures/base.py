@@ -46,7 +46,7 @@ class Scene:
         config: of the run; slip needs the wheels' geometry.
         landmark_ids: ids of the map, ascending.
         rng: the failure's own generator.
-        touched: events that each failure changed, dropped or added, by its kind.
+        affected: events that each failure changed, dropped or added, by its kind.
     """
 
     start_ns: int
@@ -54,7 +54,7 @@ class Scene:
     config: Config
     landmark_ids: tuple[int, ...]
     rng: np.random.Generator
-    touched: Counter[str] = field(default_factory=Counter)
+    affected: Counter[str] = field(default_factory=Counter)
 
     def seconds(self, event: Event) -> float:
         """Receive time of an event [s from the recording's first message]."""
@@ -137,15 +137,15 @@ class Failure(Section):
 
     @abstractmethod
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
-        """The spoiled events, in order of receive time."""
+        """The corrupted events, in order of receive time."""
 
     def spoil_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
         """The map that the run is given; few failures change it."""
         return landmark_map
 
     def touch(self, scene: Scene) -> None:
-        """Note that one more event was touched."""
-        scene.touched[self.kind] += 1
+        """Note that one more event was affected."""
+        scene.affected[self.kind] += 1
 
 
 class EventFailure(Failure):
@@ -160,7 +160,7 @@ class EventFailure(Failure):
         """What it does to one event (None: drops it), with the state of one run."""
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
-        """The spoiled events, in order of receive time."""
+        """The corrupted events, in order of receive time."""
         schedule, change, targets = self.when.schedule(scene), self.begin(scene), self.targets()
         for event in events:
             if not isinstance(event, targets) or not schedule.hits(event):

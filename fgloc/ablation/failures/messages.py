@@ -24,7 +24,7 @@ class EncoderFrozen(Failure):
     kind: Literal["encoder_frozen"] = "encoder_frozen"
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
-        """The spoiled events, in order of receive time."""
+        """The corrupted events, in order of receive time."""
         schedule = self.when.schedule(scene)
         last: dict[str, Event] = {}
         for event in events:
@@ -67,7 +67,7 @@ class OdometryReset(Failure):
     kind: Literal["odometry_reset"] = "odometry_reset"
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
-        """The spoiled events, in order of receive time."""
+        """The corrupted events, in order of receive time."""
         schedule = self.when.schedule(scene)
         origins: dict[tuple[str, float], FloatArray] = {}
         for event in events:
@@ -99,13 +99,13 @@ class WheelNan(EventFailure):
     def begin(self, scene: Scene) -> Change:
         """Fill with NaN."""
 
-        def spoil(event: Event) -> Event:
+        def corrupt(event: Event) -> Event:
             pose = ("position", "orientation", "linear", "angular")
             names = pose if isinstance(event, OdometryEvent) else ("position", "velocity")
             changes: dict[str, Any] = {name: np.full_like(getattr(event, name), np.nan) for name in names}
             return replace(event, **changes)
 
-        return spoil
+        return corrupt
 
 
 class WrongCovariance(EventFailure):

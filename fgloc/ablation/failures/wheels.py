@@ -22,7 +22,7 @@ from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
 class Roll:
     """How one source says that the wheels rolled up to one message."""
 
-    source: str  # a topic's positions or rates: each is spoiled with a memory of its own
+    source: str  # a topic's positions or rates: each is corrupted with a memory of its own
     speeds: FloatArray  # (2,) left, right: surface speeds [m/s]
     dt: float  # s since the message before
     seconds: float  # s since the recording's first message
@@ -46,7 +46,7 @@ class WheelFailure(Failure):
         """What the wheels are said to do, with the state of one run."""
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
-        """The spoiled events, in order of receive time."""
+        """The corrupted events, in order of receive time."""
         schedule, distort = self.when.schedule(scene), self.distort(scene)
         wheels = scene.config.wheels
         track = wheels.track or self.track_m
@@ -63,7 +63,7 @@ class WheelFailure(Failure):
             if interval is not None and math.isfinite(interval[1] - interval[0]):
                 phase = (seconds - interval[0]) / (interval[1] - interval[0])
 
-            def spoil(
+            def corrupt(
                 source: str,
                 speeds: FloatArray,
                 dt: float,
@@ -75,9 +75,9 @@ class WheelFailure(Failure):
 
             changed: Event
             if isinstance(event, OdometryEvent):
-                changed = odometers.setdefault(event.topic, _Odometer(track)).rewrite(event, spoil)
+                changed = odometers.setdefault(event.topic, _Odometer(track)).rewrite(event, corrupt)
             else:
-                changed = encoders.setdefault(event.topic, _Encoders(wheels)).rewrite(event, spoil)
+                changed = encoders.setdefault(event.topic, _Encoders(wheels)).rewrite(event, corrupt)
             if changed is not event and active:
                 self.touch(scene)
             yield changed
@@ -156,45 +156,45 @@ class WheelScaleDrift(WheelFailure):
         return lambda roll: np.asarray(roll.speeds * (1.0 + rate * roll.seconds / 60.0))
 
 
-Spoil = Callable[[str, FloatArray, float], FloatArray]
+Corrupt = Callable[[str, FloatArray, float], FloatArray]
 
 
 class _Odometer:
-    """Rewrites one odometry topic: its twist, and its pose from the spoiled increments."""
+    """Rewrites one odometry topic: its twist, and its pose from the corrupted increments."""
 
     def __init__(self, track: float) -> None:
         self._track = track
         self._before: tuple[int, FloatArray] | None = None  # stamp and pose as recorded
         self._told: FloatArray | None = None  # pose as told; None while it is the recorded one
 
-    def rewrite(self, event: OdometryEvent, spoil: Spoil) -> OdometryEvent:
+    def rewrite(self, event: OdometryEvent, corrupt: Corrupt) -> OdometryEvent:
         pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
         before, self._before = self._before, (event.stamp_ns, pose)
         dt = 0.0 if before is None else (event.stamp_ns - before[0]) * 1e-9
         if before is None or dt <= 0.0:
             return event if self._told is None else self._with_pose(event, self._told)
         twist = np.array([event.linear[0], event.angular[2]])
-        spoiled = self._spoiled(f"{event.topic} rates", twist, dt, spoil)
+        corrupted = self._spoiled(f"{event.topic} rates", twist, dt, corrupt)
         changed = event
-        if not np.array_equal(spoiled, twist, equal_nan=True):
+        if not np.array_equal(corrupted, twist, equal_nan=True):
             linear, angular = event.linear.copy(), event.angular.copy()
-            linear[0], angular[2] = spoiled
+            linear[0], angular[2] = corrupted
             changed = replace(event, linear=linear, angular=angular)
         moved = se2.log(se2.between(before[1], pose))
         rates = np.array([moved[0], moved[2]]) / dt
-        told = self._spoiled(f"{event.topic} positions", rates, dt, spoil)
+        told = self._spoiled(f"{event.topic} positions", rates, dt, corrupt)
         if self._told is None and np.array_equal(told, rates, equal_nan=True):
             return changed
         start = before[1] if self._told is None else self._told
         self._told = se2.compose(start, se2.exp((told[0] * dt, moved[1], told[1] * dt)))
         return self._with_pose(changed, self._told)
 
-    def _spoiled(self, source: str, rates: FloatArray, dt: float, spoil: Spoil) -> FloatArray:
+    def _spoiled(self, source: str, rates: FloatArray, dt: float, corrupt: Corrupt) -> FloatArray:
         """Forward speed and yaw rate ``(2,)`` by way of the wheels."""
         v, omega = rates
         half = 0.5 * self._track
         speeds = np.array([v - half * omega, v + half * omega])
-        left_right = spoil(source, speeds, dt)
+        left_right = corrupt(source, speeds, dt)
         if left_right is speeds:
             return rates
         left, right = left_right
@@ -216,7 +216,7 @@ class _Encoders:
         self._before: tuple[int, FloatArray] | None = None  # stamp and angles as recorded
         self._offset = np.zeros(2)  # told minus recorded angles
 
-    def rewrite(self, event: JointsEvent, spoil: Spoil) -> JointsEvent:
+    def rewrite(self, event: JointsEvent, corrupt: Corrupt) -> JointsEvent:
         pair = self._indices(event)
         if self._radii is None or pair is None:
             return event
@@ -227,12 +227,12 @@ class _Encoders:
         if before is not None and dt > 0.0:
             speeds = (angles - before[1]) / dt * radii
             if len(event.position):
-                told = spoil(f"{event.topic} positions", speeds, dt)
+                told = corrupt(f"{event.topic} positions", speeds, dt)
                 if told is not speeds:
                     self._offset = self._offset + (told - speeds) * dt / radii
             if len(event.velocity):
                 rates = event.velocity[pair] * radii
-                told = spoil(f"{event.topic} rates", rates, dt)
+                told = corrupt(f"{event.topic} rates", rates, dt)
                 if told is not rates:
                     velocity = event.velocity.copy()
                     velocity[pair] = told / radii

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.measurement_log import Sighting
+from fgloc.graph.measurement_log import LandmarkFactor
 from fgloc.types import FloatArray
 
 _REMEMBERED = 12  # displacements of a landmark
@@ -22,7 +22,7 @@ _ITERATIONS = 4
 
 
 @dataclass(slots=True)
-class _Case:
+class _Record:
     """What speaks against one landmark."""
 
     score: float = 0.0
@@ -33,7 +33,7 @@ class _Case:
     before: Counter[int] = field(default_factory=Counter)  # sightings of each landmark that had fitted until then
 
 
-class Quarantine:
+class LandmarkExclusion:
     """Counts, for every landmark, how often it was refused while others were believed.
 
     Wrong ids scatter: only a landmark whose refused sightings agree on another place has been moved.
@@ -42,7 +42,7 @@ class Quarantine:
     def __init__(self, after: int) -> None:
         """Take how many refusals, in excess of what is believed, put a landmark into quarantine."""
         self._after = after
-        self._cases: dict[int, _Case] = {}
+        self._cases: dict[int, _Record] = {}
         self._fitted: Counter[int] = Counter()  # sightings of each landmark
 
     @property
@@ -56,7 +56,7 @@ class Quarantine:
 
     def accuse(self, landmark_id: int, displacement: FloatArray) -> None:
         """Other evidence says that this landmark stands so far ``(2,)`` [m] from its place."""
-        case = self._cases[landmark_id] = _Case(held=True)
+        case = self._cases[landmark_id] = _Record(held=True)
         case.places.append(displacement)
 
     def holds(self, landmark_id: int) -> bool:
@@ -74,7 +74,7 @@ class Quarantine:
         if case.score <= 0.0:
             del self._cases[landmark_id]
 
-    def disagree(self, refused: Iterable[Sighting], k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
+    def disagree(self, refused: Iterable[LandmarkFactor], k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
         """Sightings contradicted a prediction that others confirmed.
 
         Args:
@@ -86,7 +86,7 @@ class Quarantine:
         for sighting in refused:
             landmark_id = sighting.measurement.landmark_id
             if landmark_id not in self._cases:
-                self._cases[landmark_id] = _Case(before=self._fitted.copy())
+                self._cases[landmark_id] = _Record(before=self._fitted.copy())
             case = self._cases[landmark_id]
             if case.held:
                 continue
@@ -99,14 +99,14 @@ class Quarantine:
             moved = case.score >= self._after and self._moved(case)
             case.held = moved and not self._misread(landmark_id, case, factors)
 
-    def _misread(self, landmark_id: int, case: _Case, factors: LandmarkFactors) -> bool:
+    def _misread(self, landmark_id: int, case: _Record, factors: LandmarkFactors) -> bool:
         """Whether it may be others that are read as this one: it stands where they do, and is seen far less often."""
         moved = np.median(case.places, axis=0)
         others = factors.near(landmark_id, moved, max(_AGREE_M, _AGREE_SHARE * math.hypot(*moved)))
         of_others = sum(self._fitted[i] - case.before[i] for i in others)
         return case.refused < _MISREAD_SHARE * of_others
 
-    def _moved(self, case: _Case) -> bool:
+    def _moved(self, case: _Record) -> bool:
         if len(case.places) < self._after:
             return False
         places = np.array(case.places)
@@ -118,7 +118,7 @@ class Quarantine:
         return bool(np.quantile(apart, 0.8) < max(_AGREE_M, _AGREE_SHARE * moved) and moved > np.median(apart))
 
 
-def displacement(sighting: Sighting, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:
+def displacement(sighting: LandmarkFactor, pose: FloatArray, factors: LandmarkFactors) -> FloatArray | None:
     """How far ``(2,)`` [m] the landmark must have been moved on the map, unturned, to be seen so from this pose.
 
     Gauss-Newton: moving the landmark one way is moving the robot the other.

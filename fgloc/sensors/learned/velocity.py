@@ -6,9 +6,9 @@ import numpy as np
 
 from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
-from fgloc.motion.card import ModelCard
-from fgloc.motion.commands import CommandTrack
-from fgloc.motion.forms import (
+from fgloc.sensors.learned.card import ModelCard
+from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.forms import (
     MotionPrediction,
     calibrated,
     composed,
@@ -19,8 +19,8 @@ from fgloc.motion.forms import (
     noise_density,
     sub_steps,
 )
-from fgloc.motion.network import Answering
-from fgloc.motion.signals import Signals
+from fgloc.sensors.learned.network import Answering
+from fgloc.sensors.learned.signals import Signals
 from fgloc.types import CommandEvent, FloatArray
 
 

@@ -5,27 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.observation import CornerBatch, PlanarBatch, Stacked
+from fgloc.stats import chi2_bound
 from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
 _TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
-
-
-@lru_cache(maxsize=256)
-def chi2_bound(probability: float, dof: int) -> float:
-    """χ² quantile."""
-    return float(chi2.ppf(probability, dof))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +49,7 @@ def joint_fit(
 ) -> Fit | None:
     """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
 
-    Gauss-Newton with Cauchy weights, so that one wrong sighting does not spoil the place. What is not known of the
+    Gauss-Newton with Cauchy weights, so that one wrong sighting does not corrupt the place. What is not known of the
     installation is taken for noise of each sighting by itself.
     """
     fitted = PoseFit(sightings, factors, config)

@@ -16,10 +16,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
-from fgloc.motion.card import Kinematics, ModelCard
-from fgloc.motion.commands import CommandTrack
-from fgloc.motion.joint import JointCalibration
-from fgloc.motion.signals import Signals
+from fgloc.sensors.learned.card import Kinematics, ModelCard
+from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.signals import Signals
 from fgloc.types import CommandEvent, FloatArray
 
 _SMALL = 1e-9

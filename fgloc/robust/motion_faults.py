@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgloc.config import WeightsConfig
-from fgloc.faults.glr_test import Disagreement
-from fgloc.fusion.motion import MotionSources
-from fgloc.types import FloatArray, Readings, Step
+from fgloc.robust.glr_test import GlrTest
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.types import FloatArray, MotionReadings, Step
 
 _MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
 _LEAST_M = 0.03  # of a wheel's travel: less says nothing
@@ -20,7 +20,7 @@ _EVIDENCE_S = 1.0  # of travel from which a kind of failure is told
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
+class FaultVerdict:
     """What is thought of the motion sources.
 
     Attributes:
@@ -36,14 +36,14 @@ class Trust:
     scale: float = 1.0
 
 
-class SourceTrust:
+class MotionFaultMonitor:
     """Watches wheels and their witness for a disagreement; known failures are taken as given.
 
     Attributes:
         flags: how often each source was flagged, by "source.reason".
     """
 
-    def __init__(self, config: WeightsConfig, sources: MotionSources, track_m: float | None) -> None:
+    def __init__(self, config: WeightsConfig, sources: MotionFusion, track_m: float | None) -> None:
         """Set up.
 
         Args:
@@ -55,7 +55,7 @@ class SourceTrust:
         self._config = config
         self._sources = sources
         self._track_m = track_m
-        self._disagreement = Disagreement(config)
+        self._glr = GlrTest(config)
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
         self._first_ns: int | None = None  # of the run
         self._reason = "slip"
@@ -68,10 +68,10 @@ class SourceTrust:
 
     def reset(self) -> None:
         """Nothing connects what comes with what was."""
-        self._disagreement.reset()
+        self._glr.reset()
         self._travels.clear()
 
-    def judge(self, step: Step, readings: Readings) -> Trust:
+    def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
         """Take in what the sources say of a step that follows the last one."""
         off = self._known_failures(step)
         if "wheels" in off:  # nothing to be found out
@@ -79,13 +79,13 @@ class SourceTrust:
         readings = replace(readings, **dict.fromkeys(off))
         difference = self._sources.disagreement(readings) if self._config.adaptive else None
         if difference is None:
-            return Trust(off)
-        verdict = self._disagreement.judge(
+            return FaultVerdict(off)
+        verdict = self._glr.judge(
             step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
         )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
-            return Trust(off, verdict.span, verdict.nis, verdict.scale)
+            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -94,14 +94,14 @@ class SourceTrust:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return Trust({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9
         end = start + step.dt
         return {d.source: "distrusted" for d in self._config.distrust if start < d.end_s and end > d.start_s}
 
-    def _travelled(self, dt: float, readings: Readings) -> None:
+    def _travelled(self, dt: float, readings: MotionReadings) -> None:
         witness = readings.learned or readings.gyro
         if readings.wheels is None or witness is None:
             return

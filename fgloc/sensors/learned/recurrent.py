@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.motion.network import Float32Array, Network
+from fgloc.sensors.learned.network import Float32Array, Network
 
 
 @dataclass(frozen=True, slots=True, eq=False)

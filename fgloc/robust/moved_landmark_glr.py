@@ -30,7 +30,7 @@ _CLEARED = -12.0  # with less evidence than this a beacon is looked at anew, as 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accusation:
+class MovedLandmark:
     """A beacon that was moved, and what is known if it was.
 
     Attributes:
@@ -50,7 +50,7 @@ class Accusation:
     cov: FloatArray
 
 
-class Suspects:
+class MovedLandmarkBank:
     """Extended Kalman filters over pose, calibration and the displacement of one beacon each; the first one has none.
 
     Errors of one beacon's sightings are correlated over ``repeat_s``: those closer in time share their information.
@@ -73,7 +73,7 @@ class Suspects:
         self._explained = np.zeros(n)  # ... and those of itself that its displacement explains
 
     def start(self, pose: FloatArray, calibration: FloatArray, cov: FloatArray) -> None:
-        """Suspect nobody: everything is as `Accusation` has it."""
+        """Suspect nobody: everything is as `MovedLandmark` has it."""
         self._pose[:], self._calibration[:], self._cov[0] = pose, calibration, 0.0
         self._cov[0, :5, :5] = cov
         self._misfit[:] = 0.0
@@ -153,7 +153,7 @@ class Suspects:
         return 1.0 if last is None else max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 0.01))
 
     @property
-    def accused(self) -> Accusation | None:
+    def accused(self) -> MovedLandmark | None:
         """The beacon that was moved, if one was and there is no doubt which."""
         evidence = self._misfit[0] - self._misfit[1:]
         if len(evidence) < 2:
@@ -172,7 +172,7 @@ class Suspects:
         cov = self._cov[row, :5, :5].copy()
         pose, calibration = self._pose[row].copy(), self._calibration[row].copy()
         pose[2] = se2.wrap(float(pose[2]))
-        return Accusation(self._ids[row - 1], moved.copy(), float(best), pose, calibration, cov)
+        return MovedLandmark(self._ids[row - 1], moved.copy(), float(best), pose, calibration, cov)
 
     def _misread(self, row: int) -> bool:
         """Whether others may have been read as this one: seldom, and where they stand."""

@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from fgloc.errors import ModelError
-from fgloc.motion.card import Kinematics, ModelCard
-from fgloc.motion.commands import CommandTrack
-from fgloc.motion.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
-from fgloc.motion.network import Answering, Float32Array
-from fgloc.motion.signals import Signal, Signals
+from fgloc.sensors.learned.card import Kinematics, ModelCard
+from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
+from fgloc.sensors.learned.network import Answering, Float32Array
+from fgloc.sensors.learned.signals import Signal, Signals
 from fgloc.types import CommandEvent, FloatArray
 
 _MIN_DENSITY = 1e-8  # m²/s, m²/s, rad²/s: nobody knows motion better than this

@@ -11,12 +11,12 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.measurement_log import Belief, Keyframe
-from fgloc.motion.joint import JointCalibration
-from fgloc.motion.source import LearnedMotion
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.sensors.gyro import Gyro, Turn
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.types import FloatArray, MotionMeasurement, Readings, Step
+from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
@@ -56,7 +56,7 @@ class Difference:
     installation_cov: FloatArray
 
 
-class MotionSources:
+class MotionFusion:
     """Wheels, learned motion and gyro."""
 
     def __init__(
@@ -92,7 +92,7 @@ class MotionSources:
         """Whether the learned motion has the gyro in it already."""
         return self._learned is not None and "gyro" in self._learned.model.card.inputs
 
-    def read(self, step: Step, blind_s: float = 0.0, velocity: FloatArray | None = None) -> Readings:
+    def read(self, step: Step, blind_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
         """Ask every source once.
 
         Args:
@@ -101,7 +101,7 @@ class MotionSources:
             velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
         if step.dt <= 0.0:
-            return Readings()
+            return MotionReadings()
         wheels = self._wheels.measure(step)
         if wheels is not None:
             change = None
@@ -118,7 +118,7 @@ class MotionSources:
                 gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
                 gyro = self._installed(gyro, turn)
                 self._turn = turn
-        readings = Readings(wheels, self._measure_learned(step, velocity), gyro)
+        readings = MotionReadings(wheels, self._measure_learned(step, velocity), gyro)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
@@ -161,7 +161,7 @@ class MotionSources:
         told = abs(phi) / seconds / wheels.scale_omega
         return np.array([-told * rho_x / max(1.0 - wheels.slowdown * told, _SLOWEST), 0.0, 0.0])
 
-    def read_again(self, readings: Readings, step: Step, velocity: FloatArray) -> Readings:
+    def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
         """The readings with the learned motion evaluated at a better velocity."""
         return replace(readings, learned=self._measure_learned(step, velocity))
 
@@ -177,7 +177,7 @@ class MotionSources:
         return self._installed(m, self._turn if self.gyro_is_read else None)
 
     def combine(
-        self, readings: Readings, off: Mapping[str, str] | None = None, scale: float = 1.0
+        self, readings: MotionReadings, off: Mapping[str, str] | None = None, scale: float = 1.0
     ) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other.
 
@@ -198,7 +198,7 @@ class MotionSources:
         if wheels is not None and "wheels" in off:
             wheels = None if learned is not None else self._doubtful(wheels, off["wheels"])
         elif wheels is not None and learned is not None:
-            if self._wheels.stands_in:  # made of the very commands that the model reads
+            if self._wheels.from_commands:  # made of the very commands that the model reads
                 wheels = None
             elif self.joint is not None:
                 learned = self.joint.decorrelate(wheels, learned)
@@ -213,12 +213,12 @@ class MotionSources:
             return with_room(wheels, _SLIP_SPEED, _SLIP_TURN)
         return with_room(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
 
-    def combine_again(self, frame: Keyframe, readings: Readings | None = None) -> list[MotionMeasurement]:
+    def combine_again(self, frame: Keyframe, readings: MotionReadings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
         made = self.combine(readings or frame.readings, frame.off, frame.scale)
-        return [with_noise(m, doubt=frame.doubt) for m in made]
+        return [with_noise(m, extra_cov=frame.extra_cov) for m in made]
 
-    def disagreement(self, readings: Readings) -> Difference | None:
+    def disagreement(self, readings: MotionReadings) -> Difference | None:
         """How far the wheels and the sources that witness their slip are apart over the step.
 
         Returns:
@@ -226,7 +226,7 @@ class MotionSources:
             in for wheels.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
-        if wheels is None or self._wheels.stands_in:
+        if wheels is None or self._wheels.from_commands:
             return None
         if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
             d = se2.log(se2.between(wheels.motion, learned.motion))
@@ -252,7 +252,7 @@ class MotionSources:
         rows = [index[name] for name in names]
         return D, self._factors.believed.cov[np.ix_(rows, rows)]
 
-    def unknown(self, step: Step, readings: Readings | None = None) -> MotionMeasurement:
+    def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
         """Nothing told the way: sigma grows with the time of silence, however many steps it is cut into.
 
         A gyro, if there is one, still tells the turn.
@@ -266,7 +266,7 @@ class MotionSources:
             motion, cov[2, 2] = _turned(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
-    def went(self, readings: Readings, fix: Belief | None) -> None:
+    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None) -> None:
         """The robot went on by a step.
 
         Args:
@@ -297,20 +297,20 @@ def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
 
     Args:
         off: sources that are left out, and why.
-        scale: on the wheels' covariance, as they and the other sources differ (`SourceTrust`). The learned motion's
-            follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of the two
-            is better than it says.
+        scale: on the wheels' covariance, as they and the other sources differ (`MotionFaultMonitor`). The learned
+            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of
+            the two is better than it says.
     """
     if "wheels" in off:
         return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
     return {"wheels": scale, "learned": min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)}
 
 
-def with_noise(m: MotionMeasurement, scale: float = 1.0, doubt: FloatArray | None = None) -> MotionMeasurement:
+def with_noise(m: MotionMeasurement, scale: float = 1.0, extra_cov: FloatArray | None = None) -> MotionMeasurement:
     """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
-    if scale == 1.0 and doubt is None:
+    if scale == 1.0 and extra_cov is None:
         return m
-    return replace(m, cov=m.cov * scale + (0.0 if doubt is None else doubt))
+    return replace(m, cov=m.cov * scale + (0.0 if extra_cov is None else extra_cov))
 
 
 def with_room(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:

@@ -11,9 +11,10 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
-from fgloc.graph.measurement_log import Belief, Sighting
-from fgloc.graph.moved_landmark_votes import Quarantine
-from fgloc.graph.pose_fit import Fit, cauchy_k, chi2_bound, joint_fit
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
+from fgloc.robust.moved_landmark_votes import LandmarkExclusion
+from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     Decision,
@@ -28,7 +29,7 @@ REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agree
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
-class Weights:
+class Association:
     """Weighs the sightings of one step against the prediction.
 
     Attributes:
@@ -42,18 +43,18 @@ class Weights:
         self._last_used_ns: dict[int, int] = {}
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
-        self.contrary: frozenset[tuple[int, int]] = frozenset()
+        self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
         self._believed_ns = 0  # the newest keyframe at which something was believed
-        self.quarantine = Quarantine(config.weights.quarantine_after)
+        self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
 
-    def weigh(
+    def judge(
         self,
         k: int,
         stamp_ns: int,
         measurements: Sequence[LandmarkMeasurement],
-        predicted: Belief,
-    ) -> tuple[list[Sighting], list[Sighting], list[Decision]]:
+        predicted: PoseWithCovariance,
+    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Sort sightings into believed and refused, with the decision on each.
 
         The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
@@ -71,9 +72,9 @@ class Weights:
                 fitting.append(sighting)
             elif reason == "gate":
                 gated.append(sighting)
-            if self.quarantine.holds(m.landmark_id):
+            if self.exclusion.holds(m.landmark_id):
                 reason = "quarantined"
-            elif (m.stamp_ns, m.landmark_id) in self.contrary:
+            elif (m.stamp_ns, m.landmark_id) in self.outliers:
                 reason = "contradicts_start"
             if reason:
                 refused.append(sighting)
@@ -97,7 +98,7 @@ class Weights:
         if believed:
             self._believed_ns = stamp_ns
             self._contradicting.clear()
-            for misread, sighting, decision in self._read_again(k, stamp_ns, refused, decisions, predicted):
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
                 refused.remove(misread)
                 believed.append(sighting)
@@ -109,14 +110,14 @@ class Weights:
             self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
         return believed, refused, decisions
 
-    def _read_again(
+    def _reassociate(
         self,
         k: int,
         stamp_ns: int,
-        refused: Sequence[Sighting],
+        refused: Sequence[LandmarkFactor],
         decisions: list[Decision],
-        predicted: Belief,
-    ) -> list[tuple[Sighting, Sighting, Decision]]:
+        predicted: PoseWithCovariance,
+    ) -> list[tuple[LandmarkFactor, LandmarkFactor, Decision]]:
         """Refused markers whose code was misread: what was refused, what it was, and the decision on that.
 
         Beside others that are believed, a marker that cannot be where it was seen, in a place where exactly one other
@@ -133,7 +134,7 @@ class Weights:
                 continue
             fits = []
             for other in self._factors.lookalikes(m, predicted.pose):
-                if other in seen or self.quarantine.holds(other):
+                if other in seen or self.exclusion.holds(other):
                     continue
                 again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
@@ -155,7 +156,9 @@ class Weights:
         self.rejections += Counter()  # drops the zeros
         return found
 
-    def _compare(self, k: int, fitting: Sequence[Sighting], gated: Sequence[Sighting], predicted: Belief) -> None:
+    def _compare(
+        self, k: int, fitting: Sequence[LandmarkFactor], gated: Sequence[LandmarkFactor], predicted: PoseWithCovariance
+    ) -> None:
         """Others were believed, now or just before: what disagrees beside them may have been moved.
 
         Without them, in the dark say, the prediction is too little known to be held against a landmark.
@@ -163,10 +166,12 @@ class Weights:
         if not self._config.weights.adaptive or not self._factors.known:
             return
         for sighting in fitting:
-            self.quarantine.fits(sighting.measurement.landmark_id)
-        self.quarantine.disagree(gated, k, predicted.pose, self._factors)
+            self.exclusion.fits(sighting.measurement.landmark_id)
+        self.exclusion.disagree(gated, k, predicted.pose, self._factors)
 
-    def overruled(self, refused: Sequence[Sighting], decisions: Sequence[Decision], predicted: Belief) -> Fit | None:
+    def nearby_consensus(
+        self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
+    ) -> Fit | None:
         """The place nearby that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
 
         Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
@@ -185,7 +190,9 @@ class Weights:
         self.rejections += Counter()  # drops the zeros
         return fit
 
-    def _judge(self, measurements: Sequence[LandmarkMeasurement], predicted: Belief) -> list[tuple[float, int, str]]:
+    def _judge(
+        self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> list[tuple[float, int, str]]:
         """Of each: NIS, its degrees of freedom, and why it is refused ("" if it is believed)."""
         if not self._factors.known:
             return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
@@ -208,7 +215,10 @@ class Weights:
         return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
 
     def _agreed(
-        self, measurements: Sequence[LandmarkMeasurement], predicted: Belief, judged: list[tuple[float, int, str]]
+        self,
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: PoseWithCovariance,
+        judged: list[tuple[float, int, str]],
     ) -> list[tuple[float, int, str]]:
         """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
 
@@ -231,7 +241,9 @@ class Weights:
             for i, (nis, dof, reason) in enumerate(judged)
         ]
 
-    def _compatible(self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: Belief) -> bool:
+    def _compatible(
+        self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> bool:
         """Whether these sightings and the prediction may all be right."""
         known = predicted.installation or self._factors.believed
         seen = [measurements[i] for i in rows]
@@ -240,7 +252,11 @@ class Weights:
         return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
 
     def _agreeing_with(
-        self, first: int, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: Belief
+        self,
+        first: int,
+        rows: Sequence[int],
+        measurements: Sequence[LandmarkMeasurement],
+        predicted: PoseWithCovariance,
     ) -> tuple[float, list[int]]:
         """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
         known = predicted.installation or self._factors.believed

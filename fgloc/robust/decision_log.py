@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from fgloc import se2
-from fgloc.fusion.motion import noise_scales
-from fgloc.graph.measurement_log import Belief
-from fgloc.types import Decision, FloatArray, MotionMeasurement, Readings
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.robust.motion_fusion import noise_scales
+from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings
 
 _REASONS = {
     "slip": "they slipped",
@@ -23,7 +23,7 @@ _REASONS = {
 def motion_decisions(
     k: int,
     motions: Sequence[MotionMeasurement],
-    readings: Readings,
+    readings: MotionReadings,
     off: Mapping[str, str],
     reason: str,
     scale: float = 1.0,
@@ -52,7 +52,9 @@ def motion_decisions(
     return rows
 
 
-def place_decision(k: int, stamp_ns: int, believed: Belief, place: Belief, reason: str) -> Decision:
+def place_decision(
+    k: int, stamp_ns: int, believed: PoseWithCovariance, place: PoseWithCovariance, reason: str
+) -> Decision:
     """The row for a pose that sightings tell, against the one that was believed: ``jump`` if it is gone to."""
     miss = se2.log(se2.between(believed.pose, place.pose))
     nis = float(miss @ np.linalg.solve(believed.cov + place.cov, miss))

@@ -8,8 +8,8 @@ from collections import Counter
 from numpy.typing import ArrayLike
 
 from fgloc.config import MotionConfig
-from fgloc.motion.forms import MotionModel
-from fgloc.motion.signals import SignalReader
+from fgloc.sensors.learned.forms import MotionModel
+from fgloc.sensors.learned.signals import SignalReader
 from fgloc.types import FloatArray, MotionMeasurement, Step
 
 

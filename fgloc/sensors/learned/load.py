@@ -13,12 +13,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from fgloc.errors import CovarianceError, ModelError
-from fgloc.motion.card import FORMAT, VERSION, ModelCard
-from fgloc.motion.displacement import DisplacementModel
-from fgloc.motion.forms import MotionModel
-from fgloc.motion.network import Answering, Network
-from fgloc.motion.recurrent import Cell, RecurrentNetwork
-from fgloc.motion.velocity import NaiveModel, VelocityModel
+from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard
+from fgloc.sensors.learned.displacement import DisplacementModel
+from fgloc.sensors.learned.forms import MotionModel
+from fgloc.sensors.learned.network import Answering, Network
+from fgloc.sensors.learned.recurrent import Cell, RecurrentNetwork
+from fgloc.sensors.learned.velocity import NaiveModel, VelocityModel
 
 _CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _MAX_BYTES = 64 << 20

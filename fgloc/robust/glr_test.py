@@ -20,7 +20,7 @@ _ADAPTS = 0.1  # share by which a step moves the quantile
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class GlrResult:
     """What is thought of the newest step.
 
     Attributes:
@@ -39,7 +39,7 @@ class Verdict:
     scale: float = 1.0
 
 
-class Disagreement:
+class GlrTest:
     """Compares two motion sources over all windows up to a length at once.
 
     A single step says little (encoder quantization alone trips it), a long window says it late. The test takes, of all
@@ -70,7 +70,7 @@ class Disagreement:
         cov: FloatArray,
         by_installation: FloatArray | None = None,
         installation_cov: FloatArray | None = None,
-    ) -> Verdict:
+    ) -> GlrResult:
         """Take in one step.
 
         Args:
@@ -94,15 +94,15 @@ class Disagreement:
         nis /= self._level
         if not self.flagged:
             if nis <= self._config.alarm:
-                return Verdict(False, 0, nis, span, max(self._level, nis / _DOF))
+                return GlrResult(False, 0, nis, span, max(self._level, nis / _DOF))
             self.flagged, self._calm_s = True, 0.0
-            return Verdict(True, span, nis, span)
+            return GlrResult(True, span, nis, span)
         self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0
         if self._calm_s >= self._config.release_s:
             self.flagged = False
             self._steps.clear()
             self._length_s = 0.0
-        return Verdict(self.flagged, 0, nis, span)
+        return GlrResult(self.flagged, 0, nis, span)
 
     @property
     def _level(self) -> float:
