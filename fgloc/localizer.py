@@ -221,7 +221,7 @@ class Localizer:
             place = None
             if not believed:
                 outliers = [
-                    s.measurement for s in refused if not self.association.exclusion.holds(s.measurement.landmark_id)
+                    s.measurement for s in refused if not self.association.exclusion.excludes(s.measurement.landmark_id)
                 ]
                 place = self._tracking.search(step, motions, outliers, readings, predicted)
             if place is not None:
@@ -247,7 +247,7 @@ class Localizer:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
             weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
-        accused = self._landmark_faults.look(k, step.stamp_ns, motions, believed, kept)
+        accused = self._landmark_faults.observe(k, step.stamp_ns, motions, believed, kept)
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
