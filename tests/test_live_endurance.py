@@ -9,7 +9,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from fgloc.graph.pose_fit import PoseFit
 from live_feed import PATIENCE_S, feed, live_in
 from robot_world import CAMERA, START_NS, World, beacons, config, room
 
