@@ -15,7 +15,7 @@ import typer
 from tqdm import tqdm
 
 from fgloc.cli.options import Bag, ModelOption, configured
-from fgloc.cli.terminal import columns, run_bar
+from fgloc.cli.terminal import columns, run_bar, say
 from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -63,13 +63,13 @@ def live(
     sys.setswitchinterval(_SWITCH_S)
     with _interrupted() as stop, Participant(domain, network) as participant:
         node = Node(participant, settings, landmarks, state)
-        typer.echo(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
+        say(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
         try:
             with _page(node, settings, landmarks) if view else nullcontext(_tell) as tell, _status_line(node, stop):
                 node.run(stop, tell)
         finally:
             node.close()
-        typer.echo(_summary(node, time.monotonic() - began))
+        say(_summary(node, time.monotonic() - began))
 
 
 def play(
@@ -90,10 +90,10 @@ def play(
         raise ConfigError(f"--rate {rate:g}: expected a multiple of the recorded speed, more than 0 and up to 1000")
     with _interrupted() as stop, Participant(domain, network) as participant, Player(bag, participant) as player:
         for note in player.notes:
-            typer.echo(f"note: {note}")
-        typer.echo(f"{len(player.topics)} topics, {player.duration_s:.1f} s; domain {domain}")
+            say(f"note: {note}")
+        say(f"{len(player.topics)} topics, {player.duration_s:.1f} s; domain {domain}")
         if not player.wait_for_readers(wait, stop) and not stop.is_set():
-            typer.echo(f"no subscriber in {wait:g} s: playing all the same")
+            say(f"no subscriber in {wait:g} s: playing all the same")
         again = True
         while again and not stop.is_set():
             with run_bar("play") as progress:
@@ -101,7 +101,7 @@ def play(
             again = loop
         player.finish()
         damaged = f", {player.damaged} damaged ones left out" if player.damaged else ""
-        typer.echo(f"{player.published} messages published{damaged}")
+        say(f"{player.published} messages published{damaged}")
 
 
 @contextmanager
