@@ -1,9 +1,9 @@
 """A live run that is killed while the robot drives, and started again: `python -m benchmarks.live_resume`.
 
 A process of its own replays a recording as installed in real time and saves its state; it is killed with SIGKILL at
-random times, and started again, while the recording goes on. ``live.resume_s``: from its start (its libraries are
-loaded; the time that takes it is away) until it has told a pose of mode OK; ``live.resume_lost``: how often the first such pose, or the last before
-the next kill, was off by more than its covariance allows at three sigmas.
+random times, and started again, while the recording goes on. ``live.resume_s``: from its start until it has told a pose
+of mode OK, its libraries being loaded (what that takes is in the time away); ``live.resume_lost``: how often the first
+such pose, or the last before the next kill, was off by more than its covariance allows at three sigmas.
 """
 
 from __future__ import annotations
