@@ -88,8 +88,8 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "failure_kind",
         "Tells frozen encoders and one dead wheel from slip.",
         ("robust/motion_faults.py",),
-        (Switch(f"{_TRUST}:SourceTrust._failure", Returns("slip")),),
-        Probe(f"{_TRUST}:SourceTrust._failure", lambda kind, *_: kind != "slip"),
+        (Switch(f"{_TRUST}:MotionFaultMonitor._failure", Returns("slip")),),
+        Probe(f"{_TRUST}:MotionFaultMonitor._failure", lambda kind, *_: kind != "slip"),
     ),
     Mechanism(
         "doubtful_wheels",

@@ -14,9 +14,9 @@ from robot_world import CAMERA, START_NS, World, beacons, config, room
 
 from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
-from fgloc.graph.pose_fit import PoseFit
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
+from fgloc.relocalization.pose_fit import PoseFit
 from fgloc.types import Mode
 
 SECOND = 1_000_000_000

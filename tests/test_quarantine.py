@@ -51,7 +51,7 @@ def test_the_displacement_of_a_moved_landmark_is_what_it_was_moved_by(by):
 def accused(sightings, factors, after: int = AFTER) -> LandmarkExclusion:
     quarantine = LandmarkExclusion(after)
     for pose, m in sightings:
-        quarantine.disagree([factors.sighting(0, m, 3.0)], 0, pose, factors)
+        quarantine.reject([factors.sighting(0, m, 3.0)], 0, pose, factors)
     return quarantine
 
 
@@ -62,9 +62,9 @@ def test_fault_51_a_moved_marker_is_named_with_its_displacement():
     seen = [(pose, corners(pose, stands, rng)) for pose in poses(1, 60) if project(pose, stands) is not None]
     assert len(seen) > AFTER
     before = accused(seen[: AFTER - 1], factors)
-    assert not before.holds(7)
+    assert not before.excludes(7)
     quarantine = accused(seen, factors)
-    assert quarantine.holds(7)
+    assert quarantine.excludes(7)
     assert list(quarantine.displacements) == [7]
     assert quarantine.displacements[7] == pytest.approx((0.4, 0.3), abs=0.05)
 
@@ -80,7 +80,7 @@ def test_fault_49_wrong_ids_scatter_and_name_nobody():
         if factors.depth(m := corners(pose, other, rng, as_id=7), pose) > 0.5:
             wrong.append((pose, m))
     assert len(wrong) > 2 * AFTER
-    assert not accused(wrong, factors).holds(7)
+    assert not accused(wrong, factors).excludes(7)
 
 
 def test_fault_49_one_landmark_now_and_then_misread_as_another_does_not_name_that_one():
@@ -89,14 +89,14 @@ def test_fault_49_one_landmark_now_and_then_misread_as_another_does_not_name_tha
     factors, quarantine, rarely = LandmarkFactors(world), LandmarkExclusion(AFTER), LandmarkExclusion(AFTER)
     for k, pose in enumerate(poses(6, 200)):
         wrong = factors.sighting(0, replace(beacon(pose, world.landmarks[0], rng), landmark_id=3), None)
-        rarely.fits(0)
+        rarely.accept(0)
         if k % 10 == 0:
-            rarely.disagree([wrong], 0, pose, factors)
-        quarantine.fits(0)
+            rarely.reject([wrong], 0, pose, factors)
+        quarantine.accept(0)
         if k % 3 == 0:  # that often it is no misreading
-            quarantine.disagree([wrong], 0, pose, factors)
-    assert not rarely.holds(3)
-    assert quarantine.holds(3)
+            quarantine.reject([wrong], 0, pose, factors)
+    assert not rarely.excludes(3)
+    assert quarantine.excludes(3)
 
 
 def test_a_landmark_that_is_only_ill_seen_is_not_named():
@@ -104,9 +104,9 @@ def test_a_landmark_that_is_only_ill_seen_is_not_named():
     rng, world = np.random.default_rng(3), beacons()
     factors, here = LandmarkFactors(world), np.array([0.0, -1.0, 0.4])
     ill = [(here, beacon(here, world.landmarks[3], rng, 1.04)) for _ in range(30)]
-    assert not accused(ill, factors).holds(3)
+    assert not accused(ill, factors).excludes(3)
     far = [(here, beacon(here, world.landmarks[3], rng, 1.15)) for _ in range(30)]
-    assert accused(far, factors).holds(3)
+    assert accused(far, factors).excludes(3)
 
 
 def test_a_sighting_that_fits_now_and_then_clears_a_landmark():
@@ -114,10 +114,10 @@ def test_a_sighting_that_fits_now_and_then_clears_a_landmark():
     factors, quarantine = LandmarkFactors(world), LandmarkExclusion(AFTER)
     stands = moved(world.landmarks[2], 0.6, 0.4)
     for i, pose in enumerate(poses(5, 60)):
-        quarantine.disagree([factors.sighting(0, beacon(pose, stands, rng), None)], 0, pose, factors)
+        quarantine.reject([factors.sighting(0, beacon(pose, stands, rng), None)], 0, pose, factors)
         if i % 2:
-            quarantine.fits(2)
-    assert not quarantine.holds(2)
+            quarantine.accept(2)
+    assert not quarantine.excludes(2)
 
 
 def test_fault_51_a_moved_marker_that_is_put_back_does_no_harm_in_a_run():

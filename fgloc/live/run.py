@@ -167,7 +167,7 @@ class OnlineRun:
         if gyro is not None and state.gyro is not None:
             gyro.resume(state.gyro.bias, state.gyro.bias_variance)
         for landmark_id, displacement in state.excluded.items():
-            localizer.association.exclusion.accuse(landmark_id, np.array(displacement))
+            localizer.association.exclusion.exclude(landmark_id, np.array(displacement))
         self._fastest = state.fastest
 
     def snapshot(self) -> RunState | None:

@@ -72,7 +72,7 @@ class Association:
                 fitting.append(sighting)
             elif reason == "gate":
                 gated.append(sighting)
-            if self.exclusion.holds(m.landmark_id):
+            if self.exclusion.excludes(m.landmark_id):
                 reason = "quarantined"
             elif (m.stamp_ns, m.landmark_id) in self.outliers:
                 reason = "contradicts_start"
@@ -134,7 +134,7 @@ class Association:
                 continue
             fits = []
             for other in self._factors.lookalikes(m, predicted.pose):
-                if other in seen or self.exclusion.holds(other):
+                if other in seen or self.exclusion.excludes(other):
                     continue
                 again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
@@ -166,8 +166,8 @@ class Association:
         if not self._config.weights.adaptive or not self._factors.known:
             return
         for sighting in fitting:
-            self.exclusion.fits(sighting.measurement.landmark_id)
-        self.exclusion.disagree(gated, k, predicted.pose, self._factors)
+            self.exclusion.accept(sighting.measurement.landmark_id)
+        self.exclusion.reject(gated, k, predicted.pose, self._factors)
 
     def nearby_consensus(
         self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance

@@ -44,7 +44,7 @@ class LandmarkFaultMonitor:
         if self._bank is not None:
             self._bank.step(np.zeros(3), np.zeros((3, 3)), self._beacons(believed))
 
-    def look(
+    def observe(
         self,
         k: int,
         stamp_ns: int,
@@ -72,7 +72,7 @@ class LandmarkFaultMonitor:
             s.alone
             for s in sightings
             if isinstance(s.alone, RangeBearingMeasurement)
-            and not self._association.exclusion.holds(s.alone.landmark_id)
+            and not self._association.exclusion.excludes(s.alone.landmark_id)
             and (s.alone.stamp_ns, s.alone.landmark_id) not in self._association.outliers
         ]
 
@@ -95,7 +95,7 @@ class LandmarkFaultMonitor:
 
     def _remove(self, k: int, stamp_ns: int, accused: MovedLandmark) -> Decision:
         assert self._bank is not None
-        self._association.exclusion.accuse(accused.landmark_id, accused.displacement)
+        self._association.exclusion.exclude(accused.landmark_id, accused.displacement)
         self._estimator.correct(PoseWithCovariance(accused.pose, accused.cov[:3, :3]), accused.landmark_id)
         self._bank.start(accused.pose, accused.calibration, accused.cov)
         nis = accused.evidence

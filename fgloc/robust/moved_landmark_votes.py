@@ -54,17 +54,17 @@ class LandmarkExclusion:
         """What was held against landmarks was held against them from a wrong place."""
         self._cases.clear()
 
-    def accuse(self, landmark_id: int, displacement: FloatArray) -> None:
+    def exclude(self, landmark_id: int, displacement: FloatArray) -> None:
         """Other evidence says that this landmark stands so far ``(2,)`` [m] from its place."""
         case = self._cases[landmark_id] = _Record(held=True)
         case.places.append(displacement)
 
-    def holds(self, landmark_id: int) -> bool:
+    def excludes(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""
         case = self._cases.get(landmark_id)
         return case is not None and case.held
 
-    def fits(self, landmark_id: int) -> None:
+    def accept(self, landmark_id: int) -> None:
         """A sighting of this landmark agreed with the prediction."""
         self._fitted[landmark_id] += 1
         case = self._cases.get(landmark_id)
@@ -74,7 +74,7 @@ class LandmarkExclusion:
         if case.score <= 0.0:
             del self._cases[landmark_id]
 
-    def disagree(self, refused: Iterable[LandmarkFactor], k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
+    def reject(self, refused: Iterable[LandmarkFactor], k: int, pose: FloatArray, factors: LandmarkFactors) -> None:
         """Sightings contradicted a prediction that others confirmed.
 
         Args:
