@@ -161,6 +161,20 @@ def test_a_second_topic_of_a_role_is_not_mixed_in(world, orderly):
     assert errors(world, made).mean() == pytest.approx(orderly)
 
 
+def test_the_configured_topic_is_used_whichever_comes_first(world, orderly):
+    def twin(event):
+        return dataclasses.replace(event, topic="/other_odom", linear=-event.linear)
+
+    both = [e for event in world.events() for e in ([twin(event), event] if event.topic == "/odom" else [event])]
+    settings = config(recording={"topics": {"odometry": "/odom", "command": "none"}})
+    with live_in(world, settings, roles=("odometry", "sightings")) as live:
+        made = feed(live, both)
+        status = live.status()
+    assert not [n for n in status.notes if "second topic" in n]
+    assert status.dropped == {"odometry": 200, "command": 100}
+    assert errors(world, made).mean() < 1.3 * orderly + 0.002
+
+
 def test_wheels_and_an_arm_may_share_a_topic():
     world = World(beacons(), seconds=6.0)
     radius, track, angle, events = 0.05, 0.3, np.zeros(2), []
