@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -21,3 +22,8 @@ def __getattr__(name: str) -> Any:
 
         return Live
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+# Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel. OpenCV reads this when it
+# is loaded, and keeps to it whatever the format.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 24))

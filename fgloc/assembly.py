@@ -79,7 +79,7 @@ class Assembly:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What the user should know of the parts so far."""
-        parts = (self.gate, self.stepper, self.wheels, self.localizer)
+        parts = (self.gate, self.detections, self.stepper, self.wheels, self.localizer)
         return (*self.notes, *(note for part in parts for note in part.notes))
 
 
@@ -132,7 +132,7 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     camera = _camera(facts, config) if "image" in facts.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(facts, config, notes)
-    if resolved(config, landmark_map) != config:
+    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "

@@ -190,10 +190,19 @@ class Localizer:
         if started is None:
             return []
         first, mode = self.estimator.k + 1, Mode.LOST if self._tracking.lost else Mode.UNCONFIRMED
-        estimates = [dataclasses.replace(estimate, mode=mode) for estimate in self._replay(started)]
-        for k, frame in self.estimator.log.keyframes.items():
-            frame.mode = mode if k >= first else frame.mode
-        return estimates
+        estimates = self._replay(started)
+        frames = [frame for k, frame in self.estimator.log.keyframes.items() if k >= first]
+        for frame in frames:
+            if mode is Mode.LOST is not frame.mode:
+                frame.added_cov = frame.added_cov + self._tracking.lost_cov(frame.belief)
+            frame.mode = mode
+        covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
+        return [
+            dataclasses.replace(
+                e, mode=mode, cov=covs[e.stamp_ns] if mode is Mode.LOST and e.stamp_ns in covs else e.cov
+            )
+            for e in estimates
+        ]
 
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
@@ -318,6 +327,8 @@ class Localizer:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._tracking.mode
         frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
+        if frame.mode is Mode.LOST:
+            frame.added_cov = frame.added_cov + self._tracking.lost_cov(belief)
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
 

@@ -19,6 +19,7 @@ from fgloc.calibration.settings import installation_found
 from fgloc.config import Config, Role
 from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
+from fgloc.diagnosis.unused_sightings import unused_sightings
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import TopicActivity
 from fgloc.intake.topic_clocks import TopicClocks
@@ -113,12 +114,14 @@ def run(
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         roles = recording.roles
+    seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
+    mistakes = (*wrong.sentences, *unused_sightings(rejections, roles, seen))
     if not replay.estimates:
-        raise EstimatorError(" ".join([*wrong.sentences, _never_found(replay, rejections), *hints, *untried]))
+        raise EstimatorError(" ".join([*mistakes, _never_found(replay, rejections), *hints, *untried]))
     try:
         smoothed = smooth_run(parts) if mode == "batch" else None
     except EstimatorError as error:
-        raise EstimatorError(" ".join([*wrong.sentences, _sentence(str(error)), *hints, *untried])) from error
+        raise EstimatorError(" ".join([*mistakes, _sentence(str(error)), *hints, *untried])) from error
     estimates = last_pass(replay.estimates if smoothed is None else smoothed.estimates)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, roles, installed)
@@ -127,6 +130,7 @@ def run(
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
     notes = (
+        *mistakes[len(wrong.sentences) :],
         *wrong.notes,
         *(() if tried is None else tried[:1]),
         *notes,
@@ -153,7 +157,7 @@ def run(
         found=found,
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
-        mistakes=wrong.sentences,
+        mistakes=mistakes,
         config=config,
     )
 

@@ -17,7 +17,7 @@ from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
-BASE = {"types", "errors", "config", "frames", "se2", "stats"}
+BASE = {"atomic", "documents", "settings_file", "types", "errors", "config", "frames", "se2", "stats"}
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
 ONLY = {  # the one place that may import a library

@@ -9,7 +9,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from fgloc.graph.pose_fit import PoseFit
 from live_feed import PATIENCE_S, feed, live_in
 from robot_world import CAMERA, START_NS, World, beacons, config, room
 
@@ -17,6 +16,7 @@ from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
+from fgloc.relocalization.pose_fit import PoseFit
 from fgloc.types import Mode
 
 SECOND = 1_000_000_000

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from fgloc.cli import live, runs, surveys, sweeps, tools
-from fgloc.cli.terminal import EXIT_BAD_INPUT
+from fgloc.cli.terminal import EXIT_BAD_INPUT, say
 from fgloc.errors import FglocError
 
 
@@ -22,7 +22,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except FglocError as error:
-            typer.echo(f"error: {error}", err=True)
+            say(f"error: {error}", err=True)
             raise typer.Exit(EXIT_BAD_INPUT) from error
 
 

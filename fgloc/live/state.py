@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, ValidationError
 
+from fgloc.atomic import atomic_file
 from fgloc.config import Section
 from fgloc.graph.installation import Installation, InstallationBelief
-from fgloc.recording.outputs import atomic_file
 from fgloc.types import FloatArray, LandmarkMap, Mode
 
 _SYMMETRIC, _NEGATIVE = 1e-6, -1e-9  # of the largest variance: what rounding leaves

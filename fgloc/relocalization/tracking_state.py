@@ -168,6 +168,11 @@ class Tracking:
         spread = np.mean((self._places - belief.pose[:2]) ** 2)
         return np.asarray(kidnapped * np.diag([spread, spread, math.pi**2 / 3.0]))
 
+    def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
+        """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map."""
+        spread = np.mean((self._places - belief.pose[:2]) ** 2) if len(self._places) else _ANYWHERE[0, 0]
+        return np.diag([spread, spread, math.pi**2 / 3.0])
+
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""
         self.lost = True
