@@ -257,6 +257,14 @@ def test_two_commands_as_two_processes(tmp_path):
     assert (tmp_path / "state.json").stat().st_size > 100
 
 
+@pytest.mark.parametrize("arguments", [["live"], ["play", str(SAMPLE / "bag")]])
+def test_without_cyclonedds_the_remedy_is_named(monkeypatch, arguments):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "cyclonedds"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    done = CliRunner().invoke(app, arguments)
+    assert (done.exit_code, "pip install 'fgloc[live]'" in done.stderr) == (1, True), done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
