@@ -35,10 +35,14 @@ class WireClock:
     def received_ns(self, sample: Sample) -> int:
         """When a message came.
 
-        That is when it was written, which neither the network nor a busy processor delays, if its writer has our clock.
+        That is when it was written, which neither the network nor a busy processor delays, if its writer has our clock:
+        simulation time (as `fgloc play` has it; other players and simulators write by the machine's clock), or the
+        machine's.
         """
         now = self.now_ns()
-        return sample.source_ns if abs(sample.source_ns - now) < _ALIKE_NS else now
+        apart = abs(sample.source_ns - now)
+        ours = apart <= abs(sample.source_ns - time.time_ns()) if self.simulated else apart < _ALIKE_NS
+        return sample.source_ns if ours else now
 
     def _on_clock(self, sample: Sample) -> None:
         stamp = self._messages.decode(TYPE, sample.cdr).clock

@@ -30,6 +30,7 @@ _LOOPBACK = """<CycloneDDS><Domain>
 _DEPTH = 200  # messages of a topic that wait: 1 s of the fastest sensor
 _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static transform may be one
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
+_MOST_PASSES = 10  # over the readers before their messages are delivered
 _WAIT_S = 60.0  # the reading thread waits this long for messages, then again
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
@@ -224,14 +225,22 @@ class Participant:
             self._deliver()
 
     def _deliver(self) -> None:
-        """What waits in all readers, in the order of writing."""
+        """What waits in all readers, in the order of writing.
+
+        Taken again until nothing more has come: a reader's newest message would else overtake older ones of readers
+        that were looked at before it.
+        """
         found: list[tuple[int, int, Sample, OnSample]] = []
-        for (reader, _), publication, on_sample in self._readers:
-            for message in reader.take(_DEPTH):
-                if message.sample_info.valid_data:
-                    source_ns = message.sample_info.source_timestamp
-                    sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
-                    found.append((source_ns, len(found), sample, on_sample))
+        for _ in range(_MOST_PASSES):
+            before = len(found)
+            for (reader, _), publication, on_sample in self._readers:
+                for message in reader.take(_DEPTH):
+                    if message.sample_info.valid_data:
+                        source_ns = message.sample_info.source_timestamp
+                        sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
+                        found.append((source_ns, len(found), sample, on_sample))
+            if len(found) == before:
+                break
         for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):
             try:
                 on_sample(sample)
