@@ -141,7 +141,7 @@ def _localise(
     map_path = map_file or find_beside(bag, "map.yaml")
     config = resolved(configured(bag, config_file, model), map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace)
+        result = run(bag, map_path, config, mode, progress, pace=pace)
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
