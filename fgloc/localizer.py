@@ -22,7 +22,8 @@ from fgloc.robust.association import Association
 from fgloc.robust.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
 from fgloc.robust.landmark_faults import LandmarkFaultMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
-from fgloc.robust.motion_fusion import MotionFusion, with_noise
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration

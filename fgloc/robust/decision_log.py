@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.robust.motion_fusion import noise_scales
+from fgloc.robust.motion_noise import noise_scales
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings
 
 _REASONS = {
