@@ -28,6 +28,7 @@ from fgloc.types import RunResult
 if TYPE_CHECKING:
     from fgloc.evaluation.metrics import Metrics
 
+_TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
@@ -144,6 +145,8 @@ def _localise(
 
 def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
     """Say what came out."""
+    from fgloc.evaluation.judgements import gravest
+
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]
@@ -153,6 +156,8 @@ def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
     for mistake in result.mistakes:
         typer.echo(f"mistake: {mistake}")
     typer.echo(columns(None, rows))
+    for judgement in gravest(metrics.judgements, _TOLD):
+        typer.echo(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
     for note in result.notes:
         if note not in result.mistakes:
             typer.echo(f"note: {note}")

@@ -20,6 +20,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import TrajectoryError
 from fgloc.evaluation.consistency import coverage, nees
+from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.types import RunResult, Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -72,6 +73,7 @@ class Metrics(BaseModel):
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
     mistakes: tuple[str, ...]  # of the set-up, in sentences
+    judgements: tuple[Judgement, ...]  # what was judged to be wrong, when, and by which evidence
 
 
 def _installation(result: RunResult) -> dict[str, FoundSetting]:
@@ -255,6 +257,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
         mistakes=result.mistakes,
+        judgements=judgements(result),
     )
 
 
