@@ -143,7 +143,7 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     sensors = _sensors(facts, config, landmark_map)
     if sensors and landmark_map is None:
         landmark_map = _no_landmarks(facts, sensors)
-    if {"image", "sightings"} & set(facts.roles) and resolved(config, landmark_map) != config:
+    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "

@@ -61,19 +61,22 @@ def sweep(
     out = out.resolve()
     with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
         for key, error in _finished(client, todo, out):
-            if error is not None and not record_path(out, key).exists():
-                write_record(
-                    out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
-                )
-            record = read_record(out, key)
-            if record is None:
-                raise OutputError(
-                    f"{record_path(out, key)}: was written by a worker, but is not here: do all see {out}?"
-                )
-            records[key] = record
+            records[key] = _recorded(out, key, error)
             if progress is not None:
                 progress(len(records), len(unique))
     return records
+
+
+def _recorded(out: Path, key: str, error: str | None) -> Record:
+    """The record of a job that ended; written here if its worker could not."""
+    if error is not None and not record_path(out, key).exists():
+        write_record(
+            out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
+        )
+    record = read_record(out, key)
+    if record is None:
+        raise OutputError(f"{record_path(out, key)}: was written by a worker, but is not here: do all see {out}?")
+    return record
 
 
 def _by_turns(jobs: Sequence[Job]) -> list[Job]:
@@ -90,15 +93,27 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     """Keys of finished jobs, with an error if their workers died."""
     import distributed
 
-    futures = client.map(execute, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
+    futures = client.map(_attempt, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
     key_of = {future: job.key for future, job in zip(futures, todo, strict=True)}
     for future in distributed.as_completed(futures):
-        error = future.exception() if future.status == "error" else None
+        error = future.exception() if future.status == "error" else _unwritable(future.result())
         if error is not None and not isinstance(error, distributed.KilledWorker):
             raise error
         said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
         yield key_of[future], said
         future.release()
+
+
+def _attempt(job: Job, out: Path) -> str | OutputError:
+    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
+    try:
+        return execute(job, out)
+    except OutputError as error:
+        return error
+
+
+def _unwritable(result: object) -> OutputError | None:
+    return result if isinstance(result, OutputError) else None
 
 
 @contextmanager

@@ -17,18 +17,21 @@ from fgloc.cli.options import (
     MapOption,
     ModelOption,
     Out,
+    RrdOption,
     SchedulerOption,
     WorkersOption,
     configured,
 )
 from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
-from fgloc.errors import RecordingError
+from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:
+    from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
 
+_TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
@@ -55,7 +58,9 @@ def demo(
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
-        result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
+        result, metrics = _localise(
+            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
+        )
         runs.append((mode, metrics))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
@@ -75,13 +80,17 @@ def smooth(
     config: ConfigOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    rrd: RrdOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
+        if rrd is not None:
+            raise ConfigError("--rrd: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    _finish(*_localise(bag, map_file, model, config, out, "batch", typed()), out)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
+    _finish(result, metrics, out, rrd)
 
 
 def online(
@@ -91,10 +100,12 @@ def online(
     model: ModelOption = None,
     config: ConfigOption = None,
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
+    rrd: RrdOption = None,
 ) -> None:
     """Replay the recording as a live robot would hear it; each pose knows only what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    _finish(*_localise(bag, map_file, model, config, out, "online", typed(), pace), out)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
+    _finish(result, metrics, out, rrd)
 
 
 def calibrate(
@@ -123,8 +134,7 @@ def calibrate(
 def _localise(
     bag: Path,
     map_file: Path | None,
-    model: Path | None,
-    config_file: Path | None,
+    config: Config,
     out: Path,
     mode: Literal["batch", "online"],
     command: str,
@@ -139,14 +149,20 @@ def _localise(
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
-    config = resolved(configured(bag, config_file, model), map_path)
+    config = resolved(config, map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace)
+        result = run(bag, map_path, config, mode, progress, pace=pace)
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
-def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
-    """Say what came out."""
+def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
+    """Say what came out, and write it for rerun's viewer."""
+    from fgloc.evaluation.judgements import gravest
+
+    if rrd is not None:
+        from fgloc.view.file import write_rrd
+
+        write_rrd(result, rrd)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]
@@ -156,6 +172,8 @@ def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
     for mistake in result.mistakes:
         say(f"mistake: {mistake}")
     say(columns(None, rows))
+    for judgement in gravest(metrics.judgements, _TOLD):
+        say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
     for note in result.notes:
         if note not in result.mistakes:
             say(f"note: {note}")

@@ -47,7 +47,7 @@ class Association:
         self.rejections: Counter[str] = Counter()
         self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
-        self._believed_ns = 0  # the newest keyframe at which something was believed
+        self._accepted_ns = 0  # the newest keyframe at which something was believed
         self._bias = InnovationBias(config.estimator.gate_probability)
         self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
 
@@ -64,58 +64,52 @@ class Association:
         the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
         because after dead reckoning the linear one is far too large.
         """
-        believed, refused, decisions = [], [], []
+        accepted, rejected, decisions = [], [], []
         fitting, gated = [], []
         judged = self._biased(measurements, self._judge(measurements, predicted), predicted)
         measurements, judged = self._explained_otherwise(measurements, judged, predicted)
         shared = [self._share_information(m) for m in measurements]
-        for alone, (m, weight), (nis, dof, reason) in zip(measurements, shared, judged, strict=True):
+        for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if not reason:
+            if not gate:
                 fitting.append(sighting)
-            elif reason == "gate":
+            elif gate == "gate":
                 gated.append(sighting)
-            if self.exclusion.excludes(m.landmark_id):
-                reason = "quarantined"
-            elif (m.stamp_ns, m.landmark_id) in self.outliers:
-                reason = "contradicts_start"
+            reason = self._excluded(m) or gate
             if reason:
-                refused.append(sighting)
+                rejected.append(sighting)
                 self.rejections[f"{_source(m)}.{reason}"] += 1
             else:
-                believed.append(sighting)
+                accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
+            used = 0.0 if reason else weight
             decisions.append(
-                Decision(
-                    k,
-                    stamp_ns,
-                    _kind(m),
-                    -1 if isinstance(m, PoseMeasurement) else m.landmark_id,
-                    math.sqrt(nis),
-                    nis,
-                    dof,
-                    0.0 if reason else weight,
-                    reason,
-                )
+                Decision(k, stamp_ns, _kind(m), _row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
-        if believed:
-            self._believed_ns = stamp_ns
+        if accepted:
+            self._accepted_ns = stamp_ns
             self._contradicting.clear()
-            for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
-                refused.remove(misread)
-                believed.append(sighting)
+                rejected.remove(misread)
+                accepted.append(sighting)
                 fitting.append(sighting)
                 decisions.append(decision)
-        if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
+        if stamp_ns - self._accepted_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
-        if not believed:
+        if not accepted:
             self._contradicting.update(
                 s.measurement.landmark_id
-                for s, d in zip(refused, decisions, strict=True)
+                for s, d in zip(rejected, decisions, strict=True)
                 if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
             )
-        return believed, refused, decisions
+        return accepted, rejected, decisions
+
+    def _excluded(self, m: LandmarkMeasurement) -> str:
+        """Why a sighting is rejected whatever its residual; empty if it is not."""
+        if self.exclusion.excludes(m.landmark_id):
+            return "quarantined"
+        return "contradicts_start" if (m.stamp_ns, m.landmark_id) in self.outliers else ""
 
     def _biased(
         self,
@@ -200,7 +194,11 @@ class Association:
             self.rejections["sightings.misread"] += 1
             decisions[i] = dataclasses.replace(decisions[i], reason="misread")
             found.append(
-                (misread, sighting, Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, ""))
+                (
+                    misread,
+                    sighting,
+                    Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
+                )
             )
         self.rejections += Counter()  # drops the zeros
         return found
@@ -260,7 +258,7 @@ class Association:
             if one.behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
-            bound = chi2_bound(self._config.estimator.gate_probability, dof)
+            bound = self._gate(dof)
             if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
@@ -325,6 +323,10 @@ class Association:
         }
         return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
 
+    def _gate(self, dof: int) -> float:
+        """Bound of the NIS of a sighting; NaN where there is nothing to hold it against."""
+        return chi2_bound(self._config.estimator.gate_probability, dof) if dof > 0 else math.nan
+
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
         self._seen[m.landmark_id] += 1
         return "seen_too_seldom" if self._seen[m.landmark_id] < self._config.landmarks.min_sightings else ""
@@ -365,3 +367,8 @@ def _kind(m: LandmarkMeasurement) -> str:
 def _source(m: LandmarkMeasurement) -> str:
     """Of a measurement's rejections."""
     return m.source if isinstance(m, PoseMeasurement) else "sightings"
+
+
+def _row_id(m: LandmarkMeasurement) -> int:
+    """Of a landmark in a measurement's row in ``steps.csv``; -1: none."""
+    return -1 if isinstance(m, PoseMeasurement) else m.landmark_id

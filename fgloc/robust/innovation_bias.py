@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgloc.graph.observation import Linearized
+from fgloc.graph.linearized import Linearized
 from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray
 
