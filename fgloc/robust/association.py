@@ -13,19 +13,16 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
-from fgloc.robust.innovation_bias import InnovationBias
 from fgloc.robust.moved_landmark_votes import LandmarkExclusion
+from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     Decision,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
     PoseMeasurement,
-    RangeBearingMeasurement,
 )
 
-KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 _STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
@@ -48,7 +45,7 @@ class Association:
         self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
         self._accepted_ns = 0  # the newest keyframe at which something was believed
-        self._bias = InnovationBias(config.estimator.gate_probability)
+        self._sensors = SensorMeasurements(config, factors)
         self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
 
     def judge(
@@ -66,8 +63,8 @@ class Association:
         """
         accepted, rejected, decisions = [], [], []
         fitting, gated = [], []
-        judged = self._biased(measurements, self._judge(measurements, predicted), predicted)
-        measurements, judged = self._explained_otherwise(measurements, judged, predicted)
+        judged = self._judge(measurements, predicted)
+        measurements, judged = self._sensors.revise(measurements, judged, predicted, self._judge)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
@@ -78,13 +75,13 @@ class Association:
             reason = self._excluded(m) or gate
             if reason:
                 rejected.append(sighting)
-                self.rejections[f"{_source(m)}.{reason}"] += 1
+                self.rejections[f"{source_of(m)}.{reason}"] += 1
             else:
                 accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
             used = 0.0 if reason else weight
             decisions.append(
-                Decision(k, stamp_ns, _kind(m), _row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
+                Decision(k, stamp_ns, kind_of(m), row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
         if accepted:
             self._accepted_ns = stamp_ns
@@ -110,48 +107,6 @@ class Association:
         if self.exclusion.excludes(m.landmark_id):
             return "quarantined"
         return "contradicts_start" if (m.stamp_ns, m.landmark_id) in self.outliers else ""
-
-    def _biased(
-        self,
-        measurements: Sequence[LandmarkMeasurement],
-        judged: list[tuple[float, int, str]],
-        predicted: PoseWithCovariance,
-    ) -> list[tuple[float, int, str]]:
-        """Refuse measurements of registered sensors that pass the gate one by one, but not together."""
-        rows = [
-            i
-            for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True))
-            if isinstance(m, PoseMeasurement) and not reason
-        ]
-        verdicts = list(judged)
-        for i in rows if self._config.weights.adaptive else ():
-            m = measurements[i]
-            (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.believed.mean)
-            if self._bias.is_biased((_kind(m), m.landmark_id), m.stamp_ns, one, predicted.cov):
-                verdicts[i] = verdicts[i][0], verdicts[i][1], "biased"
-        return verdicts
-
-    def _explained_otherwise(
-        self,
-        measurements: Sequence[LandmarkMeasurement],
-        judged: list[tuple[float, int, str]],
-        predicted: PoseWithCovariance,
-    ) -> tuple[list[LandmarkMeasurement], list[tuple[float, int, str]]]:
-        """Where the gate refuses a measurement, the first of its alternatives that the gate accepts takes its place.
-
-        Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the likeliest
-        component of a mixture stands for all of it; here the gate decides which.
-        """
-        taken, verdicts = list(measurements), list(judged)
-        for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True)):
-            if reason not in ("gate", "biased") or not isinstance(m, PoseMeasurement):
-                continue
-            for other in m.alternatives(predicted.pose):
-                verdict = self._judge([other], predicted)[0]
-                if not verdict[2]:
-                    taken[i], verdicts[i] = other, verdict
-                    break
-        return taken, verdicts
 
     def _reassociate(
         self,
@@ -235,7 +190,7 @@ class Association:
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
             return None
         self.rejections.subtract(
-            f"{_source(s.measurement)}.{d.reason}" for s, d in zip(refused, decisions, strict=True)
+            f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(refused, decisions, strict=True)
         )
         self.rejections += Counter()  # drops the zeros
         return fit
@@ -349,26 +304,9 @@ class Association:
     def forget_contradictions(self) -> None:
         """The pose was set anew: `contradicting` starts from 0."""
         self._contradicting.clear()
-        self._bias.forget()
+        self._sensors.forget()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
         self.forget_contradictions()
-
-
-def _kind(m: LandmarkMeasurement) -> str:
-    """Of a measurement's row in ``steps.csv``: of a registered sensor with the number of what it measured."""
-    if not isinstance(m, PoseMeasurement):
-        return KINDS[type(m)]
-    return m.source if m.target < 0 else f"{m.source}.{m.target}"
-
-
-def _source(m: LandmarkMeasurement) -> str:
-    """Of a measurement's rejections."""
-    return m.source if isinstance(m, PoseMeasurement) else "sightings"
-
-
-def _row_id(m: LandmarkMeasurement) -> int:
-    """Of a landmark in a measurement's row in ``steps.csv``; -1: none."""
-    return -1 if isinstance(m, PoseMeasurement) else m.landmark_id
