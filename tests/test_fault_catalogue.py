@@ -1,6 +1,6 @@
 """docs/faults.md and the tests named after its rows agree."""
 
-from fault_rows import PAGE, numbers, faults_tested, with_tests
+from fault_rows import PAGE, faults_tested, numbers, with_tests
 
 
 def test_each_fault_has_tests_and_each_test_a_fault():
