@@ -132,7 +132,7 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     camera = _camera(facts, config) if "image" in facts.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(facts, config, notes)
-    if {"image", "sightings"} & set(facts.roles) and resolved(config, landmark_map) != config:
+    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "

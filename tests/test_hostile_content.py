@@ -15,7 +15,7 @@ from fgloc.cli.terminal import say
 from fgloc.config import Config, GateConfig, RecordingConfig
 from fgloc.errors import MapError, RecordingError
 from fgloc.evaluation.style import plain_label
-from fgloc.intake.validation import Gate
+from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
@@ -25,7 +25,7 @@ from tests.fuzz.hostile_yaml import SYNTAX
 
 @pytest.mark.parametrize("number", [-5, 2**31, 10**21, 2**63])
 def test_ids_beyond_the_graphs_keys_are_rejected_and_counted(number):
-    gate = Gate(GateConfig(), None)
+    gate = EventValidator(GateConfig(), None)
     corners = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
     stamp = 1_700_000_000_000_000_000
     assert gate.check(RangeBearingEvent(stamp, stamp, "/s", "", (RangeBearing(number, 1.0, 0.0),))) is None

@@ -30,9 +30,11 @@ ONLY = {  # the one place that may import a library
     "typer": "cli",
     "dask": "ablation",
     "distributed": "ablation",
+    "cyclonedds": "live",
+    "rerun": "view",
 }
 NEVER = {"datasets", "training", "benchmarks", "tests", "torch", "mujoco", "evo"}
-EXTRAS = {"dask", "distributed"}  # imported late, where they are needed
+EXTRAS = {"dask", "distributed", "cyclonedds", "rerun"}  # imported late, where they are needed
 
 
 def imported(path):

@@ -16,7 +16,7 @@ from robot_world import CAMERA, START_NS, World, beacons, config, nees, room, tr
 from world_bags import write_world
 
 import fgloc
-from fgloc.config import Config, load_config
+from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
 from fgloc.recording.reader import open_recording
@@ -65,11 +65,11 @@ def test_images_give_the_poses_of_a_replay_bit_by_bit():
         settings,
         "online",
         on_step=lambda step, e: replayed.update({} if e is None else {step.stamp_ns: e}),
-        events=lambda events: iter(until(8.0, events)),
+        events=lambda events: iter(until(6.0, events)),
     )
     made = []
     with open_recording(sample / "bag", settings.recording) as recording:
-        events, roles = until(8.0, recording.events()), recording.roles
+        events, roles = until(6.0, recording.events()), recording.roles
     with Live(settings, sample / "map.yaml", roles=roles) as live:
         live.subscribe(made.append)
         for k, event in enumerate(events):
@@ -80,7 +80,7 @@ def test_images_give_the_poses_of_a_replay_bit_by_bit():
                 live.pose_at()
         assert live.wait(PATIENCE_S)
         assert live.status().dropped == {}
-    assert len(made) > 35
+    assert len(made) > 25
     assert all((e.pose == replayed[e.stamp_ns].pose).all() for e in made)
 
 
@@ -119,7 +119,7 @@ def test_the_covariance_grows_with_the_time_beyond_the_last_message():
 
 
 def test_many_threads_may_push_and_ask():
-    world = World(room(), seconds=6.0)
+    world = World(room(), seconds=4.0, rate=5)
     events = world.events()
     kinds = [[e for e in events if e.topic == topic] for topic in ("/odom", "/cmd_vel", "/tags")]
     asked, failed = [], []
@@ -343,12 +343,12 @@ def test_the_status_says_how_the_topics_come_in():
     assert status.keyframes > 30
 
 
-def test_the_example_runs():
+def test_the_example_runs(tmp_path):
+    """On a short drive: the bundled one takes longer."""
+    write_world(tmp_path, World(room(), seconds=8.0, rate=5))
+    (tmp_path / "robot.yaml").write_text(yaml_of(config(), tmp_path), encoding="utf-8")
     example = Path(__file__).parent.parent / "examples" / "live_loop.py"
     assert len(example.read_text(encoding="utf-8").splitlines()) < 40
-    done = subprocess.run(
-        [sys.executable, example], capture_output=True, text=True, check=False, cwd=example.parent.parent
-    )
+    done = subprocess.run([sys.executable, example, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    poses = [line for line in done.stdout.splitlines() if line.endswith(" OK")]
-    assert len(poses) > 20
+    assert [line for line in done.stdout.splitlines() if line.endswith(" OK")]

@@ -17,7 +17,7 @@ SECONDS = 10.0
 
 @pytest.fixture(scope="module")
 def world():
-    return World(room(), seed=5, seconds=SECONDS)
+    return World(room(), seed=5, seconds=SECONDS, rate=5)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_what_goes_wrong_on_the_way_hardly_shows(name, world, orderly):
     assert not [note for note in status.notes if "jumped" in note]
     assert errors(world, made).mean() < 1.3 * orderly + 0.002
     assert made[-1].mode is Mode.OK
-    assert len(made) > 50
+    assert len(made) > 35
 
 
 def test_the_reordering_delay_follows_what_is_measured(world):
@@ -98,7 +98,7 @@ def test_a_publisher_that_restarts_with_its_clock_reset_goes_on(world, orderly):
     assert [n for n in notes if n.startswith("/odom: its clock alone was reset")]
     assert not [n for n in notes if "clock jumped" in n]
     late = [e for e in made if e.stamp_ns > START_NS + 6.5 * SECOND]
-    assert len(late) > 25
+    assert len(late) > 12
     assert {e.mode for e in late} == {Mode.OK}
     assert errors(world, late).mean() < 1.5 * orderly + 0.002
 
@@ -115,9 +115,9 @@ def test_after_a_jump_of_the_common_clock_the_robot_is_found_again(world):
         notes = live.status().notes
     assert [n for n in notes if "the clock jumped back by 1000.0 s" in n or "the clock jumped back by 999.9 s" in n]
     again = [dataclasses.replace(e, stamp_ns=e.stamp_ns + 1000 * SECOND) for e in made if e.stamp_ns < START_NS]
-    assert len(again) > 30
+    assert len(again) > 10
     assert again[-1].mode is Mode.OK
-    assert errors(world, again[-20:]).max() < 0.06
+    assert errors(world, again[-10:]).max() < 0.06
 
 
 def test_of_two_publishers_of_a_topic_the_first_is_used_while_it_speaks(world, orderly):
@@ -159,6 +159,20 @@ def test_a_second_topic_of_a_role_is_not_mixed_in(world, orderly):
     assert [n for n in status.notes if n.startswith("/other_odom: a second topic of the role odometry is not used")]
     assert status.dropped["odometry"] == 200
     assert errors(world, made).mean() == pytest.approx(orderly)
+
+
+def test_the_configured_topic_is_used_whichever_comes_first(world, orderly):
+    def twin(event):
+        return dataclasses.replace(event, topic="/other_odom", linear=-event.linear)
+
+    both = [e for event in world.events() for e in ([twin(event), event] if event.topic == "/odom" else [event])]
+    settings = config(recording={"topics": {"odometry": "/odom", "command": "none"}})
+    with live_in(world, settings, roles=("odometry", "sightings")) as live:
+        made = feed(live, both)
+        status = live.status()
+    assert not [n for n in status.notes if "second topic" in n]
+    assert status.dropped == {"odometry": 200, "command": 100}
+    assert errors(world, made).mean() < 1.3 * orderly + 0.002
 
 
 def test_wheels_and_an_arm_may_share_a_topic():

@@ -73,7 +73,7 @@ def test_missing_or_binary_tum_is_refused(tmp_path):
     with pytest.raises(TrajectoryError, match=r"absent\.tum: cannot be read"):
         outputs.read_tum(tmp_path / "absent.tum")
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(TrajectoryError, match="cannot be read"):
+    with pytest.raises(TrajectoryError, match="not a text file"):
         outputs.read_tum(tmp_path / "b.tum")
 
 

@@ -93,15 +93,27 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     """Keys of finished jobs, with an error if their workers died."""
     import distributed
 
-    futures = client.map(execute, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
+    futures = client.map(_attempt, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
     key_of = {future: job.key for future, job in zip(futures, todo, strict=True)}
     for future in distributed.as_completed(futures):
-        error = future.exception() if future.status == "error" else None
+        error = future.exception() if future.status == "error" else _unwritable(future.result())
         if error is not None and not isinstance(error, distributed.KilledWorker):
             raise error
         said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
         yield key_of[future], said
         future.release()
+
+
+def _attempt(job: Job, out: Path) -> str | OutputError:
+    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
+    try:
+        return execute(job, out)
+    except OutputError as error:
+        return error
+
+
+def _unwritable(result: object) -> OutputError | None:
+    return result if isinstance(result, OutputError) else None
 
 
 @contextmanager

@@ -17,13 +17,14 @@ from fgloc.cli.options import (
     MapOption,
     ModelOption,
     Out,
+    RrdOption,
     SchedulerOption,
     WorkersOption,
     configured,
 )
 from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
-from fgloc.errors import RecordingError
+from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:
@@ -78,13 +79,17 @@ def smooth(
     config: ConfigOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    rrd: RrdOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
+        if rrd is not None:
+            raise ConfigError("--rrd: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    _finish(*_localise(bag, map_file, configured(bag, config, model), out, "batch", typed()), out)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
+    _finish(result, metrics, out, rrd)
 
 
 def online(
@@ -94,10 +99,12 @@ def online(
     model: ModelOption = None,
     config: ConfigOption = None,
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
+    rrd: RrdOption = None,
 ) -> None:
     """Replay the recording as a live robot would hear it; each pose knows only what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    _finish(*_localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace), out)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
+    _finish(result, metrics, out, rrd)
 
 
 def calibrate(
@@ -147,8 +154,12 @@ def _localise(
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
-def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
-    """Say what came out."""
+def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
+    """Say what came out, and write it for rerun's viewer."""
+    if rrd is not None:
+        from fgloc.view.file import write_rrd
+
+        write_rrd(result, rrd)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]

@@ -190,12 +190,14 @@ class Engine:
                 self._admit(self._held.popleft())
 
     def _refuse(self, item: Queued, event: Event) -> None:
-        """An event of a second topic for one role."""
+        """An event of another topic than the one that plays its role."""
         role = role_of(event)
         with self.changed:
-            self.reception.note(
-                f"{event.topic}: a second topic of the role {role} is not used; choose one by recording.topics.{role}"
-            )
+            if not self._run.facts.is_configured(event):
+                self.reception.note(
+                    f"{event.topic}: a second topic of the role {role} is not used; choose one by "
+                    f"recording.topics.{role}"
+                )
             self.reception.dropped[role] += 1
             self.worker.discard(item)
 

@@ -33,7 +33,11 @@ BASE, SENSOR = "base_link", "sensor"
 
 
 class EventMaker:
-    """Makes events; `_deliver` has them. Stamps are of the measurement [ns]; all topics have the name of their role."""
+    """Makes events; `_deliver` has them.
+
+    Stamps are of the measurement [ns]. Topics have the names that the configuration gives them, else those of their
+    roles.
+    """
 
     _recording: RecordingConfig
 
@@ -44,7 +48,8 @@ class EventMaker:
         """Stamp as the configuration corrects it, receive time and topic."""
         received = time.time_ns()
         stamp = received if role in self._recording.received_stamps else int(stamp_ns)
-        return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, role
+        given: str | None = getattr(self._recording.topics, role)
+        return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, given or role
 
     def odometry(
         self,
@@ -142,7 +147,8 @@ class EventMaker:
         """The camera's calibration ``(3, 3)``, ``(n,)``; see `fgloc.types.Camera` for the models. Told once."""
         now = time.time_ns()
         arrays: tuple[Any, Any] = np.asarray(K, dtype=float).reshape(3, 3), np.asarray(D, dtype=float).ravel()
-        self._deliver(CameraInfoEvent(now, now, "camera_info", frame_id, width, height, model, *arrays))
+        topic = self._recording.topics.camera_info or "camera_info"
+        self._deliver(CameraInfoEvent(now, now, topic, frame_id, width, height, model, *arrays))
 
     def transform(self, parent: str, child: str, translation: ArrayLike, rotation: ArrayLike) -> None:
         """A fixed transform ``T_parent_child``: translation ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""

@@ -70,9 +70,19 @@ class LiveFacts:
         self._incomplete = False  # a role has come in that lacks something
 
     def topic_is_used(self, event: Event) -> bool:
-        """Whether the event is of the one topic that plays its role."""
+        """Whether the event is of the one topic that plays its role: the configured one, else the first."""
         role = ROLE_OF.get(type(event))
-        return role is None or self._topics.setdefault(role, event.topic) == event.topic
+        if role is None:
+            return True
+        given: str | None = getattr(self._config.recording.topics, role)
+        if given == "none" or given not in (None, event.topic):
+            return False
+        return self._topics.setdefault(role, event.topic) == event.topic
+
+    def is_configured(self, event: Event) -> bool:
+        """Whether the configuration names the topic that plays the event's role, or none."""
+        role = ROLE_OF.get(type(event))
+        return role is not None and getattr(self._config.recording.topics, role) is not None
 
     @property
     def first(self) -> Mapping[type[Event], Event]:

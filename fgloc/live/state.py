@@ -14,6 +14,8 @@ from pydantic import Field, FiniteFloat, ValidationError
 
 from fgloc.atomic import atomic_file
 from fgloc.config import Section
+from fgloc.documents import read_text
+from fgloc.errors import FglocError, OutputError
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.types import FloatArray, LandmarkMap, Mode
 
@@ -100,9 +102,9 @@ def read_state(path: Path, map_fingerprint: str) -> Resumed:
         return Resumed(None, "")
     remedy = "it is not used, the start is fresh, and the file will be replaced"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_text(path, OutputError, "give a file that `--state` wrote"))
         body, checksum = content["state"], content["sha256"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (FglocError, ValueError, KeyError, TypeError, RecursionError) as error:
         return Resumed(None, f"{path}: no saved state ({_short(error)}); {remedy}")
     if not isinstance(body, str) or checksum != _checksum(body):
         return Resumed(None, f"{path}: damaged, its checksum does not fit; {remedy}")

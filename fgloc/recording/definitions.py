@@ -20,6 +20,7 @@ class Decoder:
     Definitions that the recording embeds win; the defaults serve for the rest.
 
     Attributes:
+        store: rosbags' typestore with the definitions used.
         notes: what the user should know of the definitions used.
     """
 
@@ -50,16 +51,16 @@ class Decoder:
             except Exception:  # the parser leaks what damaged text makes it meet
                 damaged.add(message_type)
         default = _default_definitions(ros1)
-        self._store = get_typestore(Stores.EMPTY)
+        self.store = get_typestore(Stores.EMPTY)
         try:
             needed = _needed(used, {**default, **embedded})
             check_sizes(needed)
-            self._store.register(needed)
+            self.store.register(needed)
         except Exception:  # a definition that parses may still be nonsense
-            self._store = get_typestore(Stores.EMPTY)
-            self._store.register(_needed(used, default))
+            self.store = get_typestore(Stores.EMPTY)
+            self.store.register(_needed(used, default))
             damaged |= embedded.keys() & used
-        self._deserialize = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
+        self._deserialize = self.store.deserialize_ros1 if ros1 else self.store.deserialize_cdr
         self.notes: list[str] = []
         name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
         if missing:

@@ -2,7 +2,7 @@
 
 A few kilobytes of zstd, LZ4 or bzip2 can stand for gigabytes of zeros, an index may name one message a million times,
 and a table of a database may be a query that never ends. Sensor data compresses by 2 to 10, uncompressed images of a
-simulator without noise by up to 100: a pass over a recording may deliver 128 times its size, and 64 MiB in any case.
+simulator without noise by up to 100: a pass over a recording may deliver 128 times its size, and 32 MiB in any case.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ else:
     from backports import zstd
 
 _RATIO = 128
-_FREE_BYTES = 64 << 20
+_FREE_BYTES = 32 << 20
 _BLOCK = 1 << 20
 _FRAMES = 1000  # of one chunk; recorders write one
 REWINDS = 4  # a ROS 1 reader decompresses a chunk again when messages of two chunks alternate

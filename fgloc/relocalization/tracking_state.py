@@ -169,7 +169,12 @@ class Tracking:
         return np.asarray(kidnapped * np.diag([spread, spread, math.pi**2 / 3.0]))
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
-        """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map."""
+        """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map.
+
+        Nothing, where the pose is lost for its covariance, which tells that already.
+        """
+        if self.is_unlocalized(belief):
+            return np.zeros((3, 3))
         spread = np.mean((self._places - belief.pose[:2]) ** 2) if len(self._places) else _ANYWHERE[0, 0]
         return np.diag([spread, spread, math.pi**2 / 3.0])
 
