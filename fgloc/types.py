@@ -363,17 +363,21 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What became of one measurement: a row of ``steps.csv``."""
+    """What became of one measurement, or of the pose: a row of ``steps.csv``."""
 
     step: int
     stamp_ns: int
-    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "prior"
+    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "place", "mode", "clock"
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float
     dof: int
     weight: float  # 1 as given, less if inflated, 0 if rejected
     reason: str  # "" if used as given
+    threshold: float = math.nan  # that the NIS is held against; NaN: none
+    shift_m: float = (
+        math.nan
+    )  # of a motion: how much further forward than its reference; of a place: from the believed pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)

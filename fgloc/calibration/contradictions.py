@@ -14,7 +14,7 @@ import numpy as np
 
 from fgloc.types import InstallationFound, Setting
 
-_SURE = 3.0  # sigmas, of what was found and of what was given
+SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given
 _SURE_2 = 11.8  # χ² of two degrees of freedom, as rare as three sigmas of one
 _MOST_NAMED = 5  # landmarks
 
@@ -28,7 +28,7 @@ def contradictions(found: InstallationFound) -> tuple[str, ...]:
 
 def contradicted(s: Setting) -> bool:
     """Whether what was found is surely further from what was given than that may be off."""
-    return abs(s.off) > _SURE and abs(s.found - s.given) > _SURE * s.sigma
+    return abs(s.off) > SURE_SIGMAS and abs(s.found - s.given) > SURE_SIGMAS * s.sigma
 
 
 def _landmarks(found: InstallationFound) -> Iterator[str]:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
 
+_TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
@@ -156,6 +157,8 @@ def _localise(
 
 def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
     """Say what came out, and write it for rerun's viewer."""
+    from fgloc.evaluation.judgements import gravest
+
     if rrd is not None:
         from fgloc.view.file import write_rrd
 
@@ -169,6 +172,8 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) ->
     for mistake in result.mistakes:
         say(f"mistake: {mistake}")
     say(columns(None, rows))
+    for judgement in gravest(metrics.judgements, _TOLD):
+        say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
     for note in result.notes:
         if note not in result.mistakes:
             say(f"note: {note}")

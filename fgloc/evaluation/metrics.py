@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.evaluation.consistency import coverage, nees
+from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.evaluation.matching import FEWEST, Matched, match, matchable
 from fgloc.types import RunResult
 
@@ -71,6 +72,7 @@ class Metrics(BaseModel):
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
     mistakes: tuple[str, ...]  # of the set-up, in sentences
+    judgements: tuple[Judgement, ...]  # what was judged to be wrong, when, and by which evidence
 
 
 def _installation(result: RunResult) -> dict[str, FoundSetting]:
@@ -176,6 +178,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
         mistakes=result.mistakes,
+        judgements=judgements(result),
     )
 
 

@@ -81,7 +81,7 @@ class Association:
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
             used = 0.0 if reason else weight
             decisions.append(
-                Decision(k, stamp_ns, KINDS[type(m)], m.landmark_id, math.sqrt(nis), nis, dof, used, reason)
+                Decision(k, stamp_ns, KINDS[type(m)], m.landmark_id, nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
         if accepted:
             self._accepted_ns = stamp_ns
@@ -145,7 +145,11 @@ class Association:
             self.rejections["sightings.misread"] += 1
             decisions[i] = dataclasses.replace(decisions[i], reason="misread")
             found.append(
-                (misread, sighting, Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, ""))
+                (
+                    misread,
+                    sighting,
+                    Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
+                )
             )
         self.rejections += Counter()  # drops the zeros
         return found
@@ -202,7 +206,7 @@ class Association:
             if one.behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
-            bound = chi2_bound(self._config.estimator.gate_probability, dof)
+            bound = self._gate(dof)
             if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
@@ -266,6 +270,10 @@ class Association:
             for i, one, nis in zip(others, lines, found, strict=True)
         }
         return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
+
+    def _gate(self, dof: int) -> float:
+        """Bound of the NIS of a sighting; NaN where there is nothing to hold it against."""
+        return chi2_bound(self._config.estimator.gate_probability, dof) if dof > 0 else math.nan
 
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
         self._seen[m.landmark_id] += 1

@@ -13,7 +13,7 @@ from fgloc.graph.estimator import Estimator
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.robust.association import Association
-from fgloc.robust.moved_landmark_glr import MovedLandmark, MovedLandmarkBank
+from fgloc.robust.moved_landmark_glr import ALARM, MovedLandmark, MovedLandmarkBank
 from fgloc.types import Decision, FloatArray, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
 
 _MOST_BEACONS = 500  # one filter each: with more of them a step takes too long
@@ -99,4 +99,4 @@ class LandmarkFaultMonitor:
         self._estimator.correct(PoseWithCovariance(accused.pose, accused.cov[:3, :3]), accused.landmark_id)
         self._bank.start(accused.pose, accused.calibration, accused.cov)
         nis = accused.evidence
-        return Decision(k, stamp_ns, "place", accused.landmark_id, math.sqrt(nis), nis, 2, 1.0, "landmark_moved")
+        return Decision(k, stamp_ns, "place", accused.landmark_id, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", ALARM)

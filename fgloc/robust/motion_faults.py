@@ -28,12 +28,14 @@ class FaultVerdict:
         span: for how many of the newest steps, this one included, that or the scale holds.
         nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
         scale: on their covariances where neither is left out.
+        threshold: that ``nis`` is held against.
     """
 
     off: Mapping[str, str] = field(default_factory=dict)
     span: int = 1
     nis: float = math.nan
     scale: float = 1.0
+    threshold: float = math.nan
 
 
 class MotionFaultMonitor:
@@ -85,7 +87,7 @@ class MotionFaultMonitor:
         )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
-            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale)
+            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale, self._config.alarm)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -94,7 +96,7 @@ class MotionFaultMonitor:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis, threshold=self._config.alarm)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9

@@ -21,7 +21,7 @@ from fgloc.types import FloatArray, IntArray, LandmarkMap, RangeBearingMeasureme
 _MOVED_SIGMA_M = 0.4  # of a displacement, on each axis; the gate finds what was moved by metres
 _MISREAD = 16.0  # squared whitened residual above which a sighting moves nothing: its id is wrong, say
 _CAUCHY = 4.0  # squared constant of the kernel: of misread sightings it takes many to accuse
-_ALARM = 24.0  # twice the logarithm of how much more likely all is if this beacon was moved ...
+ALARM = 24.0  # twice the logarithm of how much more likely all is if this beacon was moved ...
 _MARGIN = 7.0  # ... and more than if another one was
 _LEAST_M, _MOST_M = 0.2, 1.5  # of a displacement, beyond twice its own sigma
 _LEAST_SIGHTINGS, _LEAST_SHARE = 6, 0.6  # explained by the displacement: how many, and of all those of the accused ...
@@ -160,7 +160,7 @@ class MovedLandmarkBank:
             return None
         second, best = np.partition(evidence, -2)[-2:]
         row = int(np.argmax(evidence)) + 1
-        if best < _ALARM or best < second + _MARGIN:
+        if best < ALARM or best < second + _MARGIN:
             return None
         moved = self._moved[row]
         far = math.hypot(*moved)
