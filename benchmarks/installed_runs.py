@@ -45,7 +45,7 @@ from fgloc.ablation.failures.lift import Lift
 from fgloc.atomic import atomic_file
 from fgloc.config import Config
 from fgloc.errors import FglocError
-from fgloc.evaluation.metrics import match
+from fgloc.evaluation.matching import match
 from fgloc.localizer import Localizer
 from fgloc.types import Estimate, Step, Trajectory
 

@@ -71,8 +71,8 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
-        ("robust/motion_fusion.py",),
-        (Switch("fgloc.robust.motion_fusion:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
+        ("robust/motion_noise.py",),
+        (Switch("fgloc.robust.motion_noise:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
         Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _without_wheels),
         batch=True,
     ),

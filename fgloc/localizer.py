@@ -32,7 +32,8 @@ from fgloc.robust.decision_log import (
 from fgloc.robust.landmark_faults import LandmarkFaultMonitor
 from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
-from fgloc.robust.motion_fusion import MotionFusion, with_noise
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration

@@ -21,7 +21,8 @@ from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.localizer import Localizer
 from fgloc.robust.decision_log import motion_decisions
 from fgloc.robust.motion_faults import FaultVerdict
-from fgloc.robust.motion_fusion import MotionFusion, with_noise
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model

@@ -28,6 +28,7 @@ from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:
+    from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
 
 _TOLD = 3  # judgements in the short form
@@ -57,7 +58,9 @@ def demo(
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
-        result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
+        result, metrics = _localise(
+            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
+        )
         runs.append((mode, metrics))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
@@ -86,7 +89,7 @@ def smooth(
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    result, metrics = _localise(bag, map_file, model, config, out, "batch", typed())
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
     _finish(result, metrics, out, rrd)
 
 
@@ -101,7 +104,7 @@ def online(
 ) -> None:
     """Replay the recording as a live robot would hear it; each pose knows only what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    result, metrics = _localise(bag, map_file, model, config, out, "online", typed(), pace)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
     _finish(result, metrics, out, rrd)
 
 
@@ -131,8 +134,7 @@ def calibrate(
 def _localise(
     bag: Path,
     map_file: Path | None,
-    model: Path | None,
-    config_file: Path | None,
+    config: Config,
     out: Path,
     mode: Literal["batch", "online"],
     command: str,
@@ -147,9 +149,9 @@ def _localise(
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
-    config = resolved(configured(bag, config_file, model), map_path)
+    config = resolved(config, map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace)
+        result = run(bag, map_path, config, mode, progress, pace=pace)
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 

@@ -16,8 +16,8 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.excerpt import Picture, Stretch
 from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
+from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
-from fgloc.graph.observation import CornerBatch
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap, MarkerCorners

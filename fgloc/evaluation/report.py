@@ -19,7 +19,8 @@ from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.judgements import GRAVITY, Judgement
-from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
+from fgloc.evaluation.matching import Matched
+from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_trajectory, png
 from fgloc.evaluation.timeline import plot_timeline
 from fgloc.recording.outputs import (

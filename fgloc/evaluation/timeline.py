@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from fgloc.evaluation.metrics import Matched
+from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.style import (
     BLUE,
     GAP_S,

@@ -45,7 +45,7 @@ class Association:
         self.rejections: Counter[str] = Counter()
         self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
-        self._believed_ns = 0  # the newest keyframe at which something was believed
+        self._accepted_ns = 0  # the newest keyframe at which something was believed
         self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
 
     def judge(
@@ -61,55 +61,48 @@ class Association:
         the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
         because after dead reckoning the linear one is far too large.
         """
-        believed, refused, decisions = [], [], []
+        accepted, rejected, decisions = [], [], []
         fitting, gated = [], []
         shared = [self._share_information(m) for m in measurements]
-        for alone, (m, weight), (nis, dof, reason) in zip(
+        for alone, (m, weight), (nis, dof, gate) in zip(
             measurements, shared, self._judge(measurements, predicted), strict=True
         ):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if not reason:
+            if not gate:
                 fitting.append(sighting)
-            elif reason == "gate":
+            elif gate == "gate":
                 gated.append(sighting)
-            if self.exclusion.excludes(m.landmark_id):
-                reason = "quarantined"
-            elif (m.stamp_ns, m.landmark_id) in self.outliers:
-                reason = "contradicts_start"
+            reason = self._excluded(m) or gate
             if reason:
-                refused.append(sighting)
+                rejected.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
             else:
-                believed.append(sighting)
+                accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
+            used = 0.0 if reason else weight
             decisions.append(
-                Decision(
-                    k,
-                    stamp_ns,
-                    KINDS[type(m)],
-                    m.landmark_id,
-                    math.sqrt(nis),
-                    nis,
-                    dof,
-                    0.0 if reason else weight,
-                    reason,
-                    self._gate(dof),
-                )
+                Decision(k, stamp_ns, KINDS[type(m)], m.landmark_id, nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
-        if believed:
-            self._believed_ns = stamp_ns
+        if accepted:
+            self._accepted_ns = stamp_ns
             self._contradicting.clear()
-            for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, predicted):
                 gated = [s for s in gated if s is not misread]
-                refused.remove(misread)
-                believed.append(sighting)
+                rejected.remove(misread)
+                accepted.append(sighting)
                 fitting.append(sighting)
                 decisions.append(decision)
-        if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
+        if stamp_ns - self._accepted_ns < _STILL_RIGHT_NS:
             self._compare(k, fitting, gated, predicted)
-        if not believed:
+        if not accepted:
             self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
-        return believed, refused, decisions
+        return accepted, rejected, decisions
+
+    def _excluded(self, m: LandmarkMeasurement) -> str:
+        """Why a sighting is rejected whatever its residual; empty if it is not."""
+        if self.exclusion.excludes(m.landmark_id):
+            return "quarantined"
+        return "contradicts_start" if (m.stamp_ns, m.landmark_id) in self.outliers else ""
 
     def _reassociate(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.motion_faults import FaultVerdict
-from fgloc.robust.motion_fusion import noise_scales
+from fgloc.robust.motion_noise import noise_scales
 from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
 
 JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...

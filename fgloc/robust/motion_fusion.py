@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.robust.motion_noise import add_slip_noise, is_commanded_to_move, noise_scales, turned_by, with_noise
 from fgloc.sensors.gyro import Gyro, Turn
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
@@ -21,10 +21,7 @@ from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
-_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
-_WRONG_LASTS_S = 1.0  # ... for this long in one direction
-_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
 
 
 _OF_MOTION = (
@@ -112,10 +109,10 @@ class MotionFusion:
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
-            turn = self.gyro.measure(step, None if wheels is None or _told_to_move(step) else motion, blind_s)
+            turn = self.gyro.measure(step, None if wheels is None or is_commanded_to_move(step) else motion, blind_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
-                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
+                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, turned_by(motion, turn.yaw), cov)
                 gyro = self._installed(gyro, turn)
                 self._turn = turn
         readings = MotionReadings(wheels, self._measure_learned(step, velocity), gyro)
@@ -204,14 +201,14 @@ class MotionFusion:
                 learned = self.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
         if gyro is not None and known:
-            known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
+            known.append(replace(gyro, motion=turned_by(known[0].motion, float(gyro.motion[2]))))
         return known
 
     def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
         """Wheels that are not believed, where nothing else knows the way."""
         if why == "slip":
-            return with_room(wheels, _SLIP_SPEED, _SLIP_TURN)
-        return with_room(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
+            return add_slip_noise(wheels, _SLIP_SPEED, _SLIP_TURN)
+        return add_slip_noise(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
 
     def combine_again(self, frame: Keyframe, readings: MotionReadings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
@@ -263,7 +260,7 @@ class MotionFusion:
         cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
-            motion, cov[2, 2] = _turned(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+            motion, cov[2, 2] = turned_by(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
     def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None) -> None:
@@ -290,48 +287,3 @@ class MotionFusion:
         self._silent_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
-
-
-def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
-    """Factors on the covariances of wheels and learned motion.
-
-    Args:
-        off: sources that are left out, and why.
-        scale: on the wheels' covariance, as they and the other sources differ (`MotionFaultMonitor`). The learned
-            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of
-            the two is better than it says.
-    """
-    if "wheels" in off:
-        return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
-    return {"wheels": scale, "learned": min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)}
-
-
-def with_noise(m: MotionMeasurement, scale: float = 1.0, extra_cov: FloatArray | None = None) -> MotionMeasurement:
-    """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
-    if scale == 1.0 and extra_cov is None:
-        return m
-    return replace(m, cov=m.cov * scale + (0.0 if extra_cov is None else extra_cov))
-
-
-def with_room(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:
-    """The wheels' motion with room: the robot may do anything between what they say and nothing, or these speeds.
-
-    Args:
-        m: what the wheels say.
-        speed: that they may be wrong by, even when they hardly turn [m/s].
-        turn: likewise [rad/s].
-    """
-    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-    told, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
-    density = np.square([max(told, speed), 0.3 * max(told, speed), max(turned, turn)])
-    return replace(m, cov=m.cov + np.diag(density * _WRONG_LASTS_S * seconds))
-
-
-def _turned(motion: FloatArray, yaw: float) -> FloatArray:
-    return np.array([motion[0], motion[1], yaw])
-
-
-def _told_to_move(step: Step) -> bool:
-    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
-    since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)

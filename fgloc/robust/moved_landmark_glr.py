@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
-from fgloc.graph.observation import cartesian
+from fgloc.graph.planar_batch import cartesian
 from fgloc.types import FloatArray, IntArray, LandmarkMap, RangeBearingMeasurement
 
 _MOVED_SIGMA_M = 0.4  # of a displacement, on each axis; the gate finds what was moved by metres

@@ -155,14 +155,14 @@ def qos_bomb(path: Path) -> None:
 def image_bomb(folder: Path, suffix: str, side: int) -> Path:
     """A bag with compressed images of ``side`` by ``side`` pixels."""
     image = cv2.imencode(suffix, np.zeros((side, side), np.uint8))[1].tobytes()
-    return _with_images(folder, image)
+    return _with_images(folder, image, side)
 
 
-def _with_images(folder: Path, image: bytes) -> Path:
+def _with_images(folder: Path, image: bytes, side: int) -> Path:
     K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]
     with BagWriter(folder) as bag:
         bag.static_transform(START_NS, "base_link", "camera", (0.1, 0.0, 0.3), (-0.5, 0.5, -0.5, 0.5))
-        bag.camera_info("/camera/camera_info", START_NS, 640, 480, K, [0.0] * 5, frame_id="camera")
+        bag.camera_info("/camera/camera_info", START_NS, side, side, K, [0.0] * 5, frame_id="camera")
         for k in range(40):
             stamp = START_NS + k * 50_000_000
             bag.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.4, 0.0))
@@ -181,7 +181,7 @@ def scans_bomb(folder: Path) -> Path:
     second = jpeg.index(b"\xff\xda", first + 2)
     scan = jpeg[second : jpeg.index(b"\xff", second + 20)] if second > 0 else b""
     end = jpeg.rindex(b"\xff\xd9")
-    return _with_images(folder, jpeg[:end] + scan * 2000 + jpeg[end:])
+    return _with_images(folder, jpeg[:end] + scan * 2000 + jpeg[end:], 2000)
 
 
 def raw_image_bomb(path: Path) -> None:
@@ -269,7 +269,7 @@ def make_all(folder: Path, great: int = 3 << 30) -> dict[str, Path]:
         size = great if kind == "zstd" else 200 << 20
         mcap_bomb(at(f"mcap_{kind}"), kind, size)
     mcap_bomb(at("mcap_undeclared"), "zstd", great, declared=1 << 20)
-    mcap_bomb(at("mcap_many_chunks"), "zstd", 60 << 20, chunks=100)
+    mcap_bomb(at("mcap_many_chunks"), "zstd", 25 << 20, chunks=100)
     mcap_indexed_bomb(at("mcap_merged"), chunks=40, each=60 << 20)
     mcap_indexed_bomb(at("mcap_merged_within"), chunks=3, each=10 << 20)
     ros1_bomb(at("ros1_bz2", ".bag"), "bz2", great // 3)

@@ -27,10 +27,14 @@ _LOOPBACK = """<CycloneDDS><Domain>
 </Domain></CycloneDDS>"""
 """ROS 2 does the same when told to stay on one machine (32: its rmw's limit of processes that find one another)."""
 
-_DEPTH = 200  # messages of a topic that wait: 1 s of the fastest sensor
+_SENT_DEPTH = 200  # messages of a topic that wait for readers: 1 s of a fast sensor
+_READ_DEPTH = 2000  # messages of a topic that wait for the reading thread: 10 s of it, on a busy machine
+_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
+_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_BATCH = 200  # messages taken from a reader at once
 _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static transform may be one
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
-_MOST_PASSES = 10  # over the readers before their messages are delivered
+_MOST_PASSES = 20  # over the readers before their messages are delivered
 _WAIT_S = 60.0  # the reading thread waits this long for messages, then again
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
@@ -170,7 +174,7 @@ class Participant:
         entity = self._topic(topic, message_type, messages or self.messages)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)),
-            Policy.History.KeepLast(_DEPTH),
+            Policy.History.KeepLast(_SENT_DEPTH),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
             Policy.DataRepresentation(use_cdrv0_representation=True),
@@ -190,7 +194,7 @@ class Participant:
         entity = self._topic(topic, message_type, self.messages)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)) if latched else Policy.Reliability.BestEffort,
-            Policy.History.KeepLast(_DEPTH),
+            Policy.History.KeepLast(_LARGE_DEPTH if message_type in _LARGE else _READ_DEPTH),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.IgnoreLocal.Participant,  # what we publish is no input
@@ -234,7 +238,7 @@ class Participant:
         for _ in range(_MOST_PASSES):
             before = len(found)
             for (reader, _), publication, on_sample in self._readers:
-                for message in reader.take(_DEPTH):
+                for message in reader.take(_BATCH):
                     if message.sample_info.valid_data:
                         source_ns = message.sample_info.source_timestamp
                         sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
