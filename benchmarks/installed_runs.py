@@ -130,7 +130,7 @@ def _sources() -> str:
 
 
 def run_cell(cell: Cell) -> Scores:
-    """Replay and score a case; what fails says why."""
+    """Replay and score a case; what fails has its reason."""
     recorded = load(cell.take)
     try:
         chain = [failure(described) for described in FAILURES[cell.case].chain(recorded)]

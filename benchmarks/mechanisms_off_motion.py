@@ -86,7 +86,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     ),
     Mechanism(
         "failure_kind",
-        "Tells frozen encoders and one dead wheel from slip.",
+        "Distinguishes frozen encoders and one dead wheel from slip.",
         ("robust/motion_faults.py",),
         (Switch(f"{_TRUST}:MotionFaultMonitor._failure", Returns("slip")),),
         Probe(f"{_TRUST}:MotionFaultMonitor._failure", lambda kind, *_: kind != "slip"),

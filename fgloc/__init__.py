@@ -31,6 +31,7 @@ from fgloc.errors import (
     OutputError,
     RecordingError,
     TrajectoryError,
+    WireError,
 )
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ __all__ = [
     "RunResult",
     "Trajectory",
     "TrajectoryError",
+    "WireError",
     "load_config",
     "load_map",
     "run",

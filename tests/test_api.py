@@ -34,6 +34,7 @@ NAMES = [
     "RunResult",
     "Trajectory",
     "TrajectoryError",
+    "WireError",
     "load_config",
     "load_map",
     "run",

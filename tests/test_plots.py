@@ -299,7 +299,7 @@ def test_report_tells_all_and_escapes(written):
         "odometry&#x27;s &lt;twist&gt; is zero",
         "odometry.duplicate_stamp",
         "LOST 33.3 %",
-        "do not trust these stretches",
+        "do not use these stretches",
         "matched at 200 of 300 keyframes",
         "c0ffee",
     ):

@@ -33,7 +33,7 @@ def sweep(
     """Run all jobs that have no record yet; return all records by key.
 
     A job whose record exists is not run again: a sweep that was killed goes on where it was. A job that fails, or that
-    kills its worker again and again, gets a record that says so, and is left alone afterwards.
+    kills its worker again and again, gets a record with that outcome, and is not run again.
 
     Args:
         jobs: from `make_jobs`.

@@ -77,8 +77,8 @@ def survey(
     surveyed, views = graph.landmarks(), graph.views()
     left_out |= _undetermined(graph, surveyed, views, set(anchors), config.landmarks.min_sightings)
     if not set(surveyed) - set(left_out):
-        told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{bags[0]}: no marker can be surveyed: {told}")
+        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
+        raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
     dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
@@ -148,8 +148,8 @@ def _joined(
         free = bool(anchors) or bool(legs)
         legs.append(Leg(one, moved_poses(motion, one.poses), _agreeing(guesses), free))
     if not known:
-        told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {told or 'none was seen'}")
+        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
+        raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {listed or 'none was seen'}")
     start = {
         i: anchors[i] if i in anchors else Landmark(i, T[:3, 3], T[:3, :3], sizes[i]) for i, T in sorted(known.items())
     }

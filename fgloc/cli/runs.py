@@ -102,7 +102,7 @@ def online(
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
 ) -> None:
-    """Replay the recording as a live robot would hear it; each pose knows only what came before."""
+    """Replay the recording as on a live robot; each pose depends only on what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
     result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
     _finish(result, metrics, out, rrd)

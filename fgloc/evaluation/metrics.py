@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth, and whether its covariance says so.
+"""How far an estimated trajectory is from the truth, and whether its covariance is right.
 
 Errors live in the map frame. Where the truth's frame is another one (``truth.align: se2``), the truth is moved into the
 map by the rigid motion that fits the positions best; the estimate and its covariance stay as they are.

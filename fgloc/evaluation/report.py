@@ -47,8 +47,8 @@ _JUDGED = (
 )
 _MOST_ROWS = 60  # of the table of judgements
 _INSTALLATION = (
-    "What the run found, and how well; what it cannot tell keeps its value and sigma. A value contradicts the given "
-    "one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
+    "What the run found, and how well; what it cannot determine keeps its value and sigma. A value contradicts the "
+    "given one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
 )
 FILES = (
     "trajectory.tum",
@@ -116,12 +116,16 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
 def installation_yaml(found: InstallationFound, config: Config, folder: Path, command: str) -> str:
     """The configuration of the run with what it has found, for ``--config``; goes with the run's ``map.yaml``."""
     rows = [f"#   {s.name}: {s.given:.6g} -> {s.found:.6g} +- {s.sigma:.2g}" for s in found.settings]
-    head = [f"# {command}", "# Given -> found +- sigma; whatever a run cannot tell keeps its value and sigma.", *rows]
+    head = [
+        f"# {command}",
+        "# Given -> found +- sigma; whatever a run cannot determine keeps its value and sigma.",
+        *rows,
+    ]
     return "\n".join(head) + "\n" + yaml_of(with_settings(config, found.settings), folder)
 
 
 def _slips(result: RunResult, config: Config) -> IntArray | None:
-    """When a wheel truly slipped, if the recording is still there and tells."""
+    """When a wheel truly slipped, if the recording is still there and has it."""
     if result.source is None or not result.source.exists():
         return None
     with open_recording(result.source, config.recording) as recording:
@@ -191,7 +195,7 @@ def _truth_line(result: RunResult, matched: Matched | None) -> str:
 def _modes(modes: Sequence[Mode]) -> str:
     counts = Counter(modes)
     shares = ", ".join(f"{mode} {100.0 * counts[mode] / len(modes):.1f} %" for mode in Mode if counts[mode])
-    lost = " The robot was LOST for part of the run: do not trust these stretches." if counts[Mode.LOST] else ""
+    lost = " The robot was LOST for part of the run: do not use these stretches." if counts[Mode.LOST] else ""
     return f"<p{' class=warn' if lost else ''}>Modes: {shares}.{lost}</p>"
 
 

@@ -51,7 +51,7 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     Args:
         result: the run.
         matched: estimate and truth, for the errors.
-        slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator told.
+        slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator recorded them.
     """
     motions = [d for d in result.decisions if d.kind in _SOURCES]
     sightings = [d for d in result.decisions if d.landmark_id >= 0]

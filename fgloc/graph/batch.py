@@ -53,12 +53,12 @@ class Smoothed:
 class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
-    It holds what was believed online. Of an unknown map, sightings that the first solution finds less likely than
-    ``1 - gate_probability`` are left out.
+    It holds the sightings that were accepted online. Of an unknown map, sightings that the first solution finds less
+    likely than ``1 - gate_probability`` are left out.
 
     Attributes:
         frames: the keyframes.
-        believed: the sightings in the graph, by keyframe.
+        accepted: the sightings in the graph, by keyframe.
     """
 
     def __init__(
@@ -79,17 +79,17 @@ class BatchSmoother:
         self._factors = factors
         self._config = config
         self._probability = gate_probability
-        self.believed = {frame.k: frame.sightings for frame in self.frames}
-        self._values = initial_values(self.frames, self.believed, self._factors)
+        self.accepted = {frame.k: frame.sightings for frame in self.frames}
+        self._values = initial_values(self.frames, self.accepted, self._factors)
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
 
     def _leave_out_unlikely(self) -> None:
         """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""
-        self.believed = {
+        self.accepted = {
             k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(self._probability, _dof(s)))
-            for k, held in self.believed.items()
+            for k, held in self.accepted.items()
         }
         self._optimize()
 
@@ -128,7 +128,7 @@ class BatchSmoother:
             for s in (*frame.sightings, *frame.refused)
         ]
         if not self._factors.known or not seen:
-            factors = [f for held in self.believed.values() for s in held for f in s.factors]
+            factors = [f for held in self.accepted.values() for s in held for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
         observed = self._factors.observe([s.measurement for _, s in seen])
         lines = observed.linearize(np.array([pose for pose, _ in seen]), self._theta())
@@ -166,7 +166,7 @@ class BatchSmoother:
             stamps_ns=self.stamps_ns(),
             poses=self.poses(),
             covs=np.array(covs),
-            landmarks={} if self._factors.known else estimated_landmarks(self.believed, self._values, marginals),
+            landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
             factors=self._graph.size(),
             error=self._graph.error(self._values),
         )
@@ -192,7 +192,7 @@ class BatchSmoother:
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
-        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.believed[f.k]]
+        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.accepted[f.k]]
         for factor in self._sighting_factors(seen):
             graph.add(factor)
         return graph

@@ -55,7 +55,7 @@ def with_deep_stack(work: Callable[[], _T]) -> _T:
 
 
 def initial_values(
-    frames: list[Keyframe], believed: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
+    frames: list[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
     """Where the batch starts: poses, landmarks and installation as the incremental estimator has them."""
     values = gtsam.Values()
@@ -67,7 +67,7 @@ def initial_values(
         return values
     seen: dict[int, list[FloatArray]] = {}
     for frame in frames:
-        for sighting in believed[frame.k]:
+        for sighting in accepted[frame.k]:
             m = sighting.measurement
             if isinstance(m, MarkerPoseMeasurement):
                 seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, m.pose))
@@ -91,11 +91,11 @@ def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> 
 
 
 def estimated_landmarks(
-    believed: Mapping[int, tuple[LandmarkFactor, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
+    accepted: Mapping[int, tuple[LandmarkFactor, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
 ) -> dict[int, Landmark]:
     """Landmarks that were variables, with their covariance."""
     landmarks = {}
-    for m in (s.measurement for sightings in believed.values() for s in sightings):
+    for m in (s.measurement for sightings in accepted.values() for s in sightings):
         key = landmark_key(m.landmark_id)
         if m.landmark_id in landmarks:
             continue

@@ -1,7 +1,7 @@
 """The incremental estimator: iSAM2 in a fixed-lag window (flat cost, however long the run) or whole (short runs).
 
-A GTSAM update that throws leaves the smoother in ruins; the window is then rebuilt from our own log
-without the sightings of the step, and the caller is told.
+A GTSAM update that throws leaves the smoother unusable; the window is then rebuilt from the measurement log
+without the sightings of the step, and `rebuilt` counts it.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def predict(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """What sightings of one step say against a belief.
+    """Innovation of the sightings of one step against a prediction.
 
     Attributes:
         residual: ``(d,)`` predicted minus measured.

@@ -1,4 +1,4 @@
-"""The place that sightings tell: the pose that explains them best, and how well it does."""
+"""The pose that explains sightings best, and how well it does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of the motion: rows of ``steps.csv``, and sentences for the user."""
+"""Decisions on the motion: rows of ``steps.csv``, and sentences for the user."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def motion_decisions(
 
     That of the wheels is the statistic of the GLR test of the ``verdict``, and its threshold the alarm.
 
-    Sources that are not believed (``off``: and why) have weight 0. A ``reason`` says why the covariance of all the
+    Rejected sources (``off``: and why) have weight 0. A ``reason`` gives why the covariance of all the
     others was inflated; their weight is then 0 too, as they no longer hold the pose. Otherwise the weight is one over
     the factor on the covariance (`noise_scales` of the scale). A step that was judged again has more than one row for a
     source; the last one holds.
@@ -65,11 +65,11 @@ def motion_decisions(
 
 
 def place_decision(
-    k: int, stamp_ns: int, believed: PoseWithCovariance, place: PoseWithCovariance, reason: str
+    k: int, stamp_ns: int, estimated: PoseWithCovariance, place: PoseWithCovariance, reason: str
 ) -> Decision:
     """The row for a pose that sightings tell, against the predicted one; weight 0: the run did not go there."""
-    miss = se2.log(se2.between(believed.pose, place.pose))
-    nis = float(miss @ np.linalg.solve(believed.cov + place.cov, miss))
+    miss = se2.log(se2.between(estimated.pose, place.pose))
+    nis = float(miss @ np.linalg.solve(estimated.cov + place.cov, miss))
     weight = 1.0 if reason in (JUMP, OVERRULED) else 0.0
     shift = math.hypot(miss[0], miss[1])
     return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, weight, reason, shift_m=shift)

@@ -19,7 +19,7 @@ from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
-_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
+_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 
@@ -81,8 +81,8 @@ class MotionFusion:
         self._learned = learned
         self.joint = joint
         self.gyro = gyro
-        self._turn: Turn | None = None  # what the gyro says of the step that was read last
-        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
+        self._turn: Turn | None = None  # by the gyro, of the step that was read last
+        self._silent_s = 0.0  # how long there was neither a motion source nor a fix
 
     @property
     def gyro_is_read(self) -> bool:
@@ -93,7 +93,7 @@ class MotionFusion:
         """Ask every source once.
 
         Args:
-            step: what was heard.
+            step: its events.
             blind_s: time before the step without a fix.
             velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
@@ -127,7 +127,7 @@ class MotionFusion:
 
         Args:
             m: as it is reported.
-            turn: what the gyro says, if the motion is made of it.
+            turn: the gyro's, if the motion is made of it.
             change: ``(3,)`` of the wheels' twist over the step: by it a wrong clock shows.
 
         Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
@@ -155,8 +155,8 @@ class MotionFusion:
     def _by_slowdown(self, m: MotionMeasurement, rho_x: float, phi: float) -> FloatArray:
         """Derivative of the wheels' motion by ``slowdown``: it takes from the speed by the turning that is reported."""
         wheels, seconds = self._config.wheels, max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-        told = abs(phi) / seconds / wheels.scale_omega
-        return np.array([-told * rho_x / max(1.0 - wheels.slowdown * told, _SLOWEST), 0.0, 0.0])
+        commanded = abs(phi) / seconds / wheels.scale_omega
+        return np.array([-commanded * rho_x / max(1.0 - wheels.slowdown * commanded, _SLOWEST), 0.0, 0.0])
 
     def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -179,8 +179,8 @@ class MotionFusion:
         """Factors of a step, independent of each other.
 
         Args:
-            readings: what the sources say.
-            off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
+            readings: of the sources.
+            off: rejected sources, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
             scale: as `noise_scales` takes it.
         """
@@ -205,7 +205,7 @@ class MotionFusion:
         return known
 
     def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
-        """Wheels that are not believed, where nothing else knows the way."""
+        """Rejected wheels, where no other source measures the motion: with slip noise."""
         if why == "slip":
             return add_slip_noise(wheels, _SLIP_SPEED, _SLIP_TURN)
         return add_slip_noise(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
@@ -216,11 +216,11 @@ class MotionFusion:
         return [with_noise(m, extra_cov=frame.extra_cov) for m in made]
 
     def disagreement(self, readings: MotionReadings) -> Difference | None:
-        """How far the wheels and the sources that witness their slip are apart over the step.
+        """How far the wheels and their reference source are apart over the step.
 
         Returns:
-            None where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand
-            in for wheels.
+            None where there is no reference source: a model that reads the wheels is none, nor is one of the commands
+            that replace wheels.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
         if wheels is None or self._wheels.from_commands:
@@ -250,9 +250,9 @@ class MotionFusion:
         return D, self._factors.believed.cov[np.ix_(rows, rows)]
 
     def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
-        """Nothing told the way: sigma grows with the time of silence, however many steps it is cut into.
+        """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
 
-        A gyro, if there is one, still tells the turn.
+        A gyro, if there is one, still measures the turn.
         """
         before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
         gate = self._config.gate
@@ -267,7 +267,7 @@ class MotionFusion:
         """The robot went on by a step.
 
         Args:
-            readings: what the sources said of it.
+            readings: of that step.
             fix: where sightings have it now; None if there were none.
         """
         if fix is not None:

@@ -21,8 +21,8 @@ def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
     Args:
         off: sources that are left out, and why.
         scale: on the wheels' covariance, as they and the other sources differ (`MotionFaultMonitor`). The learned
-            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of
-            the two is better than it says.
+            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as it is not known
+            which of the two has too large a covariance.
     """
     if "wheels" in off:
         return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
@@ -30,23 +30,23 @@ def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
 
 
 def with_noise(m: MotionMeasurement, scale: float = 1.0, extra_cov: FloatArray | None = None) -> MotionMeasurement:
-    """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
+    """The motion with its covariance scaled, and with ``extra_cov (3, 3)``, its disagreement with sightings, added."""
     if scale == 1.0 and extra_cov is None:
         return m
     return replace(m, cov=m.cov * scale + (0.0 if extra_cov is None else extra_cov))
 
 
 def add_slip_noise(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:
-    """The wheels' motion with room: the robot may do anything between what they say and nothing, or these speeds.
+    """The wheels' motion with slip noise: the true speed may be anything between theirs and zero, or off by these.
 
     Args:
-        m: what the wheels say.
+        m: motion of the wheels.
         speed: that they may be wrong by, even when they hardly turn [m/s].
         turn: likewise [rad/s].
     """
     seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-    told, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
-    density = np.square([max(told, speed), 0.3 * max(told, speed), max(turned, turn)])
+    speed_of_wheels, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
+    density = np.square([max(speed_of_wheels, speed), 0.3 * max(speed_of_wheels, speed), max(turned, turn)])
     return replace(m, cov=m.cov + np.diag(density * _WRONG_LASTS_S * seconds))
 
 
