@@ -358,7 +358,7 @@ class Localizer:
     def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._tracking.mode
-        if self._lift.carried and frame.mode is Mode.OK and not frame.sightings:
+        if self._lift.carried and frame.mode is Mode.OK and self._tracking.blind_s > 0.0:
             frame.mode = Mode.DEAD_RECKONING
         frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
         if frame.mode is Mode.LOST:
