@@ -19,6 +19,7 @@ Kind = Literal[
     "lost",
     "initial_pose_contradicted",
     "relocated",
+    "lifted",
     "clock_jump",
     "landmark_moved",
     "installation",
@@ -39,6 +40,7 @@ _TITLES: Mapping[str, str] = {
     "lost": "robot lost",
     "initial_pose_contradicted": "given first pose contradicted",
     "relocated": "pose contradicted, robot relocated",
+    "lifted": "robot lifted or pushed",
     "clock_jump": "clock jumped",
     "landmark_moved": "moved",
     "installation": "contradicts the given value",
@@ -178,6 +180,8 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
         return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
     if d.kind == "mode":
         return _OF_MODES[d.reason], "pose"
+    if d.kind == "lift":
+        return "lifted", "pose"
     if d.kind == "clock":
         return "clock_jump", "clock"
     if d.kind == "place":
@@ -250,6 +254,7 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
     if not math.isfinite(statistic) or statistic == 0.0:
         return count
     names = {"wheels": "GLR", "learned": "NIS", "gyro": "NIS", "place": "NIS"}
+    names |= {"lift": f"{worst.reason.replace('_', ' ')}: NIS"}
     name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
     bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""
     return f"{name} {'up to ' if len(rows) > 1 else ''}{_number(statistic)}{bound}; {count}"
