@@ -51,6 +51,7 @@ from fgloc.types import (
     Mode,
     MotionMeasurement,
     MotionReadings,
+    PoseMeasurement,
     Step,
 )
 
@@ -292,7 +293,8 @@ class Localizer:
             self._tracking.record_fix()
             self._lift.fix()
         fix = belief if believed else None
-        self.sources.commit(readings, fix)
+        tells_yaw = any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.tells_yaw for s in believed)
+        self.sources.commit(readings, fix, tells_yaw)
         if accused:  # the pose was corrected: no motion leads from where it was thought to be
             self.sources.begin_segment()
             self.motion_faults.reset()
