@@ -34,6 +34,7 @@ from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.robust.motion_noise import with_noise
+from fgloc.sensors.base import Sensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration
@@ -77,6 +78,7 @@ class Localizer:
         joint: JointCalibration | None = None,
         keep_all: bool = False,
         gyro: Gyro | None = None,
+        sensors: Sequence[Sensor] = (),
     ) -> None:
         """Put the parts together.
 
@@ -89,6 +91,7 @@ class Localizer:
             joint: its correlation with the wheels; None: the two are taken as independent.
             keep_all: keep the measurement log of the whole run, for the batch smoother.
             gyro: the gyro, if any.
+            sensors: registered ones, whose measurements are judged and fused as sightings are.
         """
         self.config = config
         self.factors = LandmarkFactors(
@@ -106,7 +109,7 @@ class Localizer:
         self.sources = MotionFusion(config, wheels, learned, joint, gyro, self.factors)
         self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
         self._lift = LiftMonitor()
-        self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
+        self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s, sensors)
         self._landmark_faults = LandmarkFaultMonitor(config, landmark_map, self.estimator, self.association)
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
