@@ -317,7 +317,7 @@ class WeightsConfig(Section):
     )
     release_s: float = Field(0.6, gt=0, description="agreement for this long ends it")
     quarantine_after: int = Field(
-        6, gt=0, description="refusals in excess of what is believed that quarantine a marker"
+        6, gt=0, description="sightings that a displacement has to explain before a landmark is left out as moved"
     )
 
 

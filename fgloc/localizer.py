@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -20,7 +21,6 @@ from fgloc.relocalization.global_search import InitialPose
 from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
 from fgloc.robust.association import Association
 from fgloc.robust.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
-from fgloc.robust.landmark_faults import LandmarkFaultMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion, with_noise
 from fgloc.sensors.gyro import Gyro
@@ -37,6 +37,7 @@ from fgloc.types import (
     LandmarkMap,
     LandmarkMeasurement,
     Mode,
+    MotionMeasurement,
     MotionReadings,
     Step,
 )
@@ -94,7 +95,6 @@ class Localizer:
         self.sources = MotionFusion(config, wheels, learned, joint, gyro, self.factors)
         self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
         self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
-        self._landmark_faults = LandmarkFaultMonitor(config, landmark_map, self.estimator, self.association)
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
@@ -184,8 +184,9 @@ class Localizer:
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
         believed, _, decisions = self._associate(k, step, sightings, prior)
-        self._landmark_faults.start(prior, believed)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
+        self.association.modes.restart()
+        self.association.modes.observe((), prior, belief, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
         self._tracking.record_fix(bool(believed))
@@ -207,7 +208,7 @@ class Localizer:
             place = None
             if not believed:
                 outliers = [
-                    s.measurement for s in refused if not self.association.exclusion.excludes(s.measurement.landmark_id)
+                    s.measurement for s in refused if not self.association.modes.excludes(s.measurement.landmark_id)
                 ]
                 place = self._tracking.search(step, motions, outliers, readings, predicted)
             if place is not None:
@@ -233,22 +234,19 @@ class Localizer:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
             weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
-        accused = self._landmark_faults.observe(k, step.stamp_ns, motions, believed, kept)
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
             self._tracking.record_fix()
         fix = belief if believed else None
         self.sources.commit(readings, fix)
-        if accused:  # the pose was corrected: no motion leads from where it was thought to be
-            self.sources.begin_segment()
-            self.motion_faults.reset()
+        moved = self._judge_landmarks(step, motions, predicted, believed, kept)
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off, frame.scale, frame.extra_cov = readings, trust.off, trust.scale, extra_cov
         decisions += motion_decisions(
             k, motions, readings, trust.off, "overruled by sightings" if fit is not None else "", trust.scale
         )
-        return self._estimate(step, frame.belief, [*decisions, *weighed, *accused])
+        return self._estimate(step, frame.belief, [*decisions, *weighed, *moved])
 
     def _associate(
         self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
@@ -259,8 +257,41 @@ class Localizer:
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held
         if self._tracking.keeps_initial_pose:
-            self.association.exclusion.forget()  # they all seem moved from there
+            self.association.modes.forget()  # they all seem moved from there
         return believed, refused, decisions
+
+    def _judge_landmarks(
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        predicted: PoseWithCovariance,
+        fused: Sequence[LandmarkFactor],
+        refused: Sequence[LandmarkFactor],
+    ) -> list[Decision]:
+        """Leave out a landmark that was moved; take back what it did to the pose."""
+        modes, belief = self.association.modes, self.estimator.log.keyframes[self.estimator.k].belief
+        against = [s for s in refused if (s.alone.stamp_ns, s.alone.landmark_id) not in self.association.outliers]
+        moved = modes.observe(motions, predicted, belief, fused, against)
+        if moved is None:
+            return []
+        without, evidence = modes.exclude(moved, belief)
+        if without is not belief:
+            self.estimator.correct(without, moved)
+            self.sources.begin_segment()  # no motion leads from where it was thought to be
+            self.motion_faults.reset()
+        return [
+            Decision(
+                self.estimator.k,
+                step.stamp_ns,
+                "place",
+                moved,
+                math.sqrt(evidence),
+                evidence,
+                2,
+                1.0,
+                "landmark_moved",
+            )
+        ]
 
     def _revise(self, k: int, trust: FaultVerdict) -> list[Decision]:
         """Weigh the motion of the steps before this one anew, back to where the disagreement began.
@@ -297,7 +328,7 @@ class Localizer:
         return dataclasses.replace(estimate, decisions=tuple(decisions))
 
     def _get_lost(self) -> None:
-        self.association.exclusion.forget()
+        self.association.modes.forget()
         self._tracking.get_lost()
 
     def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
@@ -317,7 +348,7 @@ class Localizer:
         """What the user should know so far, one sentence each."""
         return (
             *self._tracking.notes,
-            *moved_notes(self.association.exclusion.displacements),
+            *moved_notes(self.association.modes.displacements),
             *flag_notes(self.motion_faults.flags),
         )
 

@@ -257,7 +257,7 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     counts = chain.localizer.association.rejections
     assert sum(counts[f"sightings.{why}"] for why in ("gate", "quarantined", "contradicts_start")) == len(refused)
     assert counts["sightings.quarantined"] > 40
-    moved_by = chain.localizer.association.exclusion.displacements
+    moved_by = chain.localizer.association.modes.displacements
     assert list(moved_by) == [2]
     assert np.allclose(moved_by[2], (0.0, 0.4), atol=0.05)
     assert any("marker 2 does not stand where" in note for note in chain.localizer.notes)

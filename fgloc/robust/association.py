@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
-from fgloc.robust.moved_landmark_votes import LandmarkExclusion
+from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
@@ -24,7 +24,6 @@ from fgloc.types import (
 )
 
 KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
-_STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -45,8 +44,7 @@ class Association:
         self.rejections: Counter[str] = Counter()
         self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
-        self._believed_ns = 0  # the newest keyframe at which something was believed
-        self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
+        self.modes = LandmarkModes(config, factors)
 
     def judge(
         self,
@@ -62,17 +60,12 @@ class Association:
         because after dead reckoning the linear one is far too large.
         """
         believed, refused, decisions = [], [], []
-        fitting, gated = [], []
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, reason) in zip(
             measurements, shared, self._judge(measurements, predicted), strict=True
         ):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if not reason:
-                fitting.append(sighting)
-            elif reason == "gate":
-                gated.append(sighting)
-            if self.exclusion.excludes(m.landmark_id):
+            if self.modes.excludes(m.landmark_id):
                 reason = "quarantined"
             elif (m.stamp_ns, m.landmark_id) in self.outliers:
                 reason = "contradicts_start"
@@ -96,16 +89,11 @@ class Association:
                 )
             )
         if believed:
-            self._believed_ns = stamp_ns
             self._contradicting.clear()
             for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
-                gated = [s for s in gated if s is not misread]
                 refused.remove(misread)
                 believed.append(sighting)
-                fitting.append(sighting)
                 decisions.append(decision)
-        if stamp_ns - self._believed_ns < _STILL_RIGHT_NS:
-            self._compare(k, fitting, gated, predicted)
         if not believed:
             self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
         return believed, refused, decisions
@@ -134,7 +122,7 @@ class Association:
                 continue
             fits = []
             for other in self._factors.lookalikes(m, predicted.pose):
-                if other in seen or self.exclusion.excludes(other):
+                if other in seen or self.modes.excludes(other):
                     continue
                 again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
@@ -155,19 +143,6 @@ class Association:
             )
         self.rejections += Counter()  # drops the zeros
         return found
-
-    def _compare(
-        self, k: int, fitting: Sequence[LandmarkFactor], gated: Sequence[LandmarkFactor], predicted: PoseWithCovariance
-    ) -> None:
-        """Others were believed, now or just before: what disagrees beside them may have been moved.
-
-        Without them, in the dark say, the prediction is too little known to be held against a landmark.
-        """
-        if not self._config.weights.adaptive or not self._factors.known:
-            return
-        for sighting in fitting:
-            self.exclusion.accept(sighting.measurement.landmark_id)
-        self.exclusion.reject(gated, k, predicted.pose, self._factors)
 
     def nearby_consensus(
         self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
