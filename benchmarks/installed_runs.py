@@ -41,11 +41,11 @@ from benchmarks.installed_scores import (
 )
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.ablation.failures.kidnap import Kidnap
+from fgloc.atomic import atomic_file
 from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match
 from fgloc.localizer import Localizer
-from fgloc.recording.outputs import atomic_file
 from fgloc.types import Estimate, Step, Trajectory
 
 CASES = ("none", "slip", "mu01", "dark30", "dark60", "ids30", "moved", "frozen", "onewheel", "kidnap")

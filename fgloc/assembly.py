@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,13 +19,13 @@ from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.images import ImageError, decode
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
+from fgloc.stream_facts import HasFrames, RecordingFacts, StreamFacts, first_events
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -41,7 +43,6 @@ from fgloc.types import (
 _OPTICAL_TO_BODY = np.array(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 )  # optical axes in body axes (REP 103)
-_SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded is looked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +63,25 @@ class Assembly:
     diagnosis: Diagnosis
     notes: tuple[str, ...]
 
+    @property
+    def rejections(self) -> Counter[str]:
+        """Everything refused by any part so far, by reason."""
+        localizer, gyro = self.localizer, self.localizer.sources.gyro
+        counters = [self.gate.rejections, self.detections.rejections, self.stepper.rejections, self.wheels.rejections]
+        counters += [self.landmarks.rejections, localizer.rejections, localizer.association.rejections]
+        counters += [] if self.learned is None else [self.learned.rejections]
+        counters += [] if gyro is None else [gyro.rejections]
+        total: Counter[str] = Counter()
+        for counter in counters:
+            total.update(counter)
+        return total
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the user should know of the parts so far."""
+        parts = (self.gate, self.detections, self.stepper, self.wheels, self.localizer)
+        return (*self.notes, *(note for part in parts for note in part.notes))
+
 
 def assemble(
     recording: Recording,
@@ -70,7 +90,7 @@ def assemble(
     keep_all: bool,
     landmark_map: LandmarkMap | None = None,
 ) -> Assembly:
-    """Build and check the parts.
+    """Build and check the parts for a recording.
 
     Args:
         recording: to be run.
@@ -84,31 +104,42 @@ def assemble(
         CameraError: the calibration is missing, unusable or does not fit the images.
         MapError, ModelError, ConfigError: as their loaders have it.
     """
-    if not {"odometry", "joints", "command", "imu"} & set(recording.roles):
-        raise RecordingError(
-            f"{recording.path}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
-            f"{', '.join(f'{t.name} ({t.message_type})' for t in recording.topics) or 'none'}"
-        )
+    facts = RecordingFacts(recording)
+    _need_motion(facts)
     if landmark_map is None and map_path is not None:
         landmark_map = load_map(map_path, config.markers.default_size_m)
+    return assemble_stream(facts, landmark_map, config, keep_all)
+
+
+def _need_motion(facts: StreamFacts) -> None:
+    if not {"odometry", "joints", "command", "imu"} & set(facts.roles):
+        raise RecordingError(
+            f"{facts.name}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
+            f"{facts.topics}"
+        )
+
+
+def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config: Config, keep_all: bool) -> Assembly:
+    """Build and check the parts for a stream of which these facts are known; otherwise as `assemble`."""
+    _need_motion(facts)
     notes = list(landmark_map.notes) if landmark_map is not None else []
-    if not {"odometry", "joints", "command"} & set(recording.roles):
+    if not {"odometry", "joints", "command"} & set(facts.roles):
         notes.append(
             "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
             "gate.max_speed takes it."
         )
-    first = _first_events(recording)
-    camera = _camera(recording, config, first) if "image" in recording.roles or CornersEvent in first else None
+    first = facts.first
+    camera = _camera(facts, config) if "image" in facts.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
-    T_base_sensor = _sensor_pose(recording, config, first, notes)
-    if resolved(config, map_path) != config:
-        config = resolved(config, map_path)
+    T_base_sensor = _sensor_pose(facts, config, notes)
+    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
+        config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
     detector = None
-    if "image" in recording.roles:
+    if "image" in facts.roles:
         dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
         if not dictionary:
             raise ConfigError(
@@ -118,10 +149,10 @@ def assemble(
     learned = joint = None
     if config.motion.use and config.motion.model is not None:
         model = load_model(config.motion.model)
-        learned = LearnedMotion(model, config.motion, mounted_up(recording, config, first))
+        learned = LearnedMotion(model, config.motion, mounted_up(facts, config, first))
         joint = model.joint if config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
-    imu_up = mounted_up(recording, config, first) if "imu" in recording.roles and config.gyro.use else None
+    imu_up = mounted_up(facts, config, first) if "imu" in facts.roles and config.gyro.use else None
     gyro = None if imu_up is None else Gyro(config.gyro, imu_up)
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
     seen_by: Role = "sightings" if detector is None else "image"
@@ -143,71 +174,67 @@ def assemble(
     )
 
 
-def resolved(config: Config, map_path: Path | None) -> Config:
+def resolved(config: Config, given_map: Path | LandmarkMap | None) -> Config:
     """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
-    if map_path is not None or config.estimator.kind != "fixed_lag":
+    if given_map is not None or config.estimator.kind != "fixed_lag":
         return config
     return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
 
 
-def _first_events(recording: Recording) -> dict[type[Event], Event]:
-    """The first event of each kind, from as far into the recording as it takes for every topic to speak."""
-    found: dict[type[Event], Event] = {}
-    silent = set(recording.roles.values())
-    for event in recording.events():
-        found.setdefault(type(event), event)
-        silent.discard(event.topic)
-        if not silent:
-            break
-    return found
-
-
-def _base_frame(recording: Recording, config: Config, first: dict[type[Event], Event]) -> str:
+def base_frame(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> str:
+    """Name of the robot's base frame: as configured, a usual one among the transforms, or the odometry's child."""
     if config.recording.base_frame is not None:
         return config.recording.base_frame
     for name in BASE_NAMES:
-        if name in recording.frames:
+        if name in stream.frames:
             return name
     odometry = first.get(OdometryEvent)
     return odometry.child_frame_id if isinstance(odometry, OdometryEvent) else BASE_NAMES[0]
 
 
-def _camera(recording: Recording, config: Config, first: dict[type[Event], Event]) -> Camera:
+def _camera(facts: StreamFacts, config: Config) -> Camera:
+    if facts.camera is not None:
+        return _fitting(facts.camera, facts, config)
+    first = facts.first
     info = first.get(CameraInfoEvent)
-    image = first.get(ImageEvent)
-    seen = (info, image, first.get(CornersEvent))
+    seen = (info, first.get(ImageEvent), first.get(CornersEvent))
     frame = next((e.frame_id for e in seen if isinstance(e, CameraInfoEvent | ImageEvent | CornersEvent)), "")
     T_base_cam = given_pose(config, default_axes="optical")
     if T_base_cam is None:
-        T_base_cam = recording.frames.lookup(_base_frame(recording, config, first), frame)
+        T_base_cam = facts.frames.lookup(base_frame(facts, config, first), frame)
     if config.camera.file is not None:
         camera = load_camera(config.camera.file, T_base_cam)
     elif isinstance(info, CameraInfoEvent):
         camera = camera_from_info(info, T_base_cam)
     else:
         raise CameraError(
-            f"{recording.path}: images or marker corners, but no sensor_msgs/CameraInfo; "
+            f"{facts.name}: images or marker corners, but no sensor_msgs/CameraInfo; "
             "set camera.file to a calibration YAML in --config"
         )
-    size = _image_size(recording)
+    return _fitting(camera, facts, config)
+
+
+def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
+    """The camera as the configuration corrects it, for the size of the images."""
+    size = facts.image_size
     if size is None or not camera.width or size == (camera.width, camera.height):
         return corrected(camera, config.camera)
     if not config.camera.rescale:
         raise CameraError(
-            f"{recording.path}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
+            f"{facts.name}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
             "calibrate at this size, or set camera.rescale: true"
         )
     return corrected(rescaled(camera, *size), config.camera)
 
 
-def mounted_up(recording: Recording, config: Config, first: dict[type[Event], Event]) -> FloatArray:
+def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
     """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level.
 
     Its length is ``gyro.scale``, so that rates along it are true ones.
     """
-    base, event = _base_frame(recording, config, first), first.get(ImuEvent)
-    if isinstance(event, ImuEvent) and event.frame_id in recording.frames and base in recording.frames:
-        return np.asarray(config.gyro.scale * recording.frames.lookup(base, event.frame_id)[2, :3])
+    base, event = base_frame(stream, config, first), first.get(ImuEvent)
+    if isinstance(event, ImuEvent) and event.frame_id in stream.frames and base in stream.frames:
+        return np.asarray(config.gyro.scale * stream.frames.lookup(base, event.frame_id)[2, :3])
     return np.array([0.0, 0.0, config.gyro.scale])
 
 
@@ -215,19 +242,7 @@ def base_up(recording: Recording, config: Config) -> FloatArray | None:
     """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
     if "imu" not in recording.roles or not config.gyro.use:
         return None
-    return mounted_up(recording, config, _first_events(recording))
-
-
-def _image_size(recording: Recording) -> tuple[int, int] | None:
-    """Width and height of the first image that can be decoded; None if there is none near the beginning."""
-    for _, event in zip(range(_SCAN_EVENTS), recording.events(), strict=False):
-        if isinstance(event, ImageEvent):
-            try:
-                height, width = decode(event).shape
-            except ImageError:
-                continue
-            return width, height
-    return None
+    return mounted_up(recording, config, first_events(recording))
 
 
 def given_pose(config: Config, default_axes: str) -> FloatArray | None:
@@ -243,18 +258,17 @@ def given_pose(config: Config, default_axes: str) -> FloatArray | None:
     return T
 
 
-def _sensor_pose(
-    recording: Recording, config: Config, first: dict[type[Event], Event], notes: list[str]
-) -> FloatArray | None:
+def _sensor_pose(facts: StreamFacts, config: Config, notes: list[str]) -> FloatArray | None:
     """Place of a sensor that reports ranges or marker poses: as configured, or from tf, or at the base."""
     given = given_pose(config, default_axes="body")
+    first = facts.first
     event = first.get(RangeBearingEvent) or first.get(MarkerPosesEvent)
     if given is not None or not isinstance(event, RangeBearingEvent | MarkerPosesEvent):
         return given
-    base = _base_frame(recording, config, first)
+    base = base_frame(facts, config, first)
     T = np.eye(4)
-    if event.frame_id in recording.frames and base in recording.frames:
-        T = recording.frames.lookup(base, event.frame_id).copy()
+    if event.frame_id in facts.frames and base in facts.frames:
+        T = facts.frames.lookup(base, event.frame_id).copy()
     elif event.frame_id.lstrip("/") != base.lstrip("/"):
         notes.append(
             f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at "

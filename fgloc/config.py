@@ -7,17 +7,20 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from fgloc.errors import ConfigError
+from fgloc.settings_file import Settings
 
 
 class Section(BaseModel):
-    """A part of the configuration: unknown keys are errors, values are immutable."""
+    """A part of the configuration: unknown keys are errors, numbers are finite, values are immutable."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+_Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
+_Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
+_Sigma = Annotated[float, Field(ge=1e-6, le=1e4)]  # m or rad
 Role = Literal["odometry", "command", "joints", "imu", "image", "camera_info", "sightings", "truth"]
 
 
@@ -45,9 +48,11 @@ class RecordingConfig(Section):
         le=1.0,
         description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
     )
-    stamp_offset_s: dict[Role, float] = Field({}, description="added to a role's stamps [s]: a known clock offset")
+    stamp_offset_s: dict[Role, Annotated[float, Field(ge=-4e9, le=4e9)]] = Field(
+        {}, description="added to a role's stamps [s]: a known clock offset"
+    )
     base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
-    sightings_pose: tuple[float, float, float, float, float, float] | None = Field(
+    sightings_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
         None, description="sensor in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
     )
     sightings_axes: Literal["body", "optical"] | None = Field(
@@ -60,27 +65,35 @@ class RecordingConfig(Section):
 class GateConfig(Section):
     """What is too wrong to enter the graph."""
 
-    max_speed: float = Field(5.0, gt=0, description="m/s")
-    max_yaw_rate: float = Field(10.0, gt=0, description="rad/s")
-    max_wheel_rate: float = Field(500.0, gt=0, description="rad/s")
-    max_position: float = Field(1e6, gt=0, description="m, of an odometry or truth pose")
-    max_range: float = Field(50.0, gt=0, description="m, of a sighting")
-    min_range: float = Field(0.02, gt=0, description="m")
-    max_variance: float = Field(1e6, gt=0, description="above it a variance says 'unknown'")
-    quaternion_tolerance: float = Field(0.05, gt=0, description="less off unit length: normalised; more: rejected")
-    gap_s: float = Field(1.0, gt=0, description="a silence of a sensor longer than this is reported")
-    clock_jump_s: float = Field(60.0, gt=0, description="a jump ahead larger than this starts a new segment")
-    clock_back_s: float = Field(1.0, gt=0, description="a jump back larger than this starts a new segment")
-    min_marker_side_px: float = Field(8.0, gt=0, description="a smaller marker is not believed")
+    max_speed: float = Field(5.0, gt=0, le=1e3, description="m/s")
+    max_yaw_rate: float = Field(10.0, gt=0, le=1e4, description="rad/s")
+    max_wheel_rate: float = Field(500.0, gt=0, le=1e6, description="rad/s")
+    max_position: float = Field(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
+    max_range: float = Field(50.0, gt=0, le=1e5, description="m, of a sighting")
+    min_range: float = Field(0.02, gt=0, le=1e5, description="m")
+    max_variance: float = Field(1e6, gt=0, le=1e12, description="above it a variance says 'unknown'")
+    quaternion_tolerance: float = Field(
+        0.05, gt=0, le=1, description="less off unit length: normalised; more: rejected"
+    )
+    gap_s: float = Field(1.0, gt=0, le=1e9, description="a silence of a sensor longer than this is reported")
+    clock_jump_s: float = Field(60.0, gt=0, le=1e9, description="a jump ahead larger than this starts a new segment")
+    clock_back_s: float = Field(1.0, gt=0, le=1e9, description="a jump back larger than this starts a new segment")
+    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is not believed")
 
 
 class KeyframesConfig(Section):
     """When a pose is added to the graph."""
 
-    max_interval_s: float = Field(0.2, gt=0)
-    min_interval_s: float = Field(0.05, ge=0)
-    reorder_s: float = Field(0.1, ge=0, description="late messages wait this long to be put in order")
-    history_s: float = Field(2.0, ge=0, description="commands before a step that the learned motion may read")
+    max_interval_s: float = Field(0.2, ge=0.001, le=60)
+    min_interval_s: float = Field(0.05, ge=0, le=60)
+    reorder_s: float = Field(0.1, ge=0, le=60, description="late messages wait this long to be put in order")
+    history_s: float = Field(2.0, ge=0, le=60, description="commands before a step that the learned motion may read")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> KeyframesConfig:
+        if self.min_interval_s > self.max_interval_s:
+            raise ValueError(f"min_interval_s is {self.min_interval_s}, expected at most max_interval_s")
+        return self
 
 
 class NoiseDensity(Section):
@@ -90,13 +103,13 @@ class NoiseDensity(Section):
     splitting a step leaves the covariance as it was.
     """
 
-    x_per_sqrt_m: float = Field(0.03, ge=0, description="m/√m, along the motion")
-    y_per_sqrt_m: float = Field(0.015, ge=0, description="m/√m, across the motion")
-    yaw_per_sqrt_m: float = Field(0.03, ge=0, description="rad/√m")
-    xy_per_sqrt_rad: float = Field(0.01, ge=0, description="m/√rad")
-    yaw_per_sqrt_rad: float = Field(0.05, ge=0, description="rad/√rad")
-    xy_per_sqrt_s: float = Field(0.002, ge=0, description="m/√s, also at rest")
-    yaw_per_sqrt_s: float = Field(0.002, ge=0, description="rad/√s, also at rest")
+    x_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="m/√m, along the motion")
+    y_per_sqrt_m: float = Field(0.015, ge=0, le=100, description="m/√m, across the motion")
+    yaw_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="rad/√m")
+    xy_per_sqrt_rad: float = Field(0.01, ge=0, le=100, description="m/√rad")
+    yaw_per_sqrt_rad: float = Field(0.05, ge=0, le=100, description="rad/√rad")
+    xy_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="m/√s, also at rest")
+    yaw_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="rad/√s, also at rest")
 
 
 class WheelsConfig(Section):
@@ -110,20 +123,22 @@ class WheelsConfig(Section):
     )
     left_joint: str | None = None
     right_joint: str | None = None
-    left_radius: float | None = Field(None, gt=0, le=2.0, description="m")
-    right_radius: float | None = Field(None, gt=0, le=2.0, description="m")
-    track: float | None = Field(None, gt=0, le=5.0, description="m, between the wheels' contact points")
-    angle_range: float | None = Field(None, gt=0, description="rad: the angle rolls over after this much; None: never")
-    scale_v: float = Field(1.0, gt=0, description="true over reported forward speed")
-    scale_omega: float = Field(1.0, gt=0, description="true over reported yaw rate")
+    left_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
+    right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
+    track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
+    angle_range: float | None = Field(
+        None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
+    )
+    scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
+    scale_omega: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported yaw rate")
     yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
     slowdown: float = Field(
         0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
     )
     delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
-    hold_s: float = Field(0.5, gt=0, description="a twist is held for this long when the next one is missing")
-    zero_speed: float = Field(0.0, ge=0, description="m/s below which a reported speed is rest")
-    zero_yaw_rate: float = Field(0.0, ge=0, description="rad/s below which a reported rate is rest")
+    hold_s: float = Field(0.5, gt=0, le=60, description="a twist is held for this long when the next one is missing")
+    zero_speed: float = Field(0.0, ge=0, le=10, description="m/s below which a reported speed is rest")
+    zero_yaw_rate: float = Field(0.0, ge=0, le=10, description="rad/s below which a reported rate is rest")
     noise: NoiseDensity = NoiseDensity()
     scale_sigma: float = Field(
         0.01,
@@ -149,11 +164,11 @@ class GyroConfig(Section):
     """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
 
     use: bool = True
-    scale: float = Field(1.0, gt=0, description="true over reported rate")
-    yaw_per_sqrt_s: float = Field(0.002, gt=0, description="rad/√s: white noise of the integrated rate")
+    scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported rate")
+    yaw_per_sqrt_s: float = Field(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
-    bias_sigma: float = Field(0.02, gt=0, description="rad/s, before anything is known of the bias")
-    bias_walk: float = Field(0.0003, ge=0, description="rad/s/√s")
+    bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
+    bias_walk: float = Field(0.0003, ge=0, le=10, description="rad/s/√s")
 
 
 class CameraConfig(Section):
@@ -161,11 +176,13 @@ class CameraConfig(Section):
 
     file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
     rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
-    focal_scale: float = Field(1.0, gt=0, description="true focal length over that of the calibration")
-    cx_px: float | None = Field(None, description="px: principal point; None, as below: the calibration's")
-    cy_px: float | None = Field(None, description="px")
-    k1: float | None = Field(None, description="of plumb_bob; other models are taken as they are")
-    k2: float | None = None
+    focal_scale: float = Field(1.0, ge=0.01, le=100, description="true focal length over that of the calibration")
+    cx_px: float | None = Field(
+        None, ge=-1e5, le=1e5, description="px: principal point; None, as below: the calibration's"
+    )
+    cy_px: float | None = Field(None, ge=-1e5, le=1e5, description="px")
+    k1: float | None = Field(None, ge=-100, le=100, description="of plumb_bob; other models are taken as they are")
+    k2: float | None = Field(None, ge=-100, le=100)
     position_sigma_m: float = Field(
         0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
     )
@@ -186,30 +203,30 @@ class MarkersConfig(Section):
     """Marker detection in images."""
 
     dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
-    default_size_m: float | None = Field(None, gt=0, le=5.0, description="side, for maps that give none")
-    sigma_px: float = Field(0.5, gt=0, description="noise of one corner coordinate")
+    default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, for maps that give none")
+    sigma_px: float = Field(0.5, ge=1e-3, le=100, description="noise of one corner coordinate")
     blur_s: float = Field(
         2e-4,
         ge=0,
         le=0.1,
         description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
     )
-    cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
-    max_sightings: int = Field(12, gt=0, description="the largest markers of an image that are used")
+    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
+    max_sightings: int = Field(12, gt=0, le=1000, description="the largest markers of an image that are used")
 
 
 class LandmarksConfig(Section):
     """Range/bearing and marker-pose sightings."""
 
-    range_sigma_m: float = Field(0.1, gt=0)
-    range_sigma_per_m: float = Field(0.0, ge=0, description="added range sigma per metre of range")
-    bearing_sigma_rad: float = Field(0.02, gt=0)
-    range_scale: float = Field(1.0, gt=0, description="true over reported range")
+    range_sigma_m: float = Field(0.1, ge=1e-4, le=100)
+    range_sigma_per_m: float = Field(0.0, ge=0, le=10, description="added range sigma per metre of range")
+    bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2)
+    range_scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported range")
     range_along_axis: bool = Field(
         False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
     )
-    range_bias_m: float = Field(0.0, description="subtracted from the reported range")
-    bearing_bias_rad: float = Field(0.0, description="subtracted from the reported bearing")
+    range_bias_m: float = Field(0.0, ge=-100, le=100, description="subtracted from the reported range")
+    bearing_bias_rad: float = Field(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
     range_scale_sigma: float = Field(
         0.005, ge=0, le=0.5, description="how far range_scale may be off; estimated during the run"
     )
@@ -220,13 +237,19 @@ class LandmarksConfig(Section):
         0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
     )
     yaw_sigma_rad: float | None = Field(
-        None, gt=0, description="of a marker pose's yaw; None: marker poses are used as range and bearing only"
+        None,
+        ge=1e-5,
+        le=3.2,
+        description="of a marker pose's yaw; None: marker poses are used as range and bearing only",
     )
-    cauchy_k: float = Field(3.0, gt=0, description="Cauchy constant in units of sigma")
-    min_sightings: int = Field(3, gt=0, description="sightings that an unknown landmark needs before it is believed")
+    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
+    min_sightings: int = Field(
+        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is believed"
+    )
     repeat_s: float = Field(
         0.0,
         ge=0,
+        le=1e6,
         description="correlation time of one landmark's errors: sightings closer than this share their information",
     )
 
@@ -265,7 +288,7 @@ class MotionConfig(Section):
         description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
     )
     use: bool = True
-    scale: float = Field(1.0, gt=0, description="this robot's distance over the model's")
+    scale: float = Field(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
     scale_sigma: float = Field(
         0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
     )
@@ -280,13 +303,13 @@ class EstimatorConfig(Section):
     kind: Literal["fixed_lag", "isam2", "ekf"] = Field(
         "fixed_lag", description="isam2: the whole run; ekf: a filter of the pose alone, for comparison"
     )
-    lag_s: float = Field(10.0, gt=0)
-    relinearize_threshold: float = Field(0.01, gt=0)
-    initial_pose: tuple[float, float, float] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
-    initial_sigmas: tuple[float, float, float] = (0.05, 0.05, 0.05)
-    initialise_s: float = Field(5.0, gt=0, description="how long to collect sightings for the first pose")
+    lag_s: float = Field(10.0, ge=0.05, le=1e5)
+    relinearize_threshold: float = Field(0.01, ge=1e-6, le=10)
+    initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
+    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = (0.05, 0.05, 0.05)
+    initialise_s: float = Field(5.0, ge=0.01, le=1e5, description="how long to collect sightings for the first pose")
     gate_probability: float = Field(0.9999, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
-    dead_reckoning_after_s: float = Field(2.0, gt=0, description="without a fix for this long: DEAD_RECKONING")
+    dead_reckoning_after_s: float = Field(2.0, gt=0, le=1e6, description="without a fix for this long: DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
         "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
     )
@@ -296,8 +319,8 @@ class Distrust(Section):
     """A time in which a motion source is known to be wrong."""
 
     source: Literal["wheels", "learned", "gyro"]
-    start_s: float = Field(description="since the first step of the run")
-    end_s: float
+    start_s: float = Field(ge=-1e9, le=1e9, description="since the first step of the run")
+    end_s: float = Field(ge=-1e9, le=1e9)
 
     @model_validator(mode="after")
     def _in_order(self) -> Distrust:
@@ -311,30 +334,39 @@ class WeightsConfig(Section):
 
     adaptive: bool = Field(True, description="false: covariances stay as they were made; sightings are still gated")
     distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")
-    window_s: float = Field(2.0, gt=0, description="the motion sources are compared over windows of up to this long")
-    alarm: float = Field(
-        30.0, gt=0, description="squared Mahalanobis distance of two sources that flags a disagreement"
+    window_s: float = Field(
+        2.0, ge=0.01, le=1e3, description="the motion sources are compared over windows of up to this long"
     )
-    release_s: float = Field(0.6, gt=0, description="agreement for this long ends it")
+    alarm: float = Field(
+        30.0, gt=0, le=1e9, description="squared Mahalanobis distance of two sources that flags a disagreement"
+    )
+    release_s: float = Field(0.6, gt=0, le=1e4, description="agreement for this long ends it")
     quarantine_after: int = Field(
-        6, gt=0, description="sightings that a displacement has to explain before a landmark is left out as moved"
+        6,
+        gt=0,
+        le=1_000_000,
+        description="sightings that a displacement has to explain before a landmark is left out as moved",
     )
 
 
 class BatchConfig(Section):
     """The batch smoother."""
 
-    outer_iterations: int = Field(2, ge=1, description="learned motion is re-evaluated at the smoothed velocities")
-    max_iterations: int = Field(50, ge=1, description="of Levenberg–Marquardt, each")
+    outer_iterations: int = Field(
+        2, ge=1, le=20, description="learned motion is re-evaluated at the smoothed velocities"
+    )
+    max_iterations: int = Field(50, ge=1, le=1000, description="of Levenberg–Marquardt, each")
 
 
 class TruthConfig(Section):
     """What is known of the truth's frame. Only evaluation reads it."""
 
-    yaw_offset_rad: float = Field(0.0, description="yaw of the truth's body axes in the base frame; subtracted")
-    offset_m: tuple[float, float] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
+    yaw_offset_rad: float = Field(
+        0.0, ge=-100, le=100, description="yaw of the truth's body axes in the base frame; subtracted"
+    )
+    offset_m: tuple[_Place, _Place] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
-    max_gap_s: float = Field(0.2, gt=0, description="the truth is not interpolated across longer gaps")
+    max_gap_s: float = Field(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
 
 
 class Config(Section):
@@ -358,7 +390,6 @@ class Config(Section):
 
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
 _SHIPPED = "shipped:"
-_LONGEST = 80  # characters of a wrong value that are shown
 _MODELS = Path(__file__).parent / "sensors" / "learned" / "models"
 
 
@@ -375,35 +406,15 @@ def yaml_of(config: Config, folder: Path) -> str:
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
 
 
-def _short(value: object) -> str:
-    said = repr(value)
-    return said if len(said) <= _LONGEST else said[:_LONGEST] + " ..."
-
-
 def load_config(path: Path) -> Config:
     """Read a YAML configuration. Relative paths in it are relative to the file.
 
     Raises:
         ConfigError: the file is missing, is not YAML, or has an unknown key or a value out of range; all are named.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file with --config") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from error
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected a mapping of sections, got {type(data).__name__}")
+    settings = Settings(path, "give a YAML file with --config")
     for section, key in _PATH_KEYS:
-        part = data.get(section)
+        part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(_SHIPPED):
-            part[key] = path.parent / part[key]
-    try:
-        return Config.model_validate(data)
-    except ValidationError as error:
-        lines = [
-            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {_short(e['input'])})" for e in error.errors()
-        ]
-        raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error
+            settings.content[section] = part | {key: path.parent / part[key]}
+    return settings.validated(Config)

@@ -9,6 +9,7 @@
     ├── CovarianceError      a covariance that is not one
     ├── TrajectoryError      a trajectory file, or two that do not overlap
     ├── OutputError          a result that cannot be written
+    ├── WireError            ROS 2's wire: DDS is not installed, or refuses
     └── EstimatorError       the estimator was given what it cannot use
 
 A message gives the value found, what was expected and the remedy. The command line turns these into exit code 1.
@@ -49,6 +50,10 @@ class TrajectoryError(FglocError):
 
 class OutputError(FglocError):
     """A result file cannot be written."""
+
+
+class WireError(FglocError):
+    """Messages cannot be exchanged on ROS 2's wire."""
 
 
 class EstimatorError(FglocError):

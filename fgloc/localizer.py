@@ -99,12 +99,13 @@ class Localizer:
         self._keep_all = keep_all
         self._segment = -1
         self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
+        self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
 
     def update(self, step: Step) -> Estimate | None:
         """Take in one step; return the newest pose, or None while the first pose is not yet known."""
         blind_s = self._tracking.blind_s
         self._tracking.advance_time(step.dt)
-        if step.segment != self._segment:
+        if step.segment != self._segment or self._restart is not None:
             self._begin_segment(step)
         elif not self._tracking.waiting and self._tracking.is_unlocalized(self.estimator.belief):
             self._get_lost()
@@ -118,6 +119,18 @@ class Localizer:
             return self._initialize(step, readings, sightings)
         return self._advance(step, readings, sightings)
 
+    @property
+    def blind_s(self) -> float:
+        """Time since the last fix [s]."""
+        return self._tracking.blind_s
+
+    def restart_at(self, belief: PoseWithCovariance) -> None:
+        """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
+
+        Sightings that contradict it do not hold: the map is searched.
+        """
+        self._restart = belief
+
     def _begin_segment(self, step: Step) -> None:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         if self._keep_all:
@@ -126,7 +139,8 @@ class Localizer:
         self.sources.begin_segment()
         self.motion_faults.begin(step)
         self.association.begin_segment()
-        self._prior = self._tracking.begin_segment(self.estimator.belief)
+        known, self._restart = self._restart, None
+        self._prior = self._tracking.begin_segment(self.estimator.belief, known)
 
     def _initialize(
         self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]
@@ -176,10 +190,19 @@ class Localizer:
         if started is None:
             return []
         first, mode = self.estimator.k + 1, Mode.LOST if self._tracking.lost else Mode.UNCONFIRMED
-        estimates = [dataclasses.replace(estimate, mode=mode) for estimate in self._replay(started)]
-        for k, frame in self.estimator.log.keyframes.items():
-            frame.mode = mode if k >= first else frame.mode
-        return estimates
+        estimates = self._replay(started)
+        frames = [frame for k, frame in self.estimator.log.keyframes.items() if k >= first]
+        for frame in frames:
+            if mode is Mode.LOST is not frame.mode:
+                frame.added_cov = frame.added_cov + self._tracking.lost_cov(frame.belief)
+            frame.mode = mode
+        covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
+        return [
+            dataclasses.replace(
+                e, mode=mode, cov=covs[e.stamp_ns] if mode is Mode.LOST and e.stamp_ns in covs else e.cov
+            )
+            for e in estimates
+        ]
 
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
@@ -335,6 +358,8 @@ class Localizer:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._tracking.mode
         frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
+        if frame.mode is Mode.LOST:
+            frame.added_cov = frame.added_cov + self._tracking.lost_cov(belief)
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
 

@@ -19,8 +19,10 @@ from fgloc.calibration.settings import installation_found
 from fgloc.config import Config, Role
 from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.diagnosis.image_checks import image_hints
+from fgloc.diagnosis.unused_sightings import unused_sightings
 from fgloc.errors import EstimatorError
 from fgloc.intake.topic_activity import TopicActivity
+from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
@@ -106,21 +108,20 @@ def run(
         notes = (
             *hints,
             *recording.notes,
-            *parts.notes,
-            *parts.gate.notes,
-            *parts.stepper.notes,
-            *parts.wheels.notes,
-            *parts.localizer.notes,
+            *replay.clocks.notes,
+            *parts.sentences,
         )
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         roles = recording.roles
+    seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
+    mistakes = (*wrong.sentences, *unused_sightings(rejections, roles, seen))
     if not replay.estimates:
-        raise EstimatorError(" ".join([*wrong.sentences, _never_found(replay, rejections), *hints, *untried]))
+        raise EstimatorError(" ".join([*mistakes, _never_found(replay, rejections), *hints, *untried]))
     try:
         smoothed = smooth_run(parts) if mode == "batch" else None
     except EstimatorError as error:
-        raise EstimatorError(" ".join([*wrong.sentences, _sentence(str(error)), *hints, *untried])) from error
+        raise EstimatorError(" ".join([*mistakes, _sentence(str(error)), *hints, *untried])) from error
     estimates = last_pass(replay.estimates if smoothed is None else smoothed.estimates)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, roles, installed)
@@ -129,6 +130,7 @@ def run(
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
     notes = (
+        *mistakes[len(wrong.sentences) :],
         *wrong.notes,
         *(() if tried is None else tried[:1]),
         *notes,
@@ -155,7 +157,7 @@ def run(
         found=found,
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
-        mistakes=wrong.sentences,
+        mistakes=mistakes,
         config=config,
     )
 
@@ -203,6 +205,7 @@ class _Replay:
         self.first_pose_s: float | None = None
         self.blind = True  # no image and no sighting was recorded, not even an unusable one
         self.activity = TopicActivity(roles)
+        self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
         self.decisions: list[Decision] = []
@@ -250,22 +253,8 @@ class _Replay:
 
     def rejections(self) -> Counter[str]:
         """Everything refused anywhere, by reason."""
-        parts = self._parts
-        total = Counter(parts.gate.rejections)
-        sources = [
-            parts.detections.rejections,
-            parts.stepper.rejections,
-            parts.wheels.rejections,
-            parts.landmarks.rejections,
-            self._image_rejections,
-        ]
-        sources += [parts.localizer.rejections, parts.localizer.association.rejections]
-        if parts.learned is not None:
-            sources.append(parts.learned.rejections)
-        if parts.localizer.sources.gyro is not None:
-            sources.append(parts.localizer.sources.gyro.rejections)
-        for source in sources:
-            total.update(source)
+        total = self._parts.rejections
+        total.update(self._image_rejections)
         return total
 
     def spans(self) -> dict[str, TopicTimes]:
@@ -274,7 +263,7 @@ class _Replay:
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
-        for event in events:
+        for event in self.clocks.corrected(events):
             if self._first_ns is None:
                 self._first_ns = event.received_ns
             elapsed = (event.received_ns - self._first_ns) * 1e-9

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
 
 
 # --- Events: one message (or one transform of one), as recorded, before the gate -------------------------------------

@@ -288,14 +288,14 @@ def test_fault_65_yaml_bomb_is_refused(tmp_path):
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
     metadata = folder / "metadata.yaml"
     metadata.write_text("\n".join(lines) + "\n" + metadata.read_text())
-    with pytest.raises(RecordingError, match=r"alias \(\*a0\)"):
+    with pytest.raises(RecordingError, match="stand for more than"):
         open_recording(folder, DEFAULT)
 
 
 def test_fault_65_deep_nesting_is_refused(tmp_path):
     folder = write_drive(tmp_path / "run", n=5)
     (folder / "metadata.yaml").write_text("[" * 20_000)
-    with pytest.raises(RecordingError, match="nested deeper than 50"):
+    with pytest.raises(RecordingError, match="nested deeper than 64"):
         open_recording(folder, DEFAULT)
 
 

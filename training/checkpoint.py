@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from fgloc.atomic import atomic_file
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import Split
 from training.config import TrainConfig
@@ -34,10 +34,8 @@ class Checkpoint:
         """Replace what is kept, atomically."""
         if self.path is None:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        part = self.path.with_suffix(".part")
-        torch.save(state, part)
-        part.replace(self.path)
+        with atomic_file(self.path, binary=True) as file:
+            torch.save(state, file)
 
     def load(self) -> dict[str, Any] | None:
         """What was kept last; None if there is nothing.
@@ -70,8 +68,3 @@ class Checkpoints:
             digest.update(runs[name].poses.tobytes())
             digest.update(runs[name].valid.tobytes())
         return Checkpoint(self.folder / f"{digest.hexdigest()[:16]}.{member}.{stage}.pt")
-
-    def clear(self) -> None:
-        """Forget everything: training is done."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)

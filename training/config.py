@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from fgloc.config import Section
-from fgloc.errors import ConfigError
 from fgloc.sensors.learned.card import Input, Kind, Split
+from fgloc.settings_file import Settings
 
 
 class DataConfig(Section):
@@ -181,9 +180,4 @@ def load_train_config(path: Path) -> TrainConfig:
     Raises:
         ConfigError: it cannot be read, or a key or value is wrong.
     """
-    try:
-        return TrainConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, ValidationError) as error:
-        raise ConfigError(f"{path}: not a training configuration: {error}") from error
+    return Settings(path, "give a training configuration").validated(TrainConfig)

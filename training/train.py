@@ -20,6 +20,7 @@ except ModuleNotFoundError as missing:
     raise SystemExit("error: torch is not installed; in the repository: pip install -e '.[train]'") from missing
 from tqdm import tqdm
 
+from fgloc.atomic import atomic_folder, check_out
 from fgloc.errors import ConfigError, FglocError, RecordingError
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
 from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
@@ -247,6 +248,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.use_deterministic_algorithms(True)
     try:
         config = load_train_config(options.config)
+        check_out(options.out)
         made_by = f"python -m training.train {options.config.as_posix()}; {config.model_dump_json()}"
         smoothed = {name: options.data / folder for name, folder in config.truth.items()}
         parts = {
@@ -256,29 +258,33 @@ def main(arguments: list[str] | None = None) -> int:
         runs = {name: run for part in parts.values() for name, run in part.items()}
         if config.split is not None:
             config = config.model_copy(update={"split": _in_parts(config.split, parts)})
-        if options.start is not None:
-            path = options.out / "model.safetensors"
-            _report(path.stem, adapt(options.start, config, runs, path, f"{made_by}; from {options.start.name}"))
-            return 0
-        trained = list(runs) if config.split is None else config.split.train
-        _report_controls([runs[name] for name in trained], config, options.out)
         checkpoints = Checkpoints(options.out / ".checkpoints")
-        if config.split is not None:
-            path = options.out / "model.safetensors"
-            _report(path.stem, train(config, config.split, runs, path, made_by, checkpoints))
-            checkpoints.clear()
-            return 0
-        folds = []
-        for split in leave_one_out(list(runs)):
-            path = options.out / f"without_{split.test[0]}.safetensors"
-            folds.append(train(config, split, runs, path, made_by, checkpoints))
-            _report(path.stem, folds[-1])
-        _report("all", _from_all(config, runs, folds, options.out / "all.safetensors", made_by, checkpoints))
-        checkpoints.clear()
+        with atomic_folder(options.out, own=("*.safetensors", "*.png", ".checkpoints")) as stage:
+            if options.start is not None:
+                path = stage / "model.safetensors"
+                _report(path.stem, adapt(options.start, config, runs, path, f"{made_by}; from {options.start.name}"))
+            else:
+                _train_all(config, runs, stage, made_by, checkpoints)
     except FglocError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _train_all(config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints) -> None:
+    """The model of the configuration's split, or one for each recording left out, and one of all."""
+    trained = list(runs) if config.split is None else config.split.train
+    _report_controls([runs[name] for name in trained], config, out)
+    if config.split is not None:
+        path = out / "model.safetensors"
+        _report(path.stem, train(config, config.split, runs, path, made_by, checkpoints))
+        return
+    folds = []
+    for split in leave_one_out(list(runs)):
+        path = out / f"without_{split.test[0]}.safetensors"
+        folds.append(train(config, split, runs, path, made_by, checkpoints))
+        _report(path.stem, folds[-1])
+    _report("all", _from_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints))
 
 
 def _report_controls(training: list[Run], config: TrainConfig, out: Path) -> None:

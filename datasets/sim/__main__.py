@@ -14,6 +14,7 @@ except ModuleNotFoundError as error:
 
 from datasets.sim.record import record as record_run
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
+from fgloc.atomic import check_out
 from fgloc.errors import FglocError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -43,6 +44,7 @@ def record(
     longest: Annotated[float | None, typer.Option(min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
     """Record one run of a scenario, or all that is missing of a suite."""
+    check_out(out)
     from_file = Path(what).suffix in (".yaml", ".yml")
     suite = load_suite(Path(what) if from_file else BUNDLED)
     suite = suite.perfect() if perfect else suite

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from pydantic import ValidationError
 
 from datasets.sim.installation import Installation
 from datasets.sim.mjcf import intrinsics, optical_rotation
 from datasets.sim.scenario import Camera, Robot, Scenario
 from datasets.sim.section import Section, Vector2, Vector3, channel_rng
-from fgloc.errors import ConfigError
 from fgloc.frames import quaternion_matrix, rpy_matrix
+from fgloc.settings_file import Settings
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 INSTALLED = "installed.yaml"
@@ -192,16 +191,7 @@ def load_installed(path: Path) -> Installed:
     Raises:
         ConfigError: no such file, no YAML, a key is missing or unknown, or a value is not a number; all are named.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML: {error}; record the run anew") from error
-    try:
-        return Installed.model_validate(content)
-    except ValidationError as error:
-        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-        head = f"{path}: expected what `python -m datasets.sim record` writes; record the run anew"
-        raise ConfigError("\n".join([head, *lines])) from error
+    return Settings(path, "record the run anew").validated(Installed)
 
 
 def _mounted(camera: Camera) -> MountedCamera:

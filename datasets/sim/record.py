@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import shutil
-import tempfile
 from importlib.metadata import version
 from operator import itemgetter
 from pathlib import Path
@@ -21,10 +19,10 @@ from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import make_scene, simulate
 from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import streams
+from fgloc.atomic import atomic_folder
 from fgloc.sensors.maps import write_map
 
-DONE = "scenario.yaml"  # written last: a folder that holds it is complete
-_SCRATCH = ".recording-"
+DONE = "scenario.yaml"  # a folder that holds it is complete
 _FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
 
 
@@ -49,11 +47,7 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
     """
     scene = make_scene(scenario, seed)
     log = simulate(scene)
-    out.mkdir(parents=True, exist_ok=True)
-    for left in out.glob(f"{_SCRATCH}*"):  # by a recorder that was killed
-        shutil.rmtree(left)
-    with tempfile.TemporaryDirectory(dir=out, prefix=_SCRATCH) as scratch:
-        stage = Path(scratch)
+    with atomic_folder(out, own=_FILES) as stage:
         with BagWriter(stage / "bag", compress=True) as bag:
             merged = heapq.merge(*streams(scene, log, bag, camera), key=itemgetter(0))
             for _, write in tqdm(merged, unit="msg", disable=None if progress else True, leave=False):
@@ -62,11 +56,6 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
         write_installed(scene.installed, stage / INSTALLED)
         write_robot(stage / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
         (stage / DONE).write_text(describe(scenario, seed, camera), encoding="utf-8")
-        (out / DONE).unlink(missing_ok=True)
-        for name in _FILES:
-            if (out / name).is_dir():
-                shutil.rmtree(out / name)
-            (stage / name).replace(out / name)
     return out / "bag"
 
 

@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 class Section(BaseModel):
     """A part of a scenario: unknown keys are errors, values are immutable."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def channel_rng(seed: int, channel: str) -> np.random.Generator:

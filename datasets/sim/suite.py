@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 from tqdm import tqdm
 
 from datasets.sim.physics import SimulationError
@@ -20,6 +19,7 @@ from datasets.sim.record import is_recorded, record
 from datasets.sim.scenario import Control, Scenario
 from datasets.sim.section import Section
 from fgloc.errors import ConfigError, FglocError
+from fgloc.settings_file import Settings
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
 
@@ -148,17 +148,8 @@ def load_suite(path: Path) -> Suite:
     Raises:
         ConfigError: no such file, no YAML, an unknown key or a value out of range; all are named.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected a mapping with 'entries' (a suite) or the keys of a scenario")
-    data.pop("parts", None)
-    try:
-        if "entries" in data:
-            return Suite.model_validate(data)
-        return Suite(entries=(Entry(scenario=Scenario.model_validate(data)),))
-    except ValidationError as error:
-        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-        raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error
+    settings = Settings(path, "give 'entries' (a suite) or the keys of a scenario")
+    settings.content.pop("parts", None)
+    if "entries" in settings.content:
+        return settings.validated(Suite)
+    return Suite(entries=(Entry(scenario=settings.validated(Scenario)),))

@@ -25,7 +25,7 @@ from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path,
 from fgloc.ablation.suite import Cell
 from fgloc.assembly import resolved
 from fgloc.config import Config
-from fgloc.errors import FglocError, RecordingError
+from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.frames import quaternion_yaw
@@ -129,7 +129,7 @@ def finished(job: Job, out: Path) -> Record | None:
     if record is None or record.outcome != "done" or job.folder is None:
         return record
     owner = owner_path(out, job.folder)
-    whole = (out / job.folder / "metrics.json").exists() and owner.exists() and owner.read_text("utf-8") == job.key
+    whole = (out / job.folder / "metrics.json").exists() and owner.exists() and owner.read_bytes() == job.key.encode()
     return record if whole else None
 
 
@@ -137,7 +137,7 @@ def execute(job: Job, out: Path) -> str:
     """Run a job unless it is finished already; return its key. A run that fails is recorded as such.
 
     Raises:
-        OutputError: the record cannot be written.
+        OutputError: the record, or a file of the run, cannot be written.
     """
     if finished(job, out) is not None:
         return job.key
@@ -146,6 +146,8 @@ def execute(job: Job, out: Path) -> str:
     outcome: dict[str, Any]
     try:
         outcome = {"outcome": "done", **_localise(job, out)}
+    except OutputError:
+        raise  # a full disk says nothing of the job
     except FglocError as error:
         outcome = {"outcome": "refused", "error": f"{type(error).__name__}: {error}"}
     except Exception:  # a bug: the sweep goes on, and the report lists it

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import os
+import fcntl
+import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
+from fgloc.errors import OutputError
 from fgloc.recording.outputs import write_json
+
+_ATTEMPT = re.compile(r"(\w+) (\d+\.\d{6})")
 
 
 class Track(BaseModel):
@@ -58,9 +64,12 @@ def owner_path(out: Path, folder: str) -> Path:
 
 
 def read_record(out: Path, key: str) -> Record | None:
-    """A job's record; None if it has none."""
+    """A job's record; None if it has none, or if its file is damaged: then the job has to run again."""
     path = record_path(out, key)
-    return Record.model_validate_json(path.read_bytes()) if path.exists() else None
+    try:
+        return Record.model_validate_json(path.read_bytes())
+    except (FileNotFoundError, ValidationError):
+        return None
 
 
 def write_record(out: Path, record: Record) -> None:
@@ -73,18 +82,45 @@ def write_record(out: Path, record: Record) -> None:
 
 
 def attempts(out: Path) -> list[tuple[str, float]]:
-    """Key and time [s since 1970] of every run that was begun, in order."""
+    """Key and time [s since 1970] of every run that was begun, in order, without lines that a full disk cut short."""
     path = out / "jobs" / "attempts.log"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [(key, float(stamp)) for key, stamp in (line.split() for line in lines)]
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines() if path.exists() else []
+    return [(match[1], float(match[2])) for match in map(_ATTEMPT.fullmatch, lines) if match]
 
 
 def log_attempt(out: Path, key: str) -> None:
-    """Note that a run begins."""
-    folder = out / "jobs"
-    folder.mkdir(parents=True, exist_ok=True)
-    file = os.open(folder / "attempts.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    """Note that a run begins.
+
+    Raises:
+        OutputError: it cannot be noted.
+    """
+    path = out / "jobs" / "attempts.log"
     try:
-        os.write(file, f"{key} {time.time():.6f}\n".encode())  # one short write: lines of several workers do not mix
-    finally:
-        os.close(file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab", buffering=0) as file:
+            file.write(f"{key} {time.time():.6f}\n".encode())  # one short write: lines of several workers do not mix
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); finished runs are kept") from error
+
+
+@contextmanager
+def only_sweep(out: Path) -> Iterator[None]:
+    """Keep other sweeps out of a folder: two would run the same jobs, and each replace the other's report.
+
+    Raises:
+        OutputError: another one is at work in it, or it cannot be written.
+    """
+    path = out / "jobs" / ".lock"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"{out}: another sweep is at work in it; wait for it, or give another folder") from error
+        except OSError:  # a file system without locks
+            pass
+        yield

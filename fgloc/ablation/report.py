@@ -15,10 +15,11 @@ from fgloc.ablation.jobs import Job, code_hash
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Suite
 from fgloc.ablation.tables import ATE, METRICS, Entry, Run, join, matrix, matrix_csv, rows, runs_csv, sentence, worst
+from fgloc.atomic import atomic_folder
 from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.plots import png
-from fgloc.recording.outputs import atomic_folder, sha256_of, write_json, write_text
+from fgloc.recording.outputs import sha256_of, write_json, write_text
 
 
 def write_report(
@@ -40,7 +41,7 @@ def write_report(
         "inputs": _inputs(jobs),
         "suite": suite.model_dump(mode="json"),
     }
-    with atomic_folder(out) as stage:
+    with atomic_folder(out, kept=("jobs", "detections")) as stage:
         write_text(stage / "matrix.csv", matrix_csv(entries))
         write_text(stage / "runs.csv", runs_csv(runs))
         write_json(stage / "ablation.json", _as_json(runs, entries, sentences, provenance))

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, load_config
 from fgloc.errors import ConfigError
 from fgloc.runner import RunMode, find_beside
+from fgloc.settings_file import Settings, sentences
+
+_MOST_RUNS = 1_000_000
+_Seed = Annotated[int, Field(ge=0, lt=2**32)]
+_Severity = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class RecordingEntry(Section):
@@ -41,7 +45,7 @@ class Severity(Section):
     """A number of a failure that is varied."""
 
     field: str = Field(description="of the chain's first failure; a dot leads into 'when', such as when.burst_s")
-    values: tuple[float, ...] = Field(min_length=1)
+    values: tuple[_Severity, ...] = Field(min_length=1)
     unit: str = ""
 
 
@@ -83,7 +87,7 @@ class Suite(Section):
 
     title: str
     mode: RunMode = "online"
-    seeds: tuple[int, ...] = Field((0,), min_length=1, description="of random failures")
+    seeds: tuple[_Seed, ...] = Field((0,), min_length=1, description="of random failures")
     recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
     variants: tuple[Variant, ...] = Field((Variant(name="full"),), min_length=1)
     failures: tuple[FailureEntry, ...] = ()
@@ -127,17 +131,12 @@ def load_suite(path: Path) -> Suite:
     Raises:
         ConfigError: the file is missing, is not YAML, or has an unknown key or a wrong value; all are named.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give a suite file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from error
-    try:
-        return Suite.model_validate(data)
-    except ValidationError as error:
-        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()]
-        raise ConfigError(f"{path}: {len(lines)} wrong value(s)\n" + "\n".join(lines)) from error
+    suite = Settings(path, "give a suite file").validated(Suite)
+    each = sum(1 for failure in suite.failures for _ in failure.severities())
+    runs = len(suite.recordings) * len(suite.variants) * (1 + each * len(suite.seeds))
+    if runs > _MOST_RUNS:
+        raise ConfigError(f"{path}: asks for {runs} runs, expected at most {_MOST_RUNS}; split it")
+    return suite
 
 
 def expand(suite: Suite, folder: Path) -> list[Cell]:
@@ -184,7 +183,7 @@ def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path)
     try:
         return Config.model_validate(content)
     except ValidationError as error:
-        lines = [f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()]
+        lines = [f"  {text}" for text in sentences(error, Config)]
         raise ConfigError(
             f"variant '{variant.name}' of recording '{entry.name}': wrong configuration\n" + "\n".join(lines)
         ) from error

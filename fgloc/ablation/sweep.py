@@ -13,7 +13,7 @@ from typing import Any
 
 from fgloc.ablation.jobs import Job, execute, finished
 from fgloc.ablation.records import Cost, Record, read_record, record_path, write_record
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, OutputError
 
 Progress = Callable[[int, int], None]
 """Called with the number of jobs done and their total."""
@@ -51,7 +51,7 @@ def sweep(
     records = {key: record for key, job in unique.items() if (record := finished(job, out)) is not None}
     if retry:
         for key in [key for key, record in records.items() if record.outcome != "done"]:
-            record_path(out, key).unlink()
+            record_path(out, key).unlink(missing_ok=True)
             del records[key]
     todo = _by_turns([job for key, job in unique.items() if key not in records])
     if progress is not None:
@@ -66,7 +66,10 @@ def sweep(
                     out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
                 )
             record = read_record(out, key)
-            assert record is not None
+            if record is None:
+                raise OutputError(
+                    f"{record_path(out, key)}: was written by a worker, but is not here: do all see {out}?"
+                )
             records[key] = record
             if progress is not None:
                 progress(len(records), len(unique))
@@ -87,15 +90,27 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     """Keys of finished jobs, with an error if their workers died."""
     import distributed
 
-    futures = client.map(execute, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
+    futures = client.map(_attempt, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
     key_of = {future: job.key for future, job in zip(futures, todo, strict=True)}
     for future in distributed.as_completed(futures):
-        error = future.exception() if future.status == "error" else None
+        error = future.exception() if future.status == "error" else _unwritable(future.result())
         if error is not None and not isinstance(error, distributed.KilledWorker):
             raise error
         said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
         yield key_of[future], said
         future.release()
+
+
+def _attempt(job: Job, out: Path) -> str | OutputError:
+    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
+    try:
+        return execute(job, out)
+    except OutputError as error:
+        return error
+
+
+def _unwritable(result: object) -> OutputError | None:
+    return result if isinstance(result, OutputError) else None
 
 
 @contextmanager
@@ -126,7 +141,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
                 yield client
             return
         with (
-            distributed.LocalCluster(
+            _local_cluster(
                 n_workers=workers,
                 threads_per_worker=1,  # GTSAM holds Python's lock
                 processes=True,
@@ -138,6 +153,16 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             _replacing(cluster, workers),
         ):
             yield client
+
+
+def _local_cluster(**settings: Any) -> Any:
+    """Local processes, with their scratch folders in the temporary folder."""
+    import distributed
+
+    try:
+        return distributed.LocalCluster(**settings)
+    except OSError as error:
+        raise OutputError(f"the worker processes cannot be started ({error}); is the disk full?") from error
 
 
 @contextmanager

@@ -10,8 +10,8 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from fgloc.cli import runs, surveys, sweeps, tools
-from fgloc.cli.terminal import EXIT_BAD_INPUT
+from fgloc.cli import live, runs, surveys, sweeps, tools
+from fgloc.cli.terminal import EXIT_BAD_INPUT, say
 from fgloc.errors import FglocError
 
 
@@ -22,7 +22,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except FglocError as error:
-            typer.echo(f"error: {error}", err=True)
+            say(f"error: {error}", err=True)
             raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
@@ -38,6 +38,8 @@ app.command()(runs.demo)
 app.command()(tools.info)
 app.command()(runs.smooth)
 app.command()(runs.online)
+app.command(name="live")(live.live)
+app.command(name="play")(live.play)
 app.command()(tools.evaluate)
 app.command(name="map")(surveys.make_map)
 app.command()(runs.calibrate)

@@ -31,21 +31,24 @@ ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", metavar="C", help="configuration; default: robot.yaml beside the bag, else none"),
 ]
+RrdOption = Annotated[
+    Path | None, typer.Option("--rrd", metavar="FILE", dir_okay=False, help="also write the run for rerun's viewer")
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
 SchedulerOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")
 ]
 
 
-def configured(bag: Path, config_file: Path | None, model: Path | None) -> Config:
-    """The given configuration, else the one beside the bag, else the defaults; `model` overrides it.
+def configured(bag: Path | None, config_file: Path | None, model: Path | None) -> Config:
+    """The given configuration, else the one beside the bag (if any), else the defaults; `model` overrides it.
 
     Raises:
         ConfigError: the file is missing or wrong.
     """
     from fgloc.runner import find_beside
 
-    file = config_file or find_beside(bag, "robot.yaml")
+    file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = Config() if file is None else load_config(file)
     if model is None:
         return config

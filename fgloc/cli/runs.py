@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import fgloc
+from fgloc.atomic import check_out
 from fgloc.cli.options import (
     Bag,
     Bags,
@@ -16,13 +17,14 @@ from fgloc.cli.options import (
     MapOption,
     ModelOption,
     Out,
+    RrdOption,
     SchedulerOption,
     WorkersOption,
     configured,
 )
 from fgloc.cli.sweeps import smooth_many
-from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, typed
-from fgloc.errors import RecordingError
+from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
+from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:
@@ -57,11 +59,11 @@ def demo(
         result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
         runs.append((mode, metrics))
         code = code or exit_code(result)
-    typer.echo(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
-    typer.echo(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
-    typer.echo("")
+    say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
+    say(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
+    say("")
     for mode, _ in runs:
-        typer.echo(f"{mode:<8}{out / mode / 'report.html'}")
+        say(f"{mode:<8}{out / mode / 'report.html'}")
     if code:
         raise typer.Exit(code)
 
@@ -74,13 +76,17 @@ def smooth(
     config: ConfigOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    rrd: RrdOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
+        if rrd is not None:
+            raise ConfigError("--rrd: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    _finish(*_localise(bag, map_file, model, config, out, "batch", typed()), out)
+    result, metrics = _localise(bag, map_file, model, config, out, "batch", typed())
+    _finish(result, metrics, out, rrd)
 
 
 def online(
@@ -90,10 +96,12 @@ def online(
     model: ModelOption = None,
     config: ConfigOption = None,
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
+    rrd: RrdOption = None,
 ) -> None:
     """Replay the recording as a live robot would hear it; each pose knows only what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    _finish(*_localise(bag, map_file, model, config, out, "online", typed(), pace), out)
+    result, metrics = _localise(bag, map_file, model, config, out, "online", typed(), pace)
+    _finish(result, metrics, out, rrd)
 
 
 def calibrate(
@@ -109,13 +117,14 @@ def calibrate(
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
 
+    check_out(out, folder=False)
     before = configured(bags[0], config, None)
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
     rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
-    typer.echo(columns(("setting", "given", "found"), rows))
-    typer.echo(f"configuration: {out}")
+    say(columns(("setting", "given", "found"), rows))
+    say(f"configuration: {out}")
 
 
 def _localise(
@@ -135,6 +144,7 @@ def _localise(
     from fgloc.recording.outputs import sha256_of
     from fgloc.runner import find_beside, run
 
+    check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
     config = resolved(configured(bag, config_file, model), map_path)
     with run_bar(mode) as progress:
@@ -142,8 +152,12 @@ def _localise(
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
-def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
-    """Say what came out."""
+def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
+    """Say what came out, and write it for rerun's viewer."""
+    if rrd is not None:
+        from fgloc.view.file import write_rrd
+
+        write_rrd(result, rrd)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]
@@ -151,11 +165,11 @@ def _finish(result: RunResult, metrics: Metrics, out: Path) -> None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
     for mistake in result.mistakes:
-        typer.echo(f"mistake: {mistake}")
-    typer.echo(columns(None, rows))
+        say(f"mistake: {mistake}")
+    say(columns(None, rows))
     for note in result.notes:
         if note not in result.mistakes:
-            typer.echo(f"note: {note}")
+            say(f"note: {note}")
     exit_unless_trusted(result)
 
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from fgloc.atomic import check_out
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
-from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar
+from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar, say
 from fgloc.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def make_map(
     from fgloc.calibration.survey import survey
     from fgloc.sensors.maps import load_map, write_map
 
+    check_out(out, folder=False)
     settings = configured(bags[0], config, model)
     given = None if anchor is None else load_map(anchor, size or settings.markers.default_size_m)
     settings = _with_markers(settings, dictionary, size, given)
@@ -75,7 +77,7 @@ def _of_points(bag: Path, out: Path, settings: Config) -> None:
     if result.landmarks is None or not len(result.landmarks):
         raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
     write_map(result.landmarks, out)
-    typer.echo(f"{len(result.landmarks)} landmarks in {out}")
+    say(f"{len(result.landmarks)} landmarks in {out}")
     exit_unless_trusted(result)
 
 
@@ -85,12 +87,12 @@ def _tell(found: Survey, out: Path) -> None:
         cov = found.landmarks.landmarks[i].cov
         sigma = np.sqrt(np.diag(np.eye(6) if cov is None else cov))
         rows.append((str(i), str(views), f"{1e3 * sigma[:3].max():.1f} mm", f"{np.degrees(sigma[3:].max()):.2f} deg"))
-    typer.echo(columns(("marker", "views", "position", "direction"), rows))
+    say(columns(("marker", "views", "position", "direction"), rows))
     for i, why in found.left_out.items():
-        typer.echo(f"left out: marker {i}: {why}")
+        say(f"left out: marker {i}: {why}")
     for note in found.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"{len(found.landmarks)} landmarks in {out}")
+        say(f"note: {note}")
+    say(f"{len(found.landmarks)} landmarks in {out}")
 
 
 def _with_markers(settings: Config, dictionary: str | None, size: float | None, given: LandmarkMap | None) -> Config:

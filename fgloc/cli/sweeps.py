@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.atomic import check_out
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
-from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, typed
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, say, typed
 
 if TYPE_CHECKING:
     from fgloc.ablation.records import Record
@@ -24,20 +25,24 @@ def ablate(
 ) -> None:
     """Tell what the failure of each sensor costs; a killed sweep goes on where it was."""
     from fgloc.ablation.jobs import make_jobs
+    from fgloc.ablation.records import only_sweep
     from fgloc.ablation.report import failed, write_report
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
 
+    check_out(out)
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
-    with jobs_bar("runs", len(jobs)) as show:
-        records = sweep(jobs, out, workers, scheduler, retry, show)
-    for sentence in write_report(plan, jobs, records, out, typed()):
-        typer.echo(sentence)
+    with only_sweep(out):
+        with jobs_bar("runs", len(jobs)) as show:
+            records = sweep(jobs, out, workers, scheduler, retry, show)
+        sentences = write_report(plan, jobs, records, out, typed())
+    for sentence in sentences:
+        say(sentence)
     without = failed(jobs, records)
     if without:
-        typer.echo(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
-    typer.echo(f"report: {out / 'report.html'}")
+        say(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    say(f"report: {out / 'report.html'}")
 
 
 def smooth_many(
@@ -51,30 +56,32 @@ def smooth_many(
 ) -> None:
     """Smooth each bag into a folder of its own; one that fails is listed and tried again next time."""
     from fgloc.ablation.bags import plan_bags
+    from fgloc.ablation.records import only_sweep
     from fgloc.ablation.sweep import sweep
 
+    check_out(out)
     if config_file is not None:
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
-    with jobs_bar("bags", len(plan.jobs)) as show:
+    with only_sweep(out), jobs_bar("bags", len(plan.jobs)) as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
-    typer.echo(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
+    say(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
     errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
     for name in plan.names:
         if name in errors:
-            typer.echo(f"{name}: {errors[name]}", err=True)
+            say(f"{name}: {errors[name]}", err=True)
     for name, record in by_name.items():
         for mistake in record.mistakes:
-            typer.echo(f"{name}: {mistake}", err=True)
-    typer.echo(f"reports: {out / '*' / 'report.html'}")
+            say(f"{name}: {mistake}", err=True)
+    say(f"reports: {out / '*' / 'report.html'}")
     if errors:
-        typer.echo(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
+        say(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     lost = any(record.modes.get("LOST") for record in by_name.values())
     if lost:
-        typer.echo("LOST for part of a run: do not trust it there", err=True)
+        say("LOST for part of a run: do not trust it there", err=True)
     if lost or any(record.mistakes for record in by_name.values()):
         raise typer.Exit(EXIT_LOST)
 

@@ -20,6 +20,15 @@ EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
 
 
+def say(text: str, err: bool = False, nl: bool = True) -> None:
+    """Print. Control characters, which names in a recording may hold to command the terminal, are shown as escapes."""
+    typer.echo("".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text), err=err, nl=nl)
+
+
+def _escaped(c: str) -> str:
+    return c.encode("unicode_escape", errors="replace").decode("ascii")
+
+
 def typed() -> str:
     """The command as the user typed it."""
     return shlex.join(["fgloc", *sys.argv[1:]])
@@ -34,9 +43,9 @@ def exit_unless_trusted(result: RunResult) -> None:
     """End with code 3 if a part of the run is not to be trusted, or its set-up is wrong."""
     lost = sum(mode is Mode.LOST for mode in result.modes)
     if lost:
-        typer.echo(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
+        say(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
     if result.mistakes:
-        typer.echo("the set-up is wrong, as the first note says: correct it and run again", err=True)
+        say("the set-up is wrong, as the first note says: correct it and run again", err=True)
     if code := exit_code(result):
         raise typer.Exit(code)
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from fgloc.cli.options import Bag, ConfigOption, MapOption, configured
-from fgloc.cli.terminal import columns
+from fgloc.cli.terminal import columns, say
 
 
 class Align(StrEnum):
@@ -26,7 +26,7 @@ def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> N
     from fgloc.runner import find_beside
 
     map_path = map_file or find_beside(bag, "map.yaml")
-    typer.echo(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)
+    say(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)
 
 
 def evaluate(
@@ -54,4 +54,4 @@ def evaluate(
         ("RPE per metre, position", "-" if relative is None else f"{relative.translation_m:.6f} m"),
         ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
     ]
-    typer.echo(columns(None, rows))
+    say(columns(None, rows))

@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fgloc.evaluation.style import plain_label
+
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#555555")  # Okabe and Ito
 _COLUMNS = 3
 _WIDTH = 9.0  # inches
@@ -51,13 +53,13 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
         for name, points in plot.curves.items():
             color = _COLORS[names.index(name) % len(_COLORS)]
             x = [p.severity for p in points]
-            ax.plot(x, [p.mean for p in points], "o-", color=color, lw=1.5, ms=4, label=name)
+            ax.plot(x, [p.mean for p in points], "o-", color=color, lw=1.5, ms=4, label=plain_label(name))
             banded = [p for p in points if p.interval is not None]
             low = [max(0.0, p.interval[0]) for p in banded if p.interval is not None]
             high = [p.interval[1] for p in banded if p.interval is not None]
             ax.fill_between([p.severity for p in banded], low, high, color=color, alpha=0.15, lw=0)
-        ax.set_title(plot.title, fontsize=9)
-        ax.set_xlabel(plot.unit, fontsize=8)
+        ax.set_title(plain_label(plot.title), fontsize=9)
+        ax.set_xlabel(plain_label(plot.unit), fontsize=8)
         ax.set_ylim(bottom=0.0)
     axes[0].set_ylabel(label, fontsize=8)
     handles = {name: h for ax in axes for h, name in zip(*ax.get_legend_handles_labels(), strict=True)}
@@ -73,7 +75,7 @@ def plot_tracks(plots: Sequence[Tracks]) -> Figure:
     for ax, plot in zip(axes, plots, strict=True):
         ax.plot(*np.array(plot.truth).T, color="#999999", lw=2.2)
         ax.plot(*np.array(plot.estimate).T, color=_COLORS[0], lw=1.2)
-        ax.set_title(plot.title, fontsize=9)
+        ax.set_title(plain_label(plot.title), fontsize=9)
         ax.set_aspect("equal", adjustable="datalim")
     return figure
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgloc.atomic import atomic_folder
 from fgloc.calibration.contradictions import contradicted
 from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
@@ -21,7 +22,6 @@ from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_re
 from fgloc.evaluation.plots import plot_error, plot_trajectory, png
 from fgloc.evaluation.timeline import plot_timeline
 from fgloc.recording.outputs import (
-    atomic_folder,
     write_bytes,
     write_covariance_csv,
     write_json,
@@ -42,6 +42,19 @@ _INSTALLATION = (
     "What the run found, and how well; what it cannot tell keeps its value and sigma. A value contradicts the given "
     "one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
 )
+FILES = (
+    "trajectory.tum",
+    "covariance.csv",
+    "steps.csv",
+    "metrics.json",
+    "config.json",
+    "trajectory.png",
+    "timeline.png",
+    "installation.yaml",
+    "map.yaml",
+    "report.html",
+)
+"""Files of a run; those that a run does not have are taken away from an earlier result in the same folder."""
 _PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
 
 
@@ -76,7 +89,7 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
         "error": png(plot_error(result, matched)),
         "timeline": png(plot_timeline(result, matched, _slips(result, config))),
     }
-    with atomic_folder(out) as stage:
+    with atomic_folder(out, own=FILES) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)
         write_covariance_csv(stage / "covariance.csv", result.trajectory)
         write_steps_csv(stage / "steps.csv", result.decisions)

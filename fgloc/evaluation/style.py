@@ -22,8 +22,16 @@ MODE_LOOKS = {
     Mode.LOST: (RED, "lost", "xx"),
 }
 WIDTH = 9.0  # inches
+_LONGEST_LABEL = 60
 GAP_S = 1.0  # a line is not drawn across a longer silence
 TEXT: dict[str, Any] = {"fontsize": 9, "color": "#222222"}
+
+
+def plain_label(text: str) -> str:
+    """A name from a recording or a suite as a label: no formula, no control characters, not too long."""
+    shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    shown = shown if len(shown) <= _LONGEST_LABEL else shown[: _LONGEST_LABEL - 1] + "…"
+    return shown.replace("$", r"\$")
 
 
 def seconds(result: RunResult, stamps_ns: NDArray[np.int64] | Sequence[int]) -> FloatArray:

@@ -27,6 +27,7 @@ from fgloc.evaluation.style import (
     broken,
     legend,
     mode_handles,
+    plain_label,
     seconds,
     shade_modes,
     tidy,
@@ -138,7 +139,7 @@ def _activity(
 
 
 def _rows(axes: Axes, title: str, names: Sequence[str]) -> None:
-    axes.set_yticks(range(len(names)), list(names), **TEXT | {"fontsize": 8})
+    axes.set_yticks(range(len(names)), [plain_label(name) for name in names], **TEXT | {"fontsize": 8})
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_ylabel(title, fontsize=9)
     axes.spines[["top", "right", "left"]].set_visible(False)

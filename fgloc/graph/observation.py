@@ -139,7 +139,7 @@ class CornerBatch:
         self._twist = np.array([m.twist for m in seen])
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
-        self._moved = [m.motion_cov for m in seen]
+        self._moved = [None if m.motion_cov is None else _root(m.motion_cov) for m in seen]
         self._outward, self._small = _shrinking(self._pixels)
         self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
         self._noise_px = np.hypot(self._sigma, self._blur_px)
@@ -244,7 +244,7 @@ class CornerBatch:
         common = [shrunk, self._jitter[i] * H[:, 11:12]]
         moved = self._moved[i]
         if moved is not None:
-            common.append(J @ _root(moved))
+            common.append(J @ moved)
         return np.hstack(common)
 
 

@@ -12,7 +12,8 @@ MOTION_EVENTS = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
 
 _LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation
 _CONFIRM_COUNT = 3  # events that agree on a new time ...
-_CONFIRM_NS = 250_000_000  # ... over this span confirm it
+_CONFIRM_NS = 250_000_000  # ... over this span confirm it ...
+_CONFIRM_BACK_NS = 100_000_000  # ... and, of an earlier time, received over this: late messages come in a burst
 _GIVE_UP_NS = 5_000_000_000  # sightings alone confirm after this span that motion sources have fallen silent
 _WINDOW_NS = 60_000_000_000  # events within it may agree with each other
 _MAX_SUSPECTS = 1024
@@ -42,20 +43,27 @@ class ClockGuard:
         self._usual_ns = 0.0  # running mean of the newest stamp's advances
         self._motion = False  # a motion source has spoken on the running clock
         self._suspects: deque[Event] = deque()
+        self._newest_of: dict[str, int] = {}  # by topic, on the running clock
 
     def judge(self, event: Event) -> list[tuple[ClockVerdict, Event]]:
         """Verdicts that this event allows: on itself, on earlier ones that waited, on none yet."""
         ahead = event.stamp_ns - self._newest_ns
-        if not self._started or -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns):
+        overtaken = ahead < 0 and event.stamp_ns > self._newest_of.get(event.topic, event.stamp_ns)
+        if not self._started or overtaken or -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns):
             strays = [(ClockVerdict.OUTLIER, suspect) for suspect in self._suspects]
             self._suspects.clear()
-            self._believe(event)
+            if not overtaken:
+                self._believe(event)
+            self._newest_of[event.topic] = max(event.stamp_ns, self._newest_of.get(event.topic, 0))
             return [*strays, (ClockVerdict.FITS, event)]
         self._suspects.append(event)
         group = [e for e in self._suspects if self._agree(e, event)]
         span = max(e.stamp_ns for e in group) - min(e.stamp_ns for e in group)
         moves = not self._motion or any(isinstance(e, MOTION_EVENTS) for e in group)
-        if len(group) >= _CONFIRM_COUNT and span >= (_CONFIRM_NS if moves else _GIVE_UP_NS):
+        enough = span >= (_CONFIRM_NS if moves else _GIVE_UP_NS) and (
+            ahead > 0 or max(e.received_ns for e in group) - min(e.received_ns for e in group) >= _CONFIRM_BACK_NS
+        )
+        if len(group) >= _CONFIRM_COUNT and enough:
             return self._accept(group)
         if len(self._suspects) > _MAX_SUSPECTS:
             return [(ClockVerdict.OUTLIER, self._suspects.popleft())]
@@ -86,7 +94,9 @@ class ClockGuard:
         jumped = not 0 <= first.stamp_ns - self._newest_ns <= self._jump_ns
         if jumped:
             self._motion = False
+            self._newest_of.clear()
         self._believe(first)
+        self._newest_of[first.topic] = first.stamp_ns
         verdicts = [(ClockVerdict.STARTS if jumped else ClockVerdict.FITS, first)]
         for event in waiting:
             verdicts += self.judge(event)

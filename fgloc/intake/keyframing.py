@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
-from dataclasses import dataclass
 
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -23,18 +23,11 @@ from fgloc.types import (
 )
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
-_MAX_PATIENCE_NS = 1_000_000_000
+_MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
+_NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
+_SIGHTINGS = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
-
-
-@dataclass(slots=True)
-class _Source:
-    """One topic's punctuality."""
-
-    newest_ns: int
-    patience_ns: int  # how long, by the newest stamp of all, its word is waited for
-    disorder_ns: int = 0  # how far it has stepped back behind its own newest stamp
 
 
 class KeyframeBuilder:
@@ -46,8 +39,8 @@ class KeyframeBuilder:
     Where nothing was heard, the step reaches to the next event, in pieces of at most 1 s.
 
     A keyframe is closed when every living source has spoken at or beyond it, or ``reorder_s`` later by the newest
-    stamp. Motion events older than the last keyframe are lost ("late"); their source is waited for longer from then on,
-    up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
+    stamp. Motion events older than the last keyframe are lost ("late"), sightings are not; their source is waited for
+    longer in the next minute, up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
 
     The first step of a segment has ``start_ns == stamp_ns``. Depends on the events alone, never on the wall clock.
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
@@ -68,7 +61,8 @@ class KeyframeBuilder:
         self._history_ns = int(config.history_s * 1e9)
         self._lag_ns = int(lag_s * 1e9)
         self._clock = ClockGuard(gate)
-        self._jumps: list[str] = []
+        self._jumps: list[str] = []  # the first few ...
+        self._jump_count = 0  # ... of so many
         self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
         self._index = 0
         self._segment = 0
@@ -91,17 +85,24 @@ class KeyframeBuilder:
         self._last_ns: int | None = None  # the last keyframe
         self._first_ns = 0  # the segment's first keyframe
         self._newest_ns = 0  # newest stamp
-        self._sources: dict[str, _Source] = {}
+        self._received_ns = 0  # when the last event was received
+        self._reached: deque[tuple[int, int]] = deque(maxlen=_MOST_REACHED)  # newest stamps of late, and when they came
+        self._sources: dict[str, Punctuality] = {}
         self._pending: list[SightingsEvent] = []  # by stamp
         self._seen: set[tuple[int, str]] = set()  # sightings of the lag
         self._seen_order: deque[tuple[int, str]] = deque()
 
     @property
+    def newest_ns(self) -> int:
+        """Newest stamp of the segment."""
+        return self._newest_ns
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
-        notes = self._jumps[:10]
-        if len(self._jumps) > 10:
-            notes.append(f"the clock jumped {len(self._jumps)} times in all")
+        notes = list(self._jumps)
+        if self._jump_count > _NAMED_JUMPS:
+            notes.append(f"the clock jumped {self._jump_count} times in all")
         for topic, (count, ahead_ns) in self._offsets.items():
             if count >= 10:
                 notes.append(
@@ -119,7 +120,7 @@ class KeyframeBuilder:
 
     def push(self, event: Event) -> list[Step]:
         """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
-        if not isinstance(event, (*MOTION_EVENTS, CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        if not isinstance(event, (*MOTION_EVENTS, *_SIGHTINGS)):
             return []
         return self._take(self._clock.judge(event))
 
@@ -144,21 +145,26 @@ class KeyframeBuilder:
 
     def _insert(self, event: Event) -> None:
         stamp = event.stamp_ns
-        self._newest_ns = max(self._newest_ns, stamp)
+        if stamp > self._newest_ns:
+            self._newest_ns = stamp
+            self._reached.append((stamp, event.received_ns))
+        self._received_ns = event.received_ns
         source = self._sources.get(event.topic)
         if source is None:
-            source = self._sources[event.topic] = _Source(stamp, self._reorder_ns)
+            source = self._sources[event.topic] = Punctuality(stamp, event.received_ns, self._reorder_ns)
         elif stamp > source.newest_ns:
             source.newest_ns = stamp
-        else:
-            source.disorder_ns = max(source.disorder_ns, min(source.newest_ns - stamp, self._reorder_ns))
-        if isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        source.received_ns = event.received_ns
+        source.disorder_ns.add(min(source.newest_ns - stamp, self._reorder_ns), self._newest_ns)
+        late = self._last_ns is not None and stamp < self._last_ns
+        late_ns = self._newest_ns - stamp if late else 0
+        hopeless = late_ns > MAX_PATIENCE_NS and isinstance(event, _SIGHTINGS)  # they are used at whatever time
+        source.late_ns.add(0 if hopeless else late_ns, self._newest_ns)
+        if isinstance(event, _SIGHTINGS):
             self._insert_sightings(event)
             return
         name = _NAMES[type(event)]
-        if self._last_ns is not None and stamp < self._last_ns:
-            behind = self._newest_ns - stamp
-            source.patience_ns = max(source.patience_ns, min(5 * behind // 4, _MAX_PATIENCE_NS))
+        if late:
             self.rejections[f"{name}.late"] += 1
         elif not self._motion[type(event)].insert(event):
             self.rejections[f"{name}.duplicate"] += 1
@@ -186,7 +192,7 @@ class KeyframeBuilder:
             self.rejections[f"{_NAMES.get(type(event), 'sightings')}.future"] += 1
             count, _ = self._offsets.get(event.topic, (0, 0))
             self._offsets[event.topic] = [count + 1, ahead]
-        elif isinstance(event, (CornersEvent, MarkerPosesEvent, RangeBearingEvent)):
+        elif isinstance(event, _SIGHTINGS):
             self._insert_sightings(event)
         else:
             self.rejections[f"{_NAMES[type(event)]}.late"] += 1
@@ -196,19 +202,22 @@ class KeyframeBuilder:
         steps: list[Step] = []
         if self._last_ns is None:
             lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending)
-            self._jumps.append(
-                f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped"
-            )
+            self._tell_jump(f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped")
         else:
             jump_s = (event.stamp_ns - self._newest_ns) * 1e-9
             steps = self._finish()
             self._segment += 1
-            self._jumps.append(
+            self._tell_jump(
                 f"the clock jumped {'ahead' if jump_s > 0 else 'back'} by {abs(jump_s):.1f} s at "
                 f"{event.stamp_ns * 1e-9:.3f} s: segment {self._segment} begins"
             )
         self._reset()
         return steps
+
+    def _tell_jump(self, note: str) -> None:
+        self._jump_count += 1
+        if self._jump_count <= _NAMED_JUMPS:
+            self._jumps.append(note)
 
     # --- steps out ---
 
@@ -235,15 +244,21 @@ class KeyframeBuilder:
 
     def _closed(self, stamp_ns: int) -> bool:
         """Whether nothing before this time is still expected."""
-        newest = self._newest_ns
+        newest, waited_ns = self._newest_ns, self._waited(stamp_ns)
         if newest < stamp_ns + (self._reorder_ns if self._last_ns is None else 0):
             return False
         return all(
-            source.newest_ns >= stamp_ns + source.disorder_ns
-            or newest >= stamp_ns + source.patience_ns
-            or newest > source.newest_ns + _ALIVE_NS
+            source.newest_ns >= stamp_ns + source.disorder_ns.ns
+            or (newest >= stamp_ns + source.patience_ns and waited_ns >= source.patience_ns // 2)
+            or (newest > source.newest_ns + _ALIVE_NS and self._received_ns - source.received_ns >= _ALIVE_NS // 2)
             for source in self._sources.values()
         )
+
+    def _waited(self, stamp_ns: int) -> int:
+        """How long ago, by receive times, this stamp was reached: after a stall, topics come one after another."""
+        while len(self._reached) > 1 and self._reached[0][0] < stamp_ns:
+            self._reached.popleft()
+        return self._received_ns - self._reached[0][1] if self._reached else 0
 
     def _step(self, stamp_ns: int) -> Step:
         """Close the keyframe at this time."""

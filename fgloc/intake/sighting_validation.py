@@ -11,6 +11,7 @@ from typing import TypeVar
 from fgloc.config import GateConfig
 from fgloc.intake.field_checks import Changes, FieldChecks, judge_corners
 from fgloc.types import (
+    MAX_LANDMARK_ID,
     CornersEvent,
     MarkerCorners,
     MarkerPose,
@@ -81,7 +82,8 @@ class SightingsValidator:
         kept: list[S] = []
         changed = False
         for sighting in sightings:
-            verdict = judge(topic, sighting)
+            number = sighting.landmark_id if isinstance(sighting, RangeBearing) else sighting.marker_id
+            verdict = judge(topic, sighting) if 0 <= number <= MAX_LANDMARK_ID else "id_bound"
             if isinstance(verdict, str):
                 self._rejections[f"sightings.{verdict}"] += 1
                 changed = True

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.config import Role
+from fgloc.config import RecordingConfig, Role
 from fgloc.types import (
     CameraInfoEvent,
     CommandEvent,
@@ -67,6 +67,24 @@ def transforms(message: Any, received_ns: int, topic: str, static: bool) -> list
         )
         for t in message.transforms
     ]
+
+
+def events_of(
+    content: Any, message_type: str, role: Role | None, received_ns: int, topic: str, config: RecordingConfig
+) -> list[Event]:
+    """Events of one message in a role (None: none but that of tf), stamped as the configuration has it.
+
+    Raises:
+        KeyError, ValueError, AttributeError: the message is not what its type says.
+    """
+    if message_type in TF_TYPES:
+        return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
+    if role is None:
+        return []
+    stamp_ns = None if role in config.received_stamps else header_stamp(content)
+    stamp_ns = received_ns if stamp_ns is None else stamp_ns
+    stamp_ns += round(config.stamp_offset_s.get(role, 0.0) * 1e9)
+    return [CONVERTERS[role][message_type](content, (stamp_ns, received_ns, topic))]
 
 
 # --- One converter for each type --------------------------------------------------------------------------------------

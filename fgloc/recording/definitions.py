@@ -10,6 +10,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodet
 from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
+from fgloc.recording.definition_limits import MAX_TEXT, DefinitionError, check_sizes, plain_idl
 from fgloc.recording.messages import default_typestore
 
 
@@ -19,6 +20,7 @@ class Decoder:
     Definitions that the recording embeds win; the defaults serve for the rest.
 
     Attributes:
+        store: rosbags' typestore with the definitions used.
         notes: what the user should know of the definitions used.
     """
 
@@ -31,24 +33,34 @@ class Decoder:
         """
         embedded: Typesdict = {}
         used, missing, damaged = set(), set(), set()
+        seen: set[tuple[str, str]] = set()
+        characters = 0
         for message_type, definition in definitions:
             used.add(message_type)
             if definition.format == MessageDefinitionFormat.NONE:
                 missing.add(message_type)
                 continue
+            if (message_type, definition.data) in seen:
+                continue
+            seen.add((message_type, definition.data))
             try:
+                characters += len(definition.data)
+                if characters > MAX_TEXT:
+                    raise DefinitionError(f"definitions of more than {MAX_TEXT} characters")
                 embedded.update(_parse(message_type, definition))
             except Exception:  # the parser leaks what damaged text makes it meet
                 damaged.add(message_type)
         default = _default_definitions(ros1)
-        self._store = get_typestore(Stores.EMPTY)
+        self.store = get_typestore(Stores.EMPTY)
         try:
-            self._store.register(_needed(used, {**default, **embedded}))
+            needed = _needed(used, {**default, **embedded})
+            check_sizes(needed)
+            self.store.register(needed)
         except Exception:  # a definition that parses may still be nonsense
-            self._store = get_typestore(Stores.EMPTY)
-            self._store.register(_needed(used, default))
+            self.store = get_typestore(Stores.EMPTY)
+            self.store.register(_needed(used, default))
             damaged |= embedded.keys() & used
-        self._deserialize = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
+        self._deserialize = self.store.deserialize_ros1 if ros1 else self.store.deserialize_cdr
         self.notes: list[str] = []
         name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
         if missing:
@@ -97,5 +109,5 @@ def _parse(message_type: str, definition: MessageDefinition) -> Typesdict:
     for part in definition.data.split(separator):
         text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
         if text.strip():
-            types.update(get_types_from_idl(text))
+            types.update(get_types_from_idl(plain_idl(text)))
     return types

@@ -8,10 +8,10 @@ from typing import Any
 
 import yaml
 
+from fgloc.documents import HostileError, parse, plain
 from fgloc.errors import RecordingError
 
 _MAX_BYTES = 16 * 1024 * 1024
-_MAX_DEPTH = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class BagMetadata:
     """What of ``metadata.yaml`` is needed to find and to judge the storage files."""
 
     files: tuple[Path, ...]
-    compressed: bool  # by rosbag2 itself (whole files or single messages), not inside the storage format
+    compressed: str  # by rosbag2 itself: "file", "message", or "" (also where the storage format compresses)
     message_count: int | None
 
 
@@ -27,45 +27,37 @@ def read_metadata(folder: Path) -> BagMetadata | None:
     """Read ``folder/metadata.yaml``; None if it is absent or is too damaged to be understood.
 
     Raises:
-        RecordingError: the file has YAML aliases or absurd size or depth, or names a path outside the folder.
+        RecordingError: the file is absurdly large or deep, has aliases that expand without bound, or names a path
+            outside the folder.
     """
     path = folder / "metadata.yaml"
     try:
+        if not path.is_file():
+            return None
         if path.stat().st_size > _MAX_BYTES:
             raise RecordingError(f"{path}: {path.stat().st_size} bytes, expected less than {_MAX_BYTES}; {_REMEDY}")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return None
     try:
-        _refuse_bombs(path, text)
-        content = yaml.safe_load(text)
+        root = parse(text, str(path))
+        content = {} if root is None else plain(root)
         information = content["rosbag2_bagfile_information"]
         names = [_inside(path, name) for name in information["relative_file_paths"]]
         count = information.get("message_count")
+        mode = str(information.get("compression_mode")).lower()
         return BagMetadata(
             files=tuple(folder / name for name in dict.fromkeys(names)),
-            compressed=str(information.get("compression_mode")).lower() in ("file", "message"),
+            compressed=mode if mode in ("file", "message") else "",
             message_count=count if isinstance(count, int) and count >= 0 else None,
         )
+    except HostileError as error:
+        raise RecordingError(f"{path}: {error}; {_REMEDY}") from error
     except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
         return None
 
 
 _REMEDY = "do not trust this recording, or delete its metadata.yaml to have the storage files opened directly"
-
-
-def _refuse_bombs(path: Path, text: str) -> None:
-    """Refuse aliases (they let a few lines expand without bound) and deep nesting before anything is built."""
-    depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise RecordingError(f"{path}: has a YAML alias (*{event.anchor}), which rosbag2 never writes; {_REMEDY}")
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        if depth > _MAX_DEPTH:
-            raise RecordingError(f"{path}: nested deeper than {_MAX_DEPTH} levels; {_REMEDY}")
 
 
 def _inside(path: Path, name: Any) -> str:

@@ -1,8 +1,4 @@
-"""Writing and reading results: TUM trajectories, covariances, decisions, JSON; a file appears whole or not at all.
-
-A result is written to a temporary file in the same folder, flushed to the disk and renamed over the old one: a full
-disk or a killed process leaves the old result as it was.
-"""
+"""Writing and reading results: TUM trajectories, covariances, decisions, JSON; a file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -10,16 +6,15 @@ import csv
 import hashlib
 import json
 import math
-import os
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
+from fgloc.atomic import atomic_file
+from fgloc.documents import read_text
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.frames import quaternion_yaw
 from fgloc.types import Decision, Trajectory
@@ -29,48 +24,6 @@ _TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
 _COV_COLUMNS = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
 _UPPER = np.triu_indices(3)
 _STEP_COLUMNS = ("step", "stamp", "kind", "landmark_id", "residual", "nis", "dof", "weight", "reason")
-
-
-@contextmanager
-def atomic_file(path: Path, binary: bool = False) -> Iterator[IO[Any]]:
-    """Open a file that replaces `path` when the block ends without an error, and leaves it alone otherwise.
-
-    Raises:
-        OutputError: the folder or the file cannot be written, or the disk is full.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("wb") if binary else temporary.open("w", encoding="utf-8", newline="") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); the old file is kept") from error
-
-
-@contextmanager
-def atomic_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder inside `out` whose files all move into `out` when the block ends without an error.
-
-    So the files of one result belong together: an error in the last of them keeps the whole old result.
-
-    Raises:
-        OutputError: the folder cannot be made or the files cannot be moved.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out, prefix=".partial-", ignore_cleanup_errors=True) as name:
-            stage = Path(name)
-            yield stage
-            for file in sorted(stage.iterdir()):
-                file.replace(out / file.name)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror or error}); the old result is kept") from error
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -99,11 +52,7 @@ def read_tum(path: Path) -> Trajectory:
         TrajectoryError: the file is missing or empty, or a line has not eight finite numbers, a zero quaternion, or a
             stamp that does not come after the one before. The message names file, line and value.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise TrajectoryError(f"{path}: cannot be read ({why}); give a TUM text file") from error
+    lines = read_text(path, TrajectoryError, "give a TUM text file", max_bytes=1 << 30).splitlines()
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):

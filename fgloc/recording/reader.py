@@ -10,7 +10,7 @@ from types import TracebackType
 
 from fgloc.config import RecordingConfig, Role
 from fgloc.errors import RecordingError
-from fgloc.recording.decode import CONVERTERS, TF_TYPES, header_stamp, transforms
+from fgloc.recording.decode import CONVERTERS, TF_TYPES, events_of
 from fgloc.recording.definitions import Decoder
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.recording.storage import RawMessage, Storage
@@ -130,14 +130,7 @@ class Recording:
         topic, message_type, received_ns, raw = message
         try:
             content = self._decoder.deserialize(message_type, raw)
-            if message_type in TF_TYPES:
-                return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
-            if role is None:
-                return []
-            stamp_ns = None if role in self.config.received_stamps else header_stamp(content)
-            stamp_ns = received_ns if stamp_ns is None else stamp_ns
-            stamp_ns += round(self.config.stamp_offset_s.get(role, 0.0) * 1e9)
-            return [CONVERTERS[role][message_type](content, (stamp_ns, received_ns, topic))]
+            return events_of(content, message_type, role, received_ns, topic, self.config)
         except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             self.undecodable[topic] = self.undecodable.get(topic, 0) + 1
             return []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+
+from fgloc.recording.limits import Budget, decompressed
 
 _MAX_NS = 2**63 - 1
 
@@ -46,7 +49,11 @@ class McapSink:
 
 
 def recover_mcap(path: Path, target: Path) -> tuple[int, float]:
-    """Copy what can be read of an MCAP; returns the number of messages and the share of the bytes that is lost."""
+    """Copy what can be read of an MCAP; returns the number of messages and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: its chunks expand to more than its size allows.
+    """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     for record, _ in _mcap_records(path):  # first for the channels: those of a damaged chunk are repeated at the end
@@ -73,7 +80,8 @@ def recover_mcap(path: Path, target: Path) -> tuple[int, float]:
 
 def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
     """Readable records, each with the number of the file's bytes that were sound so far; ends with (None, bytes)."""
-    size = path.stat().st_size
+    size, budget = path.stat().st_size, Budget(path)
+    budget.start_pass()
     with path.open("rb") as file:
         read = len(file.read(8))  # magic
         while len(frame := file.read(9)) == 9:
@@ -81,7 +89,7 @@ def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
             payload = file.read(min(length, size - file.tell()))
             complete = len(payload) == length
             if opcode == Opcode.CHUNK:
-                records, sound = _chunk_records(payload, complete)
+                records, sound = _chunk_records(payload, complete, budget)
             elif complete:
                 records = [_mcap_record(opcode, payload)]
                 sound = True
@@ -98,12 +106,20 @@ def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
     yield None, read
 
 
-def _chunk_records(payload: bytes, complete: bool) -> tuple[list[McapRecord | None], bool]:
+def _chunk_records(payload: bytes, complete: bool, budget: Budget) -> tuple[list[McapRecord | None], bool]:
     """Records of a chunk, and whether it was sound. Of one that was cut short, the leading ones if not compressed."""
     try:
         chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
+    except Exception:  # damaged bytes make the parser raise anything
+        return [], False
+    if chunk.compression:
+        budget.check(chunk.uncompressed_size)
+        budget.spend(chunk.uncompressed_size)
+    try:
         if complete:
-            return list(breakup_chunk(chunk, validate_crc=True)), True
+            data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+            plain = replace(chunk, compression="", data=data)
+            return list(breakup_chunk(plain, validate_crc=True)), True
         if chunk.compression:
             return [], False
     except Exception:  # damaged bytes make the parser raise anything

@@ -10,11 +10,18 @@ from typing import BinaryIO
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
-from rosbags.rosbag1.reader import decompressors
+
+from fgloc.recording.limits import Budget, decompressed
 
 
 def recover_ros1(path: Path, target: Path) -> tuple[int, float]:
-    """Copy what can be read of a ROS 1 bag; returns the number of messages and the share of the bytes that is lost."""
+    """Copy what can be read of a ROS 1 bag; returns the number of messages and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: its chunks expand to more than its size allows.
+    """
+    budget = Budget(path)
+    budget.start_pass()
     size = path.stat().st_size
     read = messages = 0
     connections: dict[int, Connection] = {}
@@ -23,7 +30,7 @@ def recover_ros1(path: Path, target: Path) -> tuple[int, float]:
         read += len(file.readline(64))  # magic
         for header, data, sound in _ros1_records(file, size):
             if header.get("op") == b"\x05":
-                inner, sound = _ros1_chunk(header, data, sound)
+                inner, sound = _ros1_chunk(header, data, sound, budget)
             else:
                 inner = [(header, data)] if sound else []
             read += 8 + sum(5 + len(k) + len(v) for k, v in header.items()) + len(data) if sound else 0
@@ -83,15 +90,16 @@ def _ros1_fields(header: bytes) -> dict[str, bytes]:
 
 
 def _ros1_chunk(
-    header: dict[str, bytes], data: bytes, complete: bool
+    header: dict[str, bytes], data: bytes, complete: bool, budget: Budget
 ) -> tuple[list[tuple[dict[str, bytes], bytes]], bool]:
     compression = header.get("compression", b"").decode(errors="replace")
     if compression != "none":
-        if not complete or compression not in decompressors:
+        if not complete or compression not in ("bz2", "lz4"):
             return [], False
         try:
-            data = decompressors[compression](data)
+            data = decompressed(compression, data, budget.limit)
         except Exception:  # damaged bytes
             return [], False
+        budget.spend(len(data))
     records = [(fields, content) for fields, content, sound in _ros1_records(BytesIO(data), len(data)) if sound]
     return records, complete or bool(records)

@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
+from fgloc.recording.limits import Budget, check_tables
 from fgloc.recording.recover_mcap import McapSink
 
 
@@ -19,7 +20,11 @@ def sqlite_journals(path: Path) -> list[Path]:
 
 
 def recover_sqlite(path: Path, target: Path) -> tuple[int, float]:
-    """Copy the readable rows into an MCAP; returns their number and the share of the bytes that is lost."""
+    """Copy the readable rows into an MCAP; returns their number and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: a table is a query.
+    """
     size = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(100)
@@ -35,13 +40,15 @@ def recover_sqlite(path: Path, target: Path) -> tuple[int, float]:
     with closing(McapSink(target)) as sink:
         try:
             with closing(sqlite3.connect(f"file:{quote(str(source.absolute()))}?{options}", uri=True)) as database:
-                _copy_rows(database, sink)
+                check_tables(database, path)
+                _copy_rows(database, sink, Budget(path))
         except sqlite3.Error:
             pass  # damaged beyond the rows already copied
     return sink.messages, 1.0 - size / intended
 
 
-def _copy_rows(database: sqlite3.Connection, sink: McapSink) -> None:
+def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> None:
+    budget.start_pass()
     database.execute("PRAGMA writable_schema=ON")  # or SQLite refuses a file that is shorter than its header says
     database.text_factory = lambda raw: raw.decode(errors="replace")
     definitions: dict[str, tuple[str, str]] = {}
@@ -69,6 +76,7 @@ def _copy_rows(database: sqlite3.Connection, sink: McapSink) -> None:
                     return  # a damaged tree that leads in circles
                 last, step = row_id, 1
                 if topic_id in ids and isinstance(received_ns, int) and isinstance(data, bytes):
+                    budget.spend(len(data))
                     sink.write(ids[topic_id], received_ns, data)
             return
         except sqlite3.DatabaseError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +15,19 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from fgloc.errors import RecordingError
-from fgloc.recording.metadata import BagMetadata, read_metadata
+from fgloc.recording.files import EXPECTED, find_files, kind_of
+from fgloc.recording.limits import (
+    REWINDS,
+    Budget,
+    TooLargeError,
+    bound_reader,
+    check_sqlite,
+    decompress_file,
+    decompressed,
+    opening,
+)
 from fgloc.recording.recover import recover
 from fgloc.recording.recover_sqlite import sqlite_journals
-
-_KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
-_EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 RawMessage = tuple[str, str, int, bytes]  # topic, message type (pkg/msg/Name), received_ns, serialized message
 
@@ -53,30 +59,39 @@ class Storage:
         """
         self.notes: list[str] = []
         self._scratch: TemporaryDirectory[str] | None = None
-        metadata, self.files = _find_files(path, self.notes)
-        self.kind = _kind(self.files[0])
+        metadata, self.files = find_files(path, self.notes)
+        self.kind = kind_of(self.files[0])
         self._files: list[_File] = []
         try:
-            if metadata is not None and metadata.compressed:
-                self._files.append(_File(path, "folder", self._folder, self.notes))
-            else:
-                self._open_files()
+            self._open_files(metadata is not None and metadata.compressed == "message")
             if metadata is not None and metadata.message_count is not None:
                 self._compare_count(metadata.message_count)
         except BaseException:
             self.close()
             raise
 
-    def _open_files(self) -> None:
+    def _open_files(self, compressed_messages: bool) -> None:
         failures = []
         for file in self.files:
             try:
-                self._files.append(_File(file, _kind(file), self._folder, self.notes))
+                plain = self._decompressed(file) if file.suffix == ".zstd" else file
+                self._files.append(_File(plain, self._folder, self.notes, compressed_messages))
+            except TooLargeError:
+                raise
             except RecordingError as error:
                 failures.append(str(error))
         if not self._files:
             raise RecordingError("\n".join(failures))
         self.notes.extend(failures)
+
+    def _decompressed(self, file: Path) -> Path:
+        """A copy of a file that the recorder compressed as a whole; of a damaged one, as far as it goes."""
+        target = self._folder() / file.stem
+        try:
+            decompress_file(file, target)
+        except (OSError, EOFError) as error:
+            self.notes.append(f"{file.name} is damaged ({_reason(error)}): what comes before is used.")
+        return target
 
     def _compare_count(self, expected: int) -> None:
         found = sum(channel.count for channel in self.channels)
@@ -141,16 +156,18 @@ class Storage:
 
 
 class _File:
-    """One storage file (or a compressed folder), replaced by a salvaged copy once it proves damaged."""
+    """One storage file, replaced by a salvaged copy once it proves damaged."""
 
-    def __init__(self, path: Path, kind: str, folder: Callable[[], Path], notes: list[str]) -> None:
-        self._path, self._kind, self._folder, self._notes = path, kind, folder, notes
+    def __init__(self, path: Path, folder: Callable[[], Path], notes: list[str], compressed_messages: bool) -> None:
+        self._path, self._kind, self._folder, self._notes = path, kind_of(path), folder, notes
+        self._compressed_messages = compressed_messages
         self._recovered = False
+        self._budget = Budget(path)
         self.reader: Any = None
         try:
-            if kind == "sqlite3" and (journals := sqlite_journals(path)):
+            if self._kind == "sqlite3" and (journals := sqlite_journals(path)):
                 raise RecordingError(f"the recorder was killed, {journals[0].name} is left")
-            self.reader = _open(path, kind)
+            self.reader = _open(path, self._kind, self._budget)
         except Exception as error:  # rosbags leaks apsw, struct, decoding and assertion errors
             self._recover(error)
 
@@ -163,6 +180,7 @@ class _File:
         last_ns = -1
         at_last: list[tuple[str, bytes]] = []  # what was delivered last, to go on from there in a salvaged copy
         resume = (last_ns, at_last)
+        self._budget.start_pass(REWINDS)
         while True:
             reader = self.reader
             wanted = [c for c in reader.connections if topics is None or c.topic in topics]
@@ -177,7 +195,8 @@ class _File:
                     if received_ns != last_ns:
                         last_ns, at_last = received_ns, []
                     at_last.append((connection.topic, raw))
-                    yield connection.topic, connection.msgtype, received_ns, raw
+                    self._budget.spend(len(raw))
+                    yield connection.topic, connection.msgtype, received_ns, self._plain(raw)
                 return
             except Exception as error:
                 if self.reader is reader:  # else another iterator has already replaced it
@@ -190,18 +209,37 @@ class _File:
                         return
                 resume = (last_ns, at_last)
 
+    def _plain(self, raw: bytes) -> bytes:
+        """A message as it was before the recorder compressed it; one that is damaged stays, and is not decodable."""
+        if not self._compressed_messages:
+            return raw
+        try:
+            plain = decompressed("zstd", raw, self._budget.limit)
+        except OverflowError:
+            self._budget.check(self._budget.limit + 1)
+            raise
+        except Exception:  # damaged bytes
+            return raw
+        self._budget.spend(len(plain))
+        return plain
+
     def _recover(self, error: Exception) -> None:
+        if isinstance(error, TooLargeError):
+            raise error
         reason = _reason(error)
-        if self._recovered or self._kind == "folder" or isinstance(error, (PermissionError, FileNotFoundError)):
+        if self._recovered or isinstance(error, (PermissionError, FileNotFoundError)):
             raise RecordingError(f"{self._path}: cannot be read: {reason}.") from error
         try:
             recovered = recover(self._path, self._kind, self._folder())
-            reader = _open(recovered.path, _kind(recovered.path)) if recovered.messages else None
+            again = Budget(recovered.path) if recovered.messages else None
+            reader = _open(recovered.path, kind_of(recovered.path), again) if again is not None else None
+        except TooLargeError:
+            raise
         except Exception as second:
             raise RecordingError(f"{self._path}: cannot be read: {reason}; nor salvaged: {_reason(second)}.") from error
         if reader is None:
             raise RecordingError(
-                f"{self._path}: cannot be read: {reason}; {_EXPECTED}, and no message could be salvaged."
+                f"{self._path}: cannot be read: {reason}; {EXPECTED}, and no message could be salvaged."
             ) from error
         self._recovered = True
         self.close()
@@ -216,11 +254,21 @@ class _File:
             self._notes.append(text)
 
 
-def _open(path: Path, kind: str) -> Any:
+def _open(path: Path, kind: str, budget: Budget) -> Any:
+    if kind == "sqlite3":
+        check_sqlite(path)
     reader = Ros1Reader(path) if kind == "ros1" else Ros2Reader(path)
-    reader.open()
+    budget.start_pass()
+    with opening(budget):
+        reader.open()
+        return _checked(reader, kind, budget)
+
+
+def _checked(reader: Any, kind: str, budget: Budget) -> Any:
     try:
-        if kind == "mcap" and not reader.storage.chunks:  # type: ignore[union-attr]
+        bound_reader(reader, budget)
+        if kind == "mcap" and not reader.storage.chunks:
+            budget.start_pass()
             for _ in reader.messages():  # without an index rosbags finds disorder only when it meets it
                 pass
         if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
@@ -229,51 +277,6 @@ def _open(path: Path, kind: str) -> Any:
         reader.close()
         raise
     return reader
-
-
-def _find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
-    """Storage files of a recording, in order, and its metadata where used."""
-    if not path.exists():
-        raise RecordingError(f"{path}: does not exist; {_EXPECTED}")
-    if path.is_file():
-        _kind(path)
-        return None, (path,)
-    metadata = read_metadata(path)
-    if metadata is not None:
-        present = tuple(file for file in metadata.files if file.is_file())
-        if present:
-            missing = [file.name for file in metadata.files if file not in present]
-            if missing:
-                notes.append(f"Named by metadata.yaml but missing: {', '.join(missing)}.")
-            return metadata, present
-    groups: dict[str, list[Path]] = defaultdict(list)
-    for file in sorted(path.iterdir(), key=_natural):
-        if file.is_file() and file.suffix in (".mcap", ".db3"):
-            groups[file.suffix].append(file)
-    if not groups:
-        bags = sorted(file.name for file in path.glob("*.bag"))
-        hint = f"; give one of its ROS 1 bags: {', '.join(bags)}" if bags else f"; {_EXPECTED}"
-        raise RecordingError(f"{path}: a folder without .mcap or .db3{hint}")
-    if len(groups) > 1:
-        names = ", ".join(file.name for files in groups.values() for file in files)
-        raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
-    files = next(iter(groups.values()))
-    state = "damaged" if (path / "metadata.yaml").exists() else "missing"
-    notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
-    return None, tuple(files)
-
-
-def _kind(path: Path) -> str:
-    suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
-    if suffix not in _KINDS:
-        raise RecordingError(f"{path}: unknown kind {suffix!r}; {_EXPECTED}")
-    return _KINDS[suffix]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key: run_2 before run_10."""
-    parts = "".join(c if c.isdigit() else f" {c} " for c in path.name).split()
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _reason(error: Exception) -> str:

@@ -47,6 +47,8 @@ _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
 _UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
 _ITERATIONS, _ROUGH_ITERATIONS = 16, 4
+# After initialise_s in vain it is tried no more often than this: a new sighting seldom changes what 5 s of them say.
+_RETRY_NS = 800_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +99,7 @@ class GlobalSearch:
         self._first = False  # whether the segment has had no pose yet
         self.hypotheses = GaussianSum(config, landmark_map)
         self._since_ns: int | None = None  # the first sighting of the search
+        self._tried_ns = 0  # when a place was looked for last
         self.waiting = True
 
     def reset(self) -> None:
@@ -145,10 +148,19 @@ class GlobalSearch:
             self.hypotheses.add(motions if len(self._steps) + len(self._earlier) > 1 else (), sightings)
         if sightings and self._since_ns is None:
             self._since_ns = step.stamp_ns
-        best = self._solve(known) if sightings else None
+        best = self._solve(known) if sightings and self._due(step.stamp_ns) else None
         if best is None:
             return None
         return self._start(PoseWithCovariance(best.fit.pose, best.fit.cov), best.outliers)
+
+    def _due(self, stamp_ns: int) -> bool:
+        """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
+        since, patience_ns = self._since_ns or stamp_ns, self._config.estimator.initialise_s * 1e9
+        waited = self._tried_ns <= since + _PATIENCE * patience_ns < stamp_ns  # what counts as enough has changed
+        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_NS and not waited:
+            return False
+        self._tried_ns = stamp_ns
+        return True
 
     def give_up(self) -> InitialPose | None:
         """The segment is over: all its steps, from the likeliest place; None if none are kept.

@@ -59,16 +59,26 @@ class Tracking:
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._speaking_for = self._speaking_against = 0  # sightings
-        self._jumps: list[FloatArray] = []
+        self._jumps: list[FloatArray] = []  # the first few ...
+        self._jump_count = 0  # ... of so many
         self._told = False  # whether a pose that is not confirmed has been told
         places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
         self._places: FloatArray = np.array(places).reshape(-1, 2)
         self._never_found = False
 
-    def begin_segment(self, last: PoseWithCovariance | None) -> PoseWithCovariance | None:
-        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings."""
+    def begin_segment(
+        self, last: PoseWithCovariance | None, known: PoseWithCovariance | None = None
+    ) -> PoseWithCovariance | None:
+        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings.
+
+        Args:
+            last: of the segment before.
+            known: where it starts, by what the user or an earlier run says.
+        """
         self.lost = self._given = self._told = False
         self._search.reset()
+        if known is not None:
+            return known
         given = self._config.initial_pose
         if given is not None and last is None:
             self._given, self._speaking_for, self._speaking_against = True, 0, 0
@@ -158,6 +168,16 @@ class Tracking:
         spread = np.mean((self._places - belief.pose[:2]) ** 2)
         return np.asarray(kidnapped * np.diag([spread, spread, math.pi**2 / 3.0]))
 
+    def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
+        """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map.
+
+        Nothing, where the pose is lost for its covariance, which tells that already.
+        """
+        if self.is_unlocalized(belief):
+            return np.zeros((3, 3))
+        spread = np.mean((self._places - belief.pose[:2]) ** 2) if len(self._places) else _ANYWHERE[0, 0]
+        return np.diag([spread, spread, math.pi**2 / 3.0])
+
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""
         self.lost = True
@@ -236,16 +256,18 @@ class Tracking:
 
     def found(self, believed: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was believed to be at."""
-        self._jumps.append(se2.between(believed.pose, place.pose))
+        self._jump_count += 1
+        if self._jump_count <= _NAMED:
+            self._jumps.append(se2.between(believed.pose, place.pose))
         self.lost = self._given = False
         self._search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know, one sentence each."""
-        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps[:_NAMED]]
-        if len(self._jumps) > _NAMED:
-            said.append(f"... and {len(self._jumps) - _NAMED} times more")
+        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps]
+        if self._jump_count > _NAMED:
+            said.append(f"... and {self._jump_count - _NAMED} times more")
         if self._never_found:
             said.append(
                 "the sightings never told where on the map the robot is: its poses are LOST, and right relative to one "

@@ -82,7 +82,7 @@ class MotionFusion:
         self._factors = LandmarkFactors(None) if factors is None else factors
         self._wheels = wheels
         self._learned = learned
-        self._joint = joint
+        self.joint = joint
         self.gyro = gyro
         self._turn: Turn | None = None  # what the gyro says of the step that was read last
         self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
@@ -200,8 +200,8 @@ class MotionFusion:
         elif wheels is not None and learned is not None:
             if self._wheels.from_commands:  # made of the very commands that the model reads
                 wheels = None
-            elif self._joint is not None:
-                learned = self._joint.decorrelate(wheels, learned)
+            elif self.joint is not None:
+                learned = self.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
         if gyro is not None and known:
             known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
@@ -231,8 +231,8 @@ class MotionFusion:
         if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
             d = se2.log(se2.between(wheels.motion, learned.motion))
             cov = wheels.cov + learned.cov
-            if self._joint is not None:
-                cov = self._joint.difference_cov(wheels.cov, learned.cov)
+            if self.joint is not None:
+                cov = self.joint.difference_cov(wheels.cov, learned.cov)
             return Difference(d, cov, *self._systematic(wheels, learned))
         if gyro is None:
             return None

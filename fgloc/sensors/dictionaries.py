@@ -8,9 +8,11 @@ from pathlib import Path
 
 import cv2
 
+from fgloc.documents import read_text
 from fgloc.errors import ConfigError
 
 _FILE_SUFFIXES = {".yml", ".yaml", ".json", ".xml"}
+_MAX_BYTES = 1_000_000  # of a dictionary file; the largest that OpenCV ships has 1000 markers in 120 kB
 _APRILTAG = "DICT_APRILTAG_"
 _TAG36H11_0 = 0xD5D628584  # bits of tag 0 of tag36h11 from the top left, row by row, as the AprilTag project prints it
 _LEAST_EVIDENCE_BITS = 6.0  # log2 of how much less likely than this chance has to be
@@ -35,7 +37,8 @@ def load_dictionary(name: str) -> cv2.aruco.Dictionary:
         raise ConfigError(f"marker dictionary '{name}' is not known; known are {', '.join(known.values())}")
     dictionary = cv2.aruco.Dictionary()
     try:
-        storage = cv2.FileStorage(name, cv2.FILE_STORAGE_READ)
+        text = read_text(Path(name), ConfigError, "give the name or the file of a marker dictionary", _MAX_BYTES)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         good = storage.isOpened() and dictionary.readDictionary(storage.root())
         storage.release()
     except (cv2.error, SystemError) as error:

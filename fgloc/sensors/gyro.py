@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -62,6 +63,16 @@ class Gyro:
         self._turned = self._turned_s = 0.0  # ... and what was turned since
         self._heard = False
         self.forget_fix()
+
+    def fork(self) -> Gyro:
+        """A copy that may integrate beyond the newest step without changing this one."""
+        forked = copy.copy(self)
+        forked.rejections = Counter()
+        return forked
+
+    def resume(self, bias: float, bias_variance: float) -> None:
+        """Go on from what an earlier run learned of the bias [rad/s], [rad²/s²]."""
+        self.bias, self.bias_variance = bias, min(bias_variance, self._config.bias_sigma**2)
 
     def measure(self, step: Step, wheels: ArrayLike | None, blind_s: float = 0.0) -> Turn | None:
         """Turn over the step.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -40,7 +42,11 @@ _PACKED: dict[str, tuple[str, int, int | None]] = {
 _LUMA_OFFSET = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 _PLANAR_LUMA = ("nv12", "nv21", "nv24")  # the luma plane comes first
 
+_MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])  # which `fgloc` sets
+_MAX_SCANS = 64  # of a progressive JPEG; cameras write up to 12, and each of them goes over the whole image
+
 _JPEG_START, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
+_JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
@@ -80,6 +86,10 @@ def _compressed(event: ImageEvent) -> GrayImage:
         raise ImageError("truncated", f"{event.topic}: JPEG of {len(data)} bytes without an end marker")
     if data.startswith(_PNG_START) and _PNG_END not in data:
         raise ImageError("truncated", f"{event.topic}: PNG of {len(data)} bytes without an IEND chunk")
+    for width, height in _stated_sizes(data):
+        _check_pixels(event.topic, width, height)
+    if data.startswith(_JPEG_START) and data.count(bytes((0xFF, _JPEG_SCAN))) > _MAX_SCANS:
+        raise ImageError("undecodable", f"{event.topic}: JPEG of more than {_MAX_SCANS} scans")
     try:
         image = cv2.imdecode(event.data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -107,9 +117,27 @@ def _jpeg_ends(data: bytes) -> bool:
     return False
 
 
+def _stated_sizes(data: bytes) -> Iterator[tuple[int, int]]:
+    """Width and height as the headers of a PNG or JPEG have them; of another format OpenCV judges itself."""
+    if data.startswith(_PNG_START):
+        yield int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    at = 2 if data.startswith(_JPEG_START) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != _JPEG_SCAN:
+        kind = data[at + 1]
+        if kind in _JPEG_FRAMES:
+            yield int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+
+
+def _check_pixels(topic: str, width: int, height: int) -> None:
+    if width * height > _MAX_PIXELS:
+        raise ImageError("size", f"{topic}: image of {width}x{height} pixels, expected at most {_MAX_PIXELS} in all")
+
+
 def _raw(event: ImageEvent) -> GrayImage:
     if event.width == 0 or event.height == 0:
         raise ImageError("empty", f"{event.topic}: image of {event.width}x{event.height} pixels")
+    _check_pixels(event.topic, event.width, event.height)
     encoding = event.encoding
     if encoding in _PACKED:
         kind, channels, conversion = _PACKED[encoding]

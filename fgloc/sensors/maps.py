@@ -22,13 +22,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fgloc.atomic import atomic_file
+from fgloc.documents import Item, read_document
 from fgloc.errors import ConfigError, MapError
 from fgloc.frames import quaternion_matrix, rpy_matrix
-from fgloc.recording.outputs import atomic_file
 from fgloc.sensors.dictionaries import load_dictionary
-from fgloc.sensors.documents import Item, read_document
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
-from fgloc.types import FloatArray, Landmark, LandmarkMap
+from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
 
 _MAX_SIZE_M = 5.0
 _MAX_POSITION_M = 1e6
@@ -59,6 +59,8 @@ class _Builder:
         number = landmark_id.integer()
         if number < 0:
             raise landmark_id.fail(f"landmark id {number} is negative; ids count from 0")
+        if number > MAX_LANDMARK_ID:
+            raise landmark_id.fail(f"landmark id {number:g} is too large; expected at most {MAX_LANDMARK_ID}")
         if number in self._lines:
             raise item.fail(f"landmark id {number} is already in line {self._lines[number]}; every id may stand once")
         if (np.abs(position) > _MAX_POSITION_M).any():

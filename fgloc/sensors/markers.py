@@ -132,6 +132,11 @@ def suggest_dictionary(images: Iterable[GrayImage]) -> str | None:
     return suggest(look)
 
 
+def use_one_thread() -> None:
+    """Switch OpenCV's own threads off for the process: beside a detection thread they take the estimator's core."""
+    cv2.setNumThreads(1)
+
+
 def detect_stream(events: Iterable[Event], detector: Detector, rejections: Counter[str]) -> Iterator[Event]:
     """All events in their order, with a CornersEvent in the place of each image.
 
@@ -143,7 +148,7 @@ def detect_stream(events: Iterable[Event], detector: Detector, rejections: Count
         detector: not to be used elsewhere at the same time.
         rejections: counts images left out, as "image." and the reason.
     """
-    cv2.setNumThreads(1)
+    use_one_thread()
     waiting: deque[Event | Future[CornersEvent]] = deque()
     images = 0
     worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="marker-detection")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from typing import ClassVar, Literal
@@ -61,6 +61,20 @@ class Scene:
         return (event.received_ns - self.start_ns) * 1e-9
 
 
+_LARGEST = 1e6  # of any number of a failure: seconds, metres, pixels, parts per million
+
+
+def _numbers(value: object) -> Iterator[float]:
+    """All numbers in nested values."""
+    if isinstance(value, Mapping):
+        value = tuple(value.values())
+    if isinstance(value, list | tuple | set | frozenset):
+        for part in value:
+            yield from _numbers(part)
+    elif isinstance(value, int | float):
+        yield value
+
+
 class When(Section):
     """When a failure is active, in seconds of receive time from the recording's first message.
 
@@ -69,7 +83,7 @@ class When(Section):
     """
 
     intervals: tuple[tuple[float, float], ...] = Field((), description="from and until [s]")
-    bursts: int = Field(0, ge=0, description="further intervals, placed at random")
+    bursts: int = Field(0, ge=0, le=10_000, description="further intervals, placed at random")
     burst_s: float = Field(5.0, gt=0, description="length of each [s]")
     after_s: float = Field(0.0, ge=0, description="no burst begins before this [s]")
     share: float = Field(1.0, ge=0, le=1, description="of the messages inside, chosen at random one by one")
@@ -133,6 +147,13 @@ class Failure(Section):
     def _lasting(self) -> Failure:
         if not self.timed and self.when != When():
             raise ValueError(f"{self.kind} lasts the whole run; leave out its 'when'")
+        return self
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Failure:
+        for value in _numbers(self.model_dump()):
+            if abs(value) > _LARGEST:
+                raise ValueError(f"{self.kind} has the number {value:g}, expected none beyond {_LARGEST:g}")
         return self
 
     @abstractmethod

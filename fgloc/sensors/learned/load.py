@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from fgloc.atomic import atomic_file
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard
 from fgloc.sensors.learned.displacement import DisplacementModel
@@ -52,6 +54,8 @@ def model_of(tensors: Tensors, card: ModelCard, path: Path = Path("model")) -> M
 def read_model(path: Path) -> tuple[Tensors, ModelCard]:
     """Raw weights by name and the checked card; errors as in `load_model`."""
     try:
+        if path.exists() and not path.is_file():
+            raise ModelError(f"{path}: not a regular file; give a .safetensors file")
         size = path.stat().st_size
         if size > _MAX_BYTES:
             raise ModelError(f"{path}: {size} bytes, expected a motion model of at most {_MAX_BYTES}")
@@ -70,13 +74,12 @@ def read_model(path: Path) -> tuple[Tensors, ModelCard]:
 def save_model(path: Path, tensors: Tensors, card: ModelCard) -> None:
     """Write a model file that `load_model` accepts, atomically."""
     metadata = {"card": card.model_dump_json()}  # one entry: the order of several would differ from run to run
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(save(tensors, metadata=metadata))
-    try:
-        load_model(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    data = save(tensors, metadata=metadata)
+    with TemporaryDirectory(prefix="fgloc-") as folder:
+        (Path(folder) / path.name).write_bytes(data)
+        load_model(Path(folder) / path.name)
+    with atomic_file(path, binary=True) as file:
+        file.write(data)
 
 
 def _card(metadata: dict[str, str], path: Path) -> ModelCard:
@@ -84,7 +87,7 @@ def _card(metadata: dict[str, str], path: Path) -> ModelCard:
         fields = json.loads(metadata["card"])
     except KeyError:
         raise ModelError(f"{path}: has no card (inputs, normalization, noise) in its header; {_REMEDY}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"{path}: its card is not JSON ({error}); {_REMEDY}") from error
     found = (fields.get("format"), fields.get("version")) if isinstance(fields, dict) else fields
     if found != (FORMAT, VERSION):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -103,6 +104,12 @@ class SignalReader:
         self._reached: tuple[int, int] | None = None
         self._imu_events: list[ImuEvent] = []
         self._joints_events: list[JointsEvent] = []
+
+    def fork(self) -> SignalReader:
+        """A copy that may read on without changing this one."""
+        forked = copy.copy(self)
+        forked._imu_events, forked._joints_events = list(self._imu_events), list(self._joints_events)
+        return forked
 
     def read(self, step: Step, gyro_bias: float = 0.0) -> Signals | str:
         """Signals over the step and what the model wants before it; else the name of the first one with a hole."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 
 from numpy.typing import ArrayLike
@@ -44,6 +45,17 @@ class LearnedMotion:
         """Whether a better velocity changes the prediction: a model of commands alone does not look at it."""
         card = self.model.card
         return "velocity" in card.inputs
+
+    def fork(self, model: MotionModel) -> LearnedMotion:
+        """A copy that may predict beyond the newest step without changing this one.
+
+        Args:
+            model: a copy of this one's, for use in another thread: a model writes into buffers of its own.
+        """
+        forked = copy.copy(self)
+        forked.model = model
+        forked._reader, forked.rejections = self._reader.fork(), Counter()
+        return forked
 
     def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step.

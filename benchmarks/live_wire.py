@@ -1,0 +1,148 @@
+"""``fgloc play`` into ``fgloc live``, as two processes on loopback: ``python -m benchmarks.live_wire``.
+
+The bundled recordings, at their own speed. A third process, this one, subscribes to what is published.
+
+- ``live.equal_mm``: largest distance between the poses published and those of ``fgloc online`` on the same recording,
+  at common keyframes; ``live.equal_keyframes`` is the share of the latter's keyframes that were published.
+- ``live.rate_hz``, ``live.jitter_ms_p99``: of the odometry, by the times of sending: messages a second, and how far the
+  time between two messages is from its mean.
+- ``live.cpu_share``: processor time of ``fgloc live``, all of its threads, over the time, of one core.
+- ``live.stop_s``: from Ctrl-C to the end of the process.
+- ``live.interop``: as `benchmarks.live_interop` has it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import live_interop
+from benchmarks.common import Row, main
+from fgloc.config import load_config
+from fgloc.live.wire.participant import Participant, Sample
+from fgloc.runner import run
+from fgloc.types import FloatArray, IntArray
+
+_SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+_NAMES = ("first_run", "installed_run")
+_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+_PATIENCE_S = 30.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heard:
+    """What one run published."""
+
+    stamps_ns: IntArray  # (n,) of the keyframes' poses
+    positions: FloatArray  # (n, 2)
+    sent_s: FloatArray  # (m,) times of sending of the odometry
+    cpu_share: float
+    stop_s: float
+    exit_code: int
+    said: str
+
+
+class _Recorder:
+    """Poses and odometry of a run, as they come."""
+
+    def __init__(self, participant: Participant) -> None:
+        self.poses: list[tuple[int, float, float]] = []
+        self.sent_ns: list[int] = []
+        self._messages = participant.messages
+        participant.read("/fgloc/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", self._on_pose)
+        participant.read(
+            "/fgloc/odometry", "nav_msgs/msg/Odometry", lambda sample: self.sent_ns.append(sample.source_ns)
+        )
+
+    def _on_pose(self, sample: Sample) -> None:
+        message = self._messages.decode(sample.message_type, sample.cdr)
+        stamp, position = message.header.stamp, message.pose.pose.position
+        self.poses.append((stamp.sec * 1_000_000_000 + stamp.nanosec, position.x, position.y))
+
+
+def live_run(sample: Path, domain: int, rate: float = 1.0) -> Heard:
+    """Play a sample into ``fgloc live`` and record what it publishes."""
+    command = [sys.executable, "-m", "fgloc.cli"]
+    with Participant(domain) as participant:
+        recorder = _Recorder(participant)
+        files = ["--map", str(sample / "map.yaml"), "--config", str(sample / "robot.yaml")]
+        live = subprocess.Popen(
+            [*command, "live", "--domain", str(domain), *files],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        play = subprocess.Popen(
+            [*command, "play", str(sample / "bag"), "--domain", str(domain), "--rate", str(rate)],
+            stdout=subprocess.DEVNULL,
+        )
+        try:
+            cpu_share = _share_while_publishing(live.pid, play, recorder)
+            began = time.monotonic()
+            live.send_signal(signal.SIGINT)
+            said, _ = live.communicate(timeout=_PATIENCE_S)
+            stop_s = time.monotonic() - began
+        finally:
+            live.kill()
+            play.kill()
+    poses = np.array(sorted(recorder.poses)).reshape(-1, 3)
+    stamps = np.array([stamp for stamp, _, _ in sorted(recorder.poses)], dtype=np.int64)
+    sent_s = np.array(recorder.sent_ns, dtype=np.int64) * 1e-9
+    return Heard(stamps, poses[:, 1:], np.sort(sent_s), cpu_share, stop_s, live.returncode, said)
+
+
+def _share_while_publishing(pid: int, play: subprocess.Popen[bytes], recorder: _Recorder) -> float:
+    """Share of a core that a process takes from its first odometry until the player has ended."""
+    deadline = time.monotonic() + _PATIENCE_S
+    while not recorder.sent_ns and time.monotonic() < deadline:
+        time.sleep(0.05)
+    began, used = time.monotonic(), _cpu_s(pid)
+    play.wait()
+    return (_cpu_s(pid) - used) / (time.monotonic() - began)
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time of a process so far, of all its threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+
+def largest_difference_mm(heard: Heard, sample: Path) -> tuple[float, float]:
+    """Between published poses and those of an online run, and the share of the latter that is common."""
+    config = load_config(sample / "robot.yaml")
+    online = run(sample / "bag", sample / "map.yaml", config, "online").trajectory
+    _, published, expected = np.intersect1d(heard.stamps_ns, online.stamps_ns, return_indices=True)
+    apart = heard.positions[published] - online.poses[expected, :2]
+    return float(np.hypot(*apart.T).max()) * 1e3, len(expected) / len(online)
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """Rows of the benchmark."""
+    names = _NAMES[:1] if quick else _NAMES
+    runs = [
+        live_run(_SAMPLES / name, 100 + (os.getpid() + k) % 100, 4.0 if quick else 1.0) for k, name in enumerate(names)
+    ]
+    equal = np.array([largest_difference_mm(heard, _SAMPLES / name) for heard, name in zip(runs, names, strict=True)])
+    gaps_ms = [np.diff(heard.sent_s) * 1e3 for heard in runs]
+    rates = [1e3 / float(gaps.mean()) for gaps in gaps_ms]
+    jitters = [float(np.percentile(np.abs(gaps - gaps.mean()), 99)) for gaps in gaps_ms]
+    n = len(runs)
+    yield Row("live.equal_mm", float(equal[:, 0].max()), n=n, unit="mm")
+    yield Row("live.equal_keyframes", float(equal[:, 1].min()), n=n)
+    yield Row("live.rate_hz", min(rates), n=n, unit="Hz")
+    yield Row("live.jitter_ms_p99", max(jitters), n=n, unit="ms")
+    yield Row("live.cpu_share", max(heard.cpu_share for heard in runs), n=n)
+    yield Row("live.stop_s", max(heard.stop_s for heard in runs), n=n, unit="s")
+    yield from live_interop.measure(quick)
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")

@@ -1,0 +1,203 @@
+"""Commands on ROS 2's wire: ``live`` and ``play``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from tqdm import tqdm
+
+from fgloc.cli.options import Bag, ModelOption, configured
+from fgloc.cli.terminal import columns, run_bar, say
+from fgloc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+    from fgloc.live.wire.node import Node
+    from fgloc.types import LandmarkMap
+
+_SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
+_STATUS_S = 0.5  # time between two changes of the status line
+
+DomainOption = Annotated[
+    int, typer.Option("--domain", metavar="N", envvar="ROS_DOMAIN_ID", help="DDS domain; default: 0")
+]
+NetworkOption = Annotated[
+    bool,
+    typer.Option("--network", help="on the machine's networks (or as CYCLONEDDS_URI has it), not on loopback only"),
+]
+
+
+def live(
+    map_file: Annotated[
+        Path | None, typer.Option("--map", metavar="MAP", help="marker map; without one landmarks are estimated")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", metavar="C", help="configuration; default: none")] = None,
+    model: ModelOption = None,
+    domain: DomainOption = 0,
+    network: NetworkOption = False,
+    initial_pose: Annotated[
+        str | None, typer.Option("--initial-pose", metavar="X,Y,YAW", help="first pose in m and rad; also /initialpose")
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option("--state", metavar="FILE", help="kept up to date, and gone on from at the start")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
+) -> None:
+    """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
+    # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
+    from fgloc.live.wire.node import Node
+    from fgloc.live.wire.participant import Participant
+    from fgloc.sensors.maps import load_map
+
+    settings = _with_initial_pose(configured(None, config, model), initial_pose)
+    landmarks = None if map_file is None else load_map(map_file, settings.markers.default_size_m)
+    began = time.monotonic()
+    sys.setswitchinterval(_SWITCH_S)
+    with _interrupted() as stop, Participant(domain, network) as participant:
+        node = Node(participant, settings, landmarks, state)
+        say(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
+        try:
+            with _page(node, settings, landmarks) if view else nullcontext(_tell) as tell, _status_line(node, stop):
+                node.run(stop, tell)
+        finally:
+            node.close()
+        say(_summary(node, time.monotonic() - began))
+
+
+def play(
+    bag: Bag,
+    rate: Annotated[float, typer.Option("--rate", metavar="R", help="multiple of the recorded speed")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end, until Ctrl-C")] = False,
+    wait: Annotated[
+        float, typer.Option("--wait", metavar="S", min=0.0, help="seconds to wait for a subscriber before the start")
+    ] = 10.0,
+    domain: DomainOption = 0,
+    network: NetworkOption = False,
+) -> None:
+    """Publish a recording on ROS 2's wire with its recorded timing, and /clock."""
+    from fgloc.live.wire.participant import Participant
+    from fgloc.live.wire.play import Player
+
+    if not 0.0 < rate <= 1000.0:
+        raise ConfigError(f"--rate {rate:g}: expected a multiple of the recorded speed, more than 0 and up to 1000")
+    with _interrupted() as stop, Participant(domain, network) as participant, Player(bag, participant) as player:
+        for note in player.notes:
+            say(f"note: {note}")
+        say(f"{len(player.topics)} topics, {player.duration_s:.1f} s; domain {domain}")
+        if not player.wait_for_readers(wait, stop) and not stop.is_set():
+            say(f"no subscriber in {wait:g} s: playing all the same")
+        again = True
+        while again and not stop.is_set():
+            with run_bar("play") as progress:
+                player.play(rate, stop, progress)
+            again = loop
+        player.finish()
+        damaged = f", {player.damaged} damaged ones left out" if player.damaged else ""
+        say(f"{player.published} messages published{damaged}")
+
+
+@contextmanager
+def _interrupted() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or a termination signal sets, instead of raising an exception anywhere."""
+    stop = threading.Event()
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(kind, lambda *_: stop.set()) for kind in kinds]
+    try:
+        yield stop
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
+
+
+def _tell(sentence: str) -> None:
+    tqdm.write(sentence, file=sys.stdout)
+    sys.stdout.flush()
+
+
+@contextmanager
+def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator[Callable[[str], None]]:
+    """A page that shows the run; what is to be told goes there too."""
+    from fgloc.recording.truth import base_pose
+    from fgloc.types import Event, TruthEvent
+    from fgloc.view.server import Page
+
+    with Page() as page:
+        scene = page.scene(config.truth.max_gap_s)
+        if landmarks is not None:
+            scene.add_map(landmarks)
+
+        def watch(event: Event) -> None:
+            if isinstance(event, TruthEvent) and config.truth.align == "none":
+                scene.add_truth(event.stamp_ns, base_pose(event, config.truth))
+
+        def tell(sentence: str) -> None:
+            _tell(sentence)
+            scene.note(sentence)
+
+        node.subscribe(scene.add)
+        node.watch = watch
+        _tell(f"view: {page.url}")
+        yield tell
+
+
+@contextmanager
+def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
+    """The pose, on a terminal."""
+    with tqdm(bar_format="{desc}", disable=None, file=sys.stderr, leave=False) as bar:
+        if bar.disable:
+            yield
+            return
+        ended = threading.Event()
+
+        def show() -> None:
+            while not stop.is_set() and not ended.wait(_STATUS_S):
+                pose = None if node.live is None else node.live.pose_at()
+                if pose is not None:
+                    x, y, yaw = pose.pose
+                    sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
+                    bar.set_description_str(f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m")
+
+        showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)
+        showing.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            showing.join()
+
+
+def _with_initial_pose(config: Config, text: str | None) -> Config:
+    if text is None:
+        return config
+    try:
+        x, y, yaw = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--initial-pose {text}: expected x, y [m] and yaw [rad], such as 1.5,-0.2,3.14") from None
+    estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
+    return config.model_copy(update={"estimator": estimator})
+
+
+def _summary(node: Node, seconds: float) -> str:
+    rows = [("duration", f"{seconds:.1f} s"), ("odometry published", str(node.published["odometry"]))]
+    if node.live is None:
+        return columns(None, [*rows, ("received", "nothing: the robot's topics were not found")])
+    status = node.live.status()
+    rows += [
+        ("keyframes", str(status.keyframes)),
+        ("last mode", "no pose was found" if status.mode is None else str(status.mode)),
+        ("rejected", str(sum(status.rejections.values()))),
+    ]
+    rows += [(f"undecodable {topic}", str(n)) for topic, n in node.intake.undecodable.items()]
+    rows += [(f"dropped {role}", str(n)) for role, n in status.dropped.items()]
+    rows += [
+        (f"{of.role} {topic}", f"{of.count}, delay {of.delay_s * 1e3:.0f} ms") for topic, of in status.topics.items()
+    ]
+    return columns(None, rows)

@@ -1,0 +1,85 @@
+"""What arrives: rates and delays by topic, publishers, and clocks that were reset."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
+from fgloc.live.facts import ROLE_OF
+from fgloc.live.status import TopicMeter, TopicStatus
+from fgloc.types import Event
+
+_SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
+_SUCCESSION_NS = 1_000_000_000  # a publisher silent for this long has ended; another one of the topic is used
+
+
+@dataclass(slots=True)
+class _Publisher:
+    """Whose messages of a topic are used."""
+
+    name: str
+    received_ns: int
+
+    def has_the_topic(self, name: str, received_ns: int) -> bool:
+        """Whether a message is of that publisher, or of one that takes its place."""
+        if name != self.name and received_ns - self.received_ns < _SUCCESSION_NS:
+            return False
+        self.name, self.received_ns = name, received_ns
+        return True
+
+
+class Reception:
+    """Takes every event as it arrives; used under the lock of its owner.
+
+    Attributes:
+        dropped: events that are not used whatever they say, by role.
+    """
+
+    def __init__(self) -> None:
+        """Nothing has arrived."""
+        self.dropped: Counter[str] = Counter()
+        self._publishers: dict[Source, _Publisher] = {}
+        self._meters: dict[str, TopicMeter] = {}
+        self._clocks = TopicClocks()
+        self._notes: dict[str, None] = {}  # an ordered set
+
+    def receive(self, event: Event, publisher: str) -> list[Event]:
+        """The events that are to be used now: mostly this one; see `TopicClocks`."""
+        role = role_of(event)
+        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
+        if not first.has_the_topic(publisher, event.received_ns):
+            self.dropped[role] += 1
+            self.note(
+                f"{event.topic}: two publishers; only the messages of the first are used: stop or rename one of them"
+            )
+            return []
+        if event.topic not in self._meters:
+            self._meters[event.topic] = TopicMeter(role)
+        self._meters[event.topic].add(event.stamp_ns, event.received_ns)
+        return self._clocks.correct(event)
+
+    def note(self, text: str) -> None:
+        """Remember a sentence for the user."""
+        self._notes.setdefault(text)
+
+    def topics(self) -> Mapping[str, TopicStatus]:
+        """How each topic comes in."""
+        return {topic: meter.status() for topic, meter in sorted(self._meters.items())}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        newest = max((meter.last_ns for meter in self._meters.values()), default=0)
+        silent = [
+            f"{topic}: silent for {(newest - meter.last_ns) * 1e-9:.0f} s"
+            for topic, meter in sorted(self._meters.items())
+            if meter.is_regular and newest - meter.last_ns > _SILENT_NS
+        ]
+        return (*self._notes, *self._clocks.notes, *silent)
+
+
+def role_of(event: Event) -> str:
+    """Role of an event's topic."""
+    return ROLE_OF.get(type(event), "tf")

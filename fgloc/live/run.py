@@ -1,0 +1,222 @@
+"""A live run without its threads: events in order of receipt go in, estimates come out, as `fgloc.runner` has it."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.assembly import Assembly, assemble_stream
+from fgloc.config import Config
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.live.extrapolation import Extrapolator
+from fgloc.live.facts import LiveFacts
+from fgloc.live.resume import carried_over, odometry_state
+from fgloc.live.state import (
+    GyroState,
+    InstallationState,
+    RunState,
+    fingerprint,
+    installation_of_state,
+    matrix3,
+    row3,
+)
+from fgloc.types import (
+    CommandEvent,
+    CornersEvent,
+    Estimate,
+    Event,
+    FloatArray,
+    ImuEvent,
+    JointsEvent,
+    LandmarkMap,
+    Mode,
+    OdometryEvent,
+    Step,
+)
+
+_MOTION = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
+_TOLD_EVERY_S = 5.0  # the diagnosis is asked no more often: what it pools changes slowly
+
+
+class OnlineRun:
+    """Gate, steps, localizer and diagnosis of a stream; single-threaded.
+
+    The parts are built once the facts of the stream are known. When a sensor begins later they are built again, and
+    the new ones go on from the state of the old.
+
+    Attributes:
+        facts: what has come in.
+        parts: of the run; None before they are built.
+        extrapolator: of the newest keyframes; None before.
+        newest: the last estimate.
+        keyframes: steps so far.
+        reordering_s: how far the last keyframe was behind the newest stamp when it was made.
+    """
+
+    def __init__(
+        self, config: Config, landmark_map: LandmarkMap | None, facts: LiveFacts, resumed: RunState | None = None
+    ) -> None:
+        """Nothing has come in.
+
+        Args:
+            config: all settings.
+            landmark_map: the known map; None: landmarks are estimated.
+            facts: of the stream.
+            resumed: what an earlier run saved.
+        """
+        self.facts = facts
+        self.parts: Assembly | None = None
+        self.extrapolator: Extrapolator | None = None
+        self.newest: Estimate | None = None
+        self.keyframes = 0
+        self.reordering_s = 0.0
+        self._config = config
+        self._map = landmark_map
+        self._fingerprint = fingerprint(landmark_map)
+        self._resumed = resumed
+        self._reset: PoseWithCovariance | None = None  # a pose that was given, for the next step
+        self._last_step: Step | None = None
+        self._odometry: OdometryEvent | None = None
+        self._fastest = (0.0, 0.0)
+        self._past_rejections: Counter[str] = Counter()
+        self._notes: list[str] = []
+        self._told: tuple[str, ...] = ()
+        self._told_s = -np.inf
+
+    def build(self) -> Assembly:
+        """Build the parts, or build them again with what is known now.
+
+        Raises:
+            FglocError: as `fgloc.assembly.assemble_stream` has it.
+        """
+        old = self.parts
+        if old is not None:
+            self._resumed = self.snapshot() or self._resumed
+            self._past_rejections += old.rejections
+        parts = assemble_stream(self.facts, self._map, self._config, keep_all=self._map is None)
+        if self._resumed is not None:
+            self._take_over(parts, self._resumed)
+        self.parts = parts
+        self.extrapolator = Extrapolator(parts)
+        return parts
+
+    def reset_pose(self, belief: PoseWithCovariance) -> None:
+        """Go on from this pose at the next step."""
+        self._reset, self._resumed = belief, None
+
+    def check(self, event: Event) -> Event | None:
+        """Through the gate: the event, a repaired copy, or None. Motion is known to the extrapolator from here on."""
+        assert self.parts is not None
+        assert self.extrapolator is not None
+        passed = self.parts.gate.check(event)
+        if isinstance(passed, _MOTION):
+            self.extrapolator.add(passed)
+        return passed
+
+    def use(self, event: Event, detected: bool = False) -> Iterator[tuple[Step, Estimate | None]]:
+        """Take the next event in order; ``detected``: markers found in an image that has passed the gate."""
+        assert self.parts is not None
+        if detected and isinstance(event, CornersEvent):
+            passed = self.parts.detections.check(event)
+            if passed is None:
+                return
+            event = passed
+        if isinstance(event, OdometryEvent):
+            self._odometry = event
+        for step in self.parts.stepper.push(event):
+            self.reordering_s = (self.parts.stepper.newest_ns - step.stamp_ns) * 1e-9
+            yield step, self._update(step)
+
+    def finish(self) -> Iterator[tuple[Step, Estimate | None]]:
+        """The stream has ended: its last steps."""
+        if self.parts is not None:
+            for step in self.parts.stepper.flush():
+                yield step, self._update(step)
+
+    def _update(self, step: Step) -> Estimate | None:
+        parts, extrapolator = self.parts, self.extrapolator
+        assert parts is not None
+        assert extrapolator is not None
+        if self._reset is not None:
+            parts.localizer.restart_at(self._reset)
+        elif self._resumed is not None:
+            belief, note = carried_over(self._resumed, step, self._config, time.time_ns())
+            self._notes = [note]
+            if belief is not None:
+                parts.localizer.restart_at(belief)
+        self._reset = self._resumed = None
+        estimate = parts.localizer.update(step)
+        parts.diagnosis.observe(step, parts.wheels.measure(step))
+        self.keyframes += 1
+        self._last_step = step
+        if estimate is not None:
+            self.newest = estimate
+            extrapolator.anchor(step, estimate)
+        return estimate
+
+    def _take_over(self, parts: Assembly, state: RunState) -> None:
+        """What an earlier run found, but for the pose, which waits for the first step."""
+        localizer, gyro = parts.localizer, parts.localizer.sources.gyro
+        known = installation_of_state(state, localizer.factors.installation)
+        if known is not None:
+            localizer.factors.believed = known
+        if gyro is not None and state.gyro is not None:
+            gyro.resume(state.gyro.bias, state.gyro.bias_variance)
+        for landmark_id, displacement in state.excluded.items():
+            localizer.association.exclusion.exclude(landmark_id, np.array(displacement))
+        self._fastest = state.fastest
+
+    def snapshot(self) -> RunState | None:
+        """What is to be saved; None while no pose is known."""
+        parts, step, estimate = self.parts, self._last_step, self.newest
+        if parts is None or step is None or estimate is None or estimate.mode is Mode.UNCONFIRMED:
+            return None
+        localizer, gyro = parts.localizer, parts.localizer.sources.gyro
+        twist = parts.wheels.twist(step, step.stamp_ns)
+        self._fastest = (
+            max(self._fastest[0], float(np.hypot(twist[0], twist[1]))),
+            max(self._fastest[1], abs(float(twist[2]))),
+        )
+        installed = localizer.estimator.installed
+        moved = localizer.association.exclusion.displacements
+        return RunState(
+            map_fingerprint=self._fingerprint,
+            saved_ns=time.time_ns(),
+            stamp_ns=estimate.stamp_ns,
+            pose=row3(estimate.pose),
+            cov=matrix3(_body_cov(estimate)),
+            mode=estimate.mode,
+            fastest=self._fastest,
+            twist=row3(twist),
+            installation=InstallationState(
+                names=localizer.factors.installation.names,
+                mean=tuple(installed.mean.tolist()),
+                cov=tuple(tuple(row) for row in installed.cov.tolist()),
+            ),
+            gyro=None if gyro is None else GyroState(bias=gyro.bias, bias_variance=gyro.bias_variance),
+            odometry=None if self._odometry is None else odometry_state(self._odometry),
+            excluded={i: (float(d[0]), float(d[1])) for i, d in moved.items()},
+        )
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """Everything refused so far, by reason."""
+        return self._past_rejections + (Counter() if self.parts is None else self.parts.rejections)
+
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong, in the sentences of the reports."""
+        if self.parts is None:
+            return tuple(self._notes)
+        now = time.monotonic()
+        if now - self._told_s > _TOLD_EVERY_S:
+            self._told, self._told_s = self.parts.diagnosis.notes(self.parts.wheels.source), now
+        return (*self._notes, *self._told, *self.parts.sentences)
+
+
+def _body_cov(estimate: Estimate) -> FloatArray:
+    cov = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
+    return np.asarray(0.5 * (cov + cov.T))

@@ -1,0 +1,219 @@
+"""``fgloc live`` as a participant: events of the wire into `Live`, its poses out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.errors import FglocError
+from fgloc.frames import quaternion_yaw
+from fgloc.live import Live, LiveStatus
+from fgloc.live.wire.clock import WireClock
+from fgloc.live.wire.intake import Intake
+from fgloc.live.wire.odom_frame import OdomFrame
+from fgloc.live.wire.outputs import MAP_FRAME, BaseState, Outputs, odom_in_map
+from fgloc.live.wire.participant import Participant, Sample
+from fgloc.live.wire.recent import RecentPoses
+from fgloc.live.wire.teller import Teller
+from fgloc.types import Estimate, Event, LandmarkMap
+
+RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
+_POLL_S = 0.2  # time between two looks at what there is on the wire
+_INITIAL_POSE = "/initialpose"
+_INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+class Node:
+    """One live run on the wire. Use `run`, then `close`.
+
+    Attributes:
+        live: the run; None until the topics that it needs are there.
+        intake: what comes in.
+        published: messages sent, by kind.
+        watch: given every event that comes in, also a truth's.
+    """
+
+    def __init__(
+        self,
+        participant: Participant,
+        config: Config,
+        landmarks: LandmarkMap | None,
+        state: Path | None = None,
+    ) -> None:
+        """Announce the outputs; input is looked for by `run`.
+
+        Args:
+            participant: on the wire.
+            config: all settings.
+            landmarks: the map; None: landmarks are estimated.
+            state: as `Live` has it.
+        """
+        self.live: Live | None = None
+        self._config = config
+        self._landmarks = landmarks
+        self._state = state
+        self.watch: Callable[[Event], None] | None = None
+        self._subscribers: list[Callable[[Estimate], None]] = [self._on_estimate]
+        self._clock = WireClock(participant)
+        self._outputs = Outputs(participant)
+        self._odom = OdomFrame(config.recording)
+        self.intake = Intake(participant, self._clock, config.recording, self._push)
+        self.published: Counter[str] = Counter()
+        self._messages = participant.messages
+        self._failure: FglocError | None = None
+        self._notes: list[str] = []  # to be told
+        self._stopping = threading.Event()
+        self._last_ns = 0  # stamp of the last odometry published
+        self._last_odom_ns = 0
+        if landmarks is not None:
+            self._outputs.map(landmarks)
+        participant.read(_INITIAL_POSE, _INITIAL_POSE_TYPE, self._on_initial_pose)
+
+    def close(self) -> None:
+        """End the run, and save its state."""
+        if self.live is not None:
+            self.live.close()
+
+    def subscribe(self, callback: Callable[[Estimate], None]) -> None:
+        """As `Live.subscribe`; call it before `run`."""
+        self._subscribers.append(callback)
+
+    def run(self, stop: threading.Event, tell: Callable[[str], None]) -> None:
+        """Localise until `stop` is set.
+
+        Args:
+            stop: ends it within a fraction of a second.
+            tell: given what the user should know, one sentence at a time, each once.
+
+        Raises:
+            FglocError: what comes in cannot be used.
+        """
+        publishing: threading.Thread | None = None
+        teller = Teller(tell)
+        next_diagnostics_s = time.monotonic()
+        try:
+            while not stop.wait(_POLL_S):
+                if self._failure is not None:
+                    raise self._failure
+                teller.waiting(self.intake.find())
+                if self.live is None and self.intake.roles:
+                    self._start()
+                    publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
+                    publishing.start()
+                for role, topic in self.intake.subscribe():
+                    teller.tell(f"Subscribed: {topic} ({role}).")
+                status = None if self.live is None else self.live.status()
+                if status is not None:
+                    teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
+                    teller.tell(*status.notes)
+                teller.tell(*self._take_notes())
+                if time.monotonic() >= next_diagnostics_s:
+                    next_diagnostics_s = time.monotonic() + 1.0
+                    self._diagnose(status)
+        finally:
+            self._stopping.set()
+            if publishing is not None:
+                publishing.join()
+
+    def _start(self) -> None:
+        """The topics are known: whose first messages come soon belongs to the run from its beginning."""
+        self.live = Live(self._config, self._landmarks, state=self._state, roles=self.intake.roles.keys())
+        self._recent = RecentPoses(self.live.pose_at)
+        for callback in self._subscribers:
+            self.live.subscribe(callback)
+
+    def _push(self, event: Event) -> None:
+        self._odom.add(event)
+        if self.watch is not None:
+            self.watch(event)
+        assert self.live is not None  # nothing is read before
+        try:
+            self.live.push(event)
+        except FglocError as error:
+            self._failure = error
+
+    def _on_estimate(self, estimate: Estimate) -> None:
+        self._outputs.pose(estimate)
+        self.published["pose"] += 1
+
+    def _on_initial_pose(self, sample: Sample) -> None:
+        message = self._messages.decode(sample.message_type, sample.cdr)
+        frame = message.header.frame_id.lstrip("/")
+        if frame not in ("", MAP_FRAME):
+            self._notes.append(f"{_INITIAL_POSE} is in frame {frame!r}, expected {MAP_FRAME!r}: not used.")
+            return
+        if self.live is None:
+            self._notes.append(f"{_INITIAL_POSE} came before the robot's topics: not used.")
+            return
+        pose, variances = message.pose.pose, np.asarray(message.pose.covariance)[[0, 7, 35]]
+        if not (variances > 0.0).all():
+            variances = np.square(self._config.estimator.initial_sigmas)
+        q = pose.orientation
+        yaw = quaternion_yaw((q.x, q.y, q.z, q.w))
+        try:
+            self.live.reset_pose((pose.position.x, pose.position.y, yaw), np.sqrt(variances).tolist())
+        except FglocError as error:
+            self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
+
+    def _take_notes(self) -> list[str]:
+        notes, self._notes = self._notes, []
+        return notes
+
+    def _publish(self) -> None:
+        """At `RATE_HZ` until the end; a turn that comes too late is left out."""
+        period_s = 1.0 / RATE_HZ
+        due = time.monotonic()
+        while not self._stopping.is_set():
+            due = max(due + period_s, time.monotonic())
+            try:
+                self._publish_once()
+            except FglocError as error:
+                self._failure = error
+                return
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _publish_once(self) -> None:
+        assert self.live is not None
+        now = self.live.pose_at(self._clock.now_ns()) or self.live.pose_at()
+        if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
+            return
+        self._last_ns = now.stamp_ns
+        self._recent.add(now)
+        base, odom = self._odom.base, self._odom.latest()
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, self._recent.twist()), base)
+        self.published["odometry"] += 1
+        if odom is None:
+            self._outputs.transform(now.stamp_ns, now.pose, base)
+        elif odom.stamp_ns != self._last_odom_ns and (then := self._recent.at(odom.stamp_ns)) is not None:
+            self._last_odom_ns = odom.stamp_ns
+            self._outputs.transform(odom.stamp_ns, odom_in_map(then, odom.T_odom_base), odom.frame)
+
+    def _diagnose(self, status: LiveStatus | None) -> None:
+        mode = None if status is None else status.mode
+        message, values = described(status)
+        self._outputs.diagnostics(self._clock.now_ns(), mode, message, values)
+        self.published["diagnostics"] += 1
+
+
+def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
+    """A status as a message and its values, for diagnostics."""
+    if status is None:
+        return "waiting for the robot's topics", {}
+    values = {"keyframes": str(status.keyframes), "update [ms]": f"{status.step_ms:.1f}"}
+    values["keyframe delay [s]"] = f"{status.reordering_s:.3f}"
+    for topic, of in status.topics.items():
+        values[f"{of.role} topic"] = topic
+        values[f"{of.role} rate [Hz]"] = f"{of.rate_hz:.1f}"
+        values[f"{of.role} delay [s]"] = f"{of.delay_s:.3f}"
+    values |= {f"dropped {role}": str(n) for role, n in status.dropped.items()}
+    values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
+    values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}
+    if status.mode is not None:
+        return str(status.mode), values
+    return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values

@@ -1,0 +1,263 @@
+"""A participant on ROS 2's wire: finds publications, writes and reads messages as CDR.
+
+cyclonedds is imported late: it comes with the extra ``live``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
+
+from fgloc.errors import WireError
+from fgloc.live.wire.dds_types import cdr_type
+from fgloc.live.wire.names import dds_topic, ros_topic, ros_type
+from fgloc.recording.cdr import Messages
+
+if TYPE_CHECKING:
+    from cyclonedds.domain import Domain
+
+_LOOPBACK = """<CycloneDDS><Domain>
+<General><Interfaces><NetworkInterface address="127.0.0.1" multicast="true"/></Interfaces>
+<AllowMulticast>spdp</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+"""ROS 2 does the same when told to stay on one machine (32: its rmw's limit of processes that find one another)."""
+
+_SENT_DEPTH = 200  # messages of a topic that wait for readers: 1 s of a fast sensor
+_READ_DEPTH = 2000  # messages of a topic that wait for the reading thread: 10 s of it, on a busy machine
+_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
+_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_BATCH = 200  # messages taken from a reader at once
+_LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static transform may be one
+_BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
+_MOST_PASSES = 20  # over the readers before their messages are delivered
+_WAIT_S = 60.0  # the reading thread waits this long for messages, then again
+
+_domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
+_domains_lock = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """A topic that someone else publishes."""
+
+    topic: str
+    message_type: str  # "pkg/msg/Name"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One message as it came in."""
+
+    topic: str
+    message_type: str
+    cdr: bytes
+    source_ns: int  # when it was written, by its writer's clock
+
+
+OnSample = Callable[[Sample], None]
+
+
+class Writer:
+    """Publishes messages on one topic."""
+
+    def __init__(self, writer: Any, kind: type[Any]) -> None:
+        self._writer = writer
+        self._kind = kind
+
+    def write(self, cdr: bytes, source_ns: int | None = None) -> None:
+        """Send one message; ``source_ns``: the time that readers see as that of writing; None: now."""
+        self._writer.write(self._kind(cdr), timestamp=source_ns)
+
+    @property
+    def readers(self) -> int:
+        """How many readers there are."""
+        return len(self._writer.get_matched_subscriptions())
+
+    def flush(self, timeout_s: float) -> None:
+        """Wait until all reliable readers have acknowledged everything."""
+        try:
+            self._writer.wait_for_acks(round(timeout_s * 1e9))
+        except Exception:  # cyclonedds 11.0.1 raises AttributeError where it means a timeout
+            return
+
+
+class Participant:
+    """A DDS participant. Close it, or use it in a ``with``."""
+
+    def __init__(self, domain: int = 0, network: bool = False, messages: Messages | None = None) -> None:
+        """Join a domain.
+
+        Args:
+            domain: as ROS_DOMAIN_ID.
+            network: on all the machine's networks, or as CYCLONEDDS_URI has it; else only on loopback.
+            messages: message types; None: ROS 2 Humble's.
+
+        Raises:
+            WireError: cyclonedds is not installed, or there is no such domain.
+        """
+        if not 0 <= domain <= 232:
+            raise WireError(f"domain {domain}: expected 0 to 232, as ROS_DOMAIN_ID")
+        try:
+            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+            from cyclonedds.core import DDSException, GuardCondition, WaitSet
+            from cyclonedds.domain import DomainParticipant
+        except ImportError as error:
+            raise WireError(f"cyclonedds cannot be loaded ({error}); install it: pip install 'fgloc[live]'") from error
+        self.messages = Messages() if messages is None else messages
+        try:
+            self._domain = None if network else _loopback(domain)
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise WireError(f"DDS does not start in domain {domain}: {error.msg}") from error
+        self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._publications: dict[object, Publication] = {}
+        self._topics: dict[str, Any] = {}
+        self._readers: list[tuple[Any, Publication, OnSample]] = []
+        self._entering: list[tuple[Any, Publication, OnSample]] = []
+        self._failure: Exception | None = None
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._changed = GuardCondition(self._participant)
+        self._waiting = WaitSet(self._participant)
+        self._waiting.attach(self._changed)
+        self._thread = threading.Thread(target=self._read, name="fgloc-wire", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Participant:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the domain. Nothing is delivered afterwards."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        self._changed.set(True)
+        self._thread.join()
+        self._readers.clear()
+        self._entering.clear()
+        self._topics.clear()
+        del self._waiting, self._changed, self._found, self._participant, self._domain
+
+    def publications(self) -> tuple[Publication, ...]:
+        """What others publish now, by name.
+
+        Raises:
+            WireError: a message of a topic that is read could not be taken in.
+        """
+        if self._failure is not None:
+            raise WireError(f"a message could not be taken in: {self._failure!r}") from self._failure
+        from cyclonedds.core import InstanceState
+
+        for endpoint in self._found.take(1000):
+            key = endpoint.sample_info.instance_handle
+            if endpoint.sample_info.instance_state != InstanceState.Alive:
+                self._publications.pop(key, None)
+            elif endpoint.participant_key != self._participant.guid:
+                topic, kind = ros_topic(endpoint.topic_name), ros_type(endpoint.type_name)
+                if topic is not None and kind is not None:
+                    self._publications[key] = Publication(topic, kind)
+        return tuple(sorted(set(self._publications.values()), key=lambda p: (p.topic, p.message_type)))
+
+    def writer(self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None) -> Writer:
+        """A reliable writer; a latched one gives late readers what was written before (transient local)."""
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.qos import Policy, Qos
+
+        entity = self._topic(topic, message_type, messages or self.messages)
+        qos = Qos(
+            Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)),
+            Policy.History.KeepLast(_SENT_DEPTH),
+            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+            Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        return Writer(DataWriter(self._participant, entity, qos=qos), entity.data_type)
+
+    def read(self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False) -> None:
+        """Deliver a topic's messages from now on, in a thread of this object's.
+
+        Quality of service is that of sensor data (best effort), which every publisher offers; of a latched topic
+        reliable and transient local.
+        """
+        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+        from cyclonedds.qos import Policy, Qos
+        from cyclonedds.sub import DataReader
+
+        entity = self._topic(topic, message_type, self.messages)
+        qos = Qos(
+            Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)) if latched else Policy.Reliability.BestEffort,
+            Policy.History.KeepLast(_LARGE_DEPTH if message_type in _LARGE else _READ_DEPTH),
+            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.IgnoreLocal.Participant,  # what we publish is no input
+        )
+        reader = DataReader(self._participant, entity, qos=qos)
+        unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
+        with self._lock:
+            self._entering.append(((reader, unread), Publication(topic, message_type), on_sample))
+        self._changed.set(True)
+
+    def _topic(self, topic: str, message_type: str, messages: Messages) -> Any:
+        from cyclonedds.core import DDSException
+        from cyclonedds.topic import Topic
+
+        if topic not in self._topics:
+            kind = cdr_type(message_type, messages.layout(message_type))
+            try:
+                self._topics[topic] = Topic(self._participant, dds_topic(topic), kind)
+            except DDSException as error:
+                raise WireError(f"{topic} ({message_type}): DDS refuses the topic: {error.msg}") from error
+        return self._topics[topic]
+
+    def _read(self) -> None:
+        while not self._closing.is_set():
+            with self._lock:
+                entering, self._entering = self._entering, []
+            for entry in entering:
+                self._waiting.attach(entry[0][1])
+                self._readers.append(entry)
+            self._waiting.wait(round(_WAIT_S * 1e9))
+            self._changed.take()
+            self._deliver()
+
+    def _deliver(self) -> None:
+        """What waits in all readers, in the order of writing.
+
+        Taken again until nothing more has come: a reader's newest message would else overtake older ones of readers
+        that were looked at before it.
+        """
+        found: list[tuple[int, int, Sample, OnSample]] = []
+        for _ in range(_MOST_PASSES):
+            before = len(found)
+            for (reader, _), publication, on_sample in self._readers:
+                for message in reader.take(_BATCH):
+                    if message.sample_info.valid_data:
+                        source_ns = message.sample_info.source_timestamp
+                        sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
+                        found.append((source_ns, len(found), sample, on_sample))
+            if len(found) == before:
+                break
+        for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):
+            try:
+                on_sample(sample)
+            except Exception as error:  # told by the next call; the other topics go on
+                self._failure = self._failure or error
+
+
+def _loopback(domain: int) -> Domain:
+    """The domain's settings, which all its participants in this process share."""
+    from cyclonedds.domain import Domain
+
+    with _domains_lock:
+        known = _domains.get(domain)
+        if known is None:
+            known = _domains[domain] = Domain(domain, _LOOPBACK)
+        return known

@@ -1,0 +1,87 @@
+"""A command in a process of its own, with limits on memory and time."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+_ADDRESS_SPACE = 8 << 30  # of a process, most of which libraries reserve and never touch
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a process ended."""
+
+    code: int  # negative: killed by this signal
+    stdout: str
+    stderr: str
+    seconds: float  # processor time
+    peak_mb: float
+    timed_out: bool
+
+    def failures(self, codes: Sequence[int] = (0, 1, 3), peak_mb: float = 1000.0) -> list[str]:
+        """What a user should never see."""
+        found = ["hangs"] if self.timed_out else []
+        if not found and self.code not in codes:
+            found.append(f"exit code {self.code}")
+        if "Traceback" in self.stderr:
+            found.append("traceback: " + self.stderr.strip().splitlines()[-1])
+        if self.peak_mb > peak_mb:
+            found.append(f"{self.peak_mb:.0f} MB")
+        return found
+
+
+def run(arguments: Sequence[str], seconds: float = 20.0) -> Done:
+    """Run ``python ARGUMENTS``; it is killed after this much processor time, or three times as much on the wall."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 1))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        process = subprocess.Popen(
+            [sys.executable, *arguments],
+            stdout=out,
+            stderr=err,
+            stdin=subprocess.DEVNULL,
+            preexec_fn=limit,
+            env=environment,
+            cwd=tempfile.gettempdir(),
+        )
+        late = threading.Event()
+
+        def kill() -> None:
+            late.set()
+            process.kill()
+
+        timer = threading.Timer(3.0 * seconds, kill)
+        timer.start()
+        _, status, usage = os.wait4(process.pid, 0)
+        timer.cancel()
+        process.returncode = code = os.waitstatus_to_exitcode(status)
+        out.seek(0)
+        err.seek(0)
+        used = usage.ru_utime + usage.ru_stime
+        return Done(
+            code,
+            out.read().decode(errors="replace"),
+            err.read().decode(errors="replace"),
+            used,
+            usage.ru_maxrss / 1024.0,
+            late.is_set() or (code < 0 and used >= seconds),
+        )
+
+
+def fgloc(*arguments: object, seconds: float = 20.0) -> Done:
+    """Run a command of fgloc."""
+    return run(["-m", "fgloc.cli", *map(str, arguments)], seconds)

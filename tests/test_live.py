@@ -1,0 +1,354 @@
+"""A live run: the same poses as a replay, poses between keyframes, threads, overload, sensors that join later."""
+
+import subprocess
+import sys
+import threading
+import time
+from itertools import takewhile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from event_makers import joints
+from live_feed import PATIENCE_S, errors, feed, live_in
+from robot_world import CAMERA, START_NS, World, beacons, config, nees, room, truth_at
+from world_bags import write_world
+
+import fgloc
+from fgloc.config import Config, load_config, yaml_of
+from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
+from fgloc.live import Live
+from fgloc.recording.reader import open_recording
+from fgloc.runner import run
+from fgloc.sensors.markers import MarkerDetector
+from fgloc.types import ImageEvent, ImuEvent, Mode
+
+SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
+WAITED_S = 0.3  # what a slow detector of these tests takes
+
+
+def until(seconds, events):
+    """Events of the first seconds."""
+    held = list(events)
+    return list(takewhile(lambda e: e.received_ns < held[0].received_ns + seconds * 1e9, held))
+
+
+def test_live_is_public():
+    assert fgloc.Live is Live
+    with pytest.raises(AttributeError, match="Alive"):
+        _ = fgloc.Alive
+
+
+def test_poses_are_those_of_a_replay_bit_by_bit(tmp_path):
+    bag = write_world(tmp_path, World(room(), seconds=8.0))
+    settings = config()
+    replayed = run(bag, tmp_path / "map.yaml", settings, "online", check=False).trajectory
+    with open_recording(bag, settings.recording) as recording:
+        with Live(settings, tmp_path / "map.yaml", roles=recording.roles) as live:
+            made = feed(live, recording.events())
+        assert len(made) == len(replayed) - 1 or len(made) >= len(replayed) - 3  # the last ones come at the end
+        for estimate, stamp, pose, cov in zip(made, replayed.stamps_ns, replayed.poses, replayed.covs, strict=False):
+            assert estimate.stamp_ns == stamp
+            assert (estimate.pose == pose).all()
+            assert (estimate.cov == cov).all()
+
+
+def test_images_give_the_poses_of_a_replay_bit_by_bit():
+    """With images, a gyro and the learned motion; asked for poses meanwhile, which must change nothing."""
+    sample = SAMPLES / "installed_run"
+    settings = load_config(sample / "robot.yaml")
+    replayed = {}
+    run(
+        sample / "bag",
+        sample / "map.yaml",
+        settings,
+        "online",
+        on_step=lambda step, e: replayed.update({} if e is None else {step.stamp_ns: e}),
+        events=lambda events: iter(until(6.0, events)),
+    )
+    made = []
+    with open_recording(sample / "bag", settings.recording) as recording:
+        events, roles = until(6.0, recording.events()), recording.roles
+    with Live(settings, sample / "map.yaml", roles=roles) as live:
+        live.subscribe(made.append)
+        for k, event in enumerate(events):
+            live.push(event)
+            if isinstance(event, ImageEvent):
+                assert live.wait(PATIENCE_S)
+            elif k % 20 == 0:
+                live.pose_at()
+        assert live.wait(PATIENCE_S)
+        assert live.status().dropped == {}
+    assert len(made) > 25
+    assert all((e.pose == replayed[e.stamp_ns].pose).all() for e in made)
+
+
+def test_poses_between_keyframes_are_as_good_as_their_covariance_says():
+    world = World(room(), seed=3, seconds=12.0, rate=5)
+    told = []
+    with live_in(world) as live:
+        for event in world.events():
+            live.push(event)
+            live.wait(PATIENCE_S)
+            pose = live.pose_at()
+            if pose is not None:
+                told.append((pose, world.truth(pose.stamp_ns)))
+    beyond = [(p, t) for p, t in told if p.stamp_ns > p.keyframe_ns]
+    assert len(beyond) > 100
+    assert max(p.stamp_ns - p.keyframe_ns for p, _ in beyond) > 0.1e9
+    assert np.mean([np.hypot(*(p.pose - t)[:2]) for p, t in beyond]) < 0.03
+    assert 0.2 < np.mean([nees(p, t) for p, t in beyond]) / 3.0 < 2.0
+
+
+def test_the_covariance_grows_with_the_time_beyond_the_last_message():
+    world = World(room(), seconds=6.0, rate=5)
+    with live_in(world) as live:
+        last = feed(live, world.events())[-1]
+        newest = live.pose_at().stamp_ns
+        ahead = [live.pose_at(newest + round(s * 1e9)) for s in (0.0, 0.3, 0.6, 1.5, 3.0)]
+        assert live.pose_at(newest + 60_000_000_000) is None
+        assert live.pose_at(last.stamp_ns - 60_000_000_000) is None
+        past = live.pose_at(last.stamp_ns - 1_000_000_000)
+    traces = [np.trace(p.cov[:2, :2]) for p in ahead]
+    assert traces == sorted(traces)
+    assert traces[-1] > 10.0 * traces[0]
+    assert [p.mode for p in ahead] == [Mode.OK] * 4 + [Mode.DEAD_RECKONING]
+    assert past.keyframe_ns <= past.stamp_ns < last.stamp_ns
+    assert np.hypot(*(past.pose - world.truth(past.stamp_ns))[:2]) < 0.05
+
+
+def test_many_threads_may_push_and_ask():
+    world = World(room(), seconds=4.0, rate=5)
+    events = world.events()
+    kinds = [[e for e in events if e.topic == topic] for topic in ("/odom", "/cmd_vel", "/tags")]
+    asked, failed = [], []
+
+    def push(live, some):
+        try:
+            for event in some:
+                live.push(event)
+                asked.append(live.pose_at())
+                live.status()
+        except Exception as error:
+            failed.append(error)
+
+    with live_in(world) as live:
+        threads = [threading.Thread(target=push, args=(live, some)) for some in kinds]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(PATIENCE_S)
+        assert live.wait(PATIENCE_S)
+        status = live.status()
+    assert not failed
+    assert {topic: t.count for topic, t in status.topics.items()} == {k[0].topic: len(k) for k in kinds}
+    assert status.queued_events == status.queued_images == 0
+
+
+def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
+    sample = SAMPLES / "first_run"
+    settings = load_config(sample / "robot.yaml")
+    seen = []
+    detect = MarkerDetector.detect
+
+    def slowly(self, event):
+        time.sleep(WAITED_S)
+        seen.append(event.stamp_ns)
+        return detect(self, event)
+
+    monkeypatch.setattr(MarkerDetector, "detect", slowly)
+    with open_recording(sample / "bag", settings.recording) as recording:
+        events = until(4.0, recording.events())
+        images = [e.stamp_ns for e in events if isinstance(e, ImageEvent)]
+        with Live(settings, sample / "map.yaml", roles=recording.roles, image_queue=3) as live:
+            began = time.perf_counter()
+            for event in events:
+                live.push(event)
+                assert live.status().queued_images <= 4  # three wait, one is looked at
+            assert time.perf_counter() - began < 0.5 * len(images) * WAITED_S
+            assert live.wait(PATIENCE_S)
+            status = live.status()
+    assert status.dropped["image"] == len(images) - len(seen) > 5
+    assert seen == sorted(seen)
+    assert seen[-3:] == images[-3:]
+
+
+def test_a_subscriber_that_fails_is_named_and_left_out():
+    world = World(beacons(), seconds=5.0)
+    called = []
+
+    def fails(estimate):
+        called.append(estimate)
+        raise ZeroDivisionError("of theirs")
+
+    with live_in(world) as live:
+        live.subscribe(fails)
+        made = feed(live, world.events())
+        notes = live.status().notes
+    assert len(called) == 1
+    assert len(made) > 20
+    assert [n for n in notes if "a subscriber failed" in n and "ZeroDivisionError: of theirs" in n]
+
+
+def test_what_cannot_be_used_is_told_by_the_next_call():
+    names = ("left_wheel", "left_wheel_rear")
+    settings = config(wheels={"source": "ticks", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3})
+    live = Live(settings, beacons(), roles=("joints",))
+    events = [joints(1.0 + 0.02 * k, 0.0, 0.0, names=names) for k in range(200)]
+    with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
+        feed(live, events)
+    with pytest.raises(ConfigError):
+        live.pose_at()
+    live.close()
+
+
+def test_a_wrong_file_is_refused_at_once(tmp_path):
+    (tmp_path / "no.safetensors").write_bytes(b"nothing")
+    settings = Config.model_validate({"motion": {"model": tmp_path / "no.safetensors"}})
+    with pytest.raises(ModelError):
+        Live(settings, beacons())
+
+
+def test_after_close_nothing_more_is_taken():
+    world = World(beacons(), seconds=3.0)
+    events = world.events()
+    with live_in(world) as live:
+        feed(live, events)
+    live.close()
+    with pytest.raises(EstimatorError, match="closed"):
+        live.push(events[-1])
+    assert live.pose_at() is not None
+    assert not [t for t in threading.enumerate() if t.name.startswith("fgloc-")]
+
+
+def test_a_gyro_that_begins_later_joins_without_losing_the_pose():
+    world = World(room(), seconds=8.0)
+    events = world.events()
+    rate = np.array([0.0, 0.0, 0.33])
+    for k in range(400, 800):
+        stamp = START_NS + k * 10_000_000
+        events.append(ImuEvent(stamp, stamp, "/imu", "base_link", rate, np.zeros(3), np.zeros((3, 3))))
+    with live_in(world) as live:
+        made = feed(live, sorted(events, key=lambda e: e.received_ns))
+        status = live.status()
+        assert live._run.parts.localizer.sources.gyro is not None
+    after = [e for e in made if e.stamp_ns > START_NS + 4_000_000_000]
+    assert {e.mode for e in after} == {Mode.OK}
+    assert errors(world, after).max() < 0.06
+    assert status.waiting_for == ()
+
+
+def test_without_roles_the_run_begins_after_a_while_and_a_calibration_may_come_later():
+    world = World(room(), seconds=6.0)
+    with Live(config(), world.map, startup_s=1.0) as live:
+        feed(live, until(0.5, world.events()))
+        early = live.status()
+        assert not early.running
+        assert any("no CameraInfo yet" in what for what in early.waiting_for)
+        feed(live, world.events()[len(until(0.5, world.events())) : len(until(3.0, world.events()))])
+        assert live.status().running
+        assert live.status().mode is None
+        live.camera_info(640, 480, CAMERA.K, np.zeros(4), frame_id="cam")
+        live.transform("base_link", "cam", CAMERA.T_base_cam[:3, 3], [-0.5, 0.5, -0.5, 0.5])
+        made = feed(live, world.events()[len(until(3.0, world.events())) :])
+        assert live.status().waiting_for == ()
+    assert made[-1].mode is Mode.OK
+    assert errors(world, made[-10:]).max() < 0.06
+
+
+def test_a_pose_that_is_told_is_taken_and_sightings_win_over_a_wrong_one():
+    world = World(room(), seconds=9.0)
+    events = world.events()
+    dark, light = until(3.0, events), events[len(until(3.0, events)) :]
+    with live_in(world, roles=("odometry", "command")) as live:
+        feed(live, [e for e in dark if e.topic != "/tags"])
+        live.reset_pose(truth_at(3.0), (0.1, 0.1, 0.1))
+        made = feed(live, until(1.0, [e for e in light if e.topic != "/tags"]))
+        assert errors(world, made[-1:]).max() < 0.2
+        live.reset_pose((2.0, 2.0, 3.0), (0.05, 0.05, 0.05))
+        made = feed(live, light[len(until(1.0, light)) :])
+        assert any("jumped" in note for note in live.status().notes)
+    assert errors(world, made[-10:]).max() < 0.06
+    assert made[-1].mode is Mode.OK
+
+
+def test_a_pose_that_is_none_is_refused():
+    with Live(config(), beacons()) as live:
+        for pose, sigmas in (((0.0, 0.0), (1.0, 1.0, 1.0)), ((0.0, 0.0, np.nan), (1, 1, 1)), ((0, 0, 0), (1, 0, 1))):
+            with pytest.raises(EstimatorError, match="expected three finite values"):
+                live.reset_pose(pose, sigmas)
+
+
+def test_events_may_be_told_in_plain_numbers():
+    """A loop of one's own: ranges to beacons, odometry and a command; then corners and images."""
+    landmarks = beacons()
+    with Live(config(), landmarks, roles=("odometry", "sightings")) as live:
+        for event in World(landmarks, seconds=4.0).events():
+            if event.topic == "/odom":
+                x, y, yaw = truth_at((event.stamp_ns - START_NS) * 1e-9)
+                live.odometry(event.stamp_ns, (x, y, yaw), (event.linear[0], 0.0, event.angular[2]))
+                live.imu(event.stamp_ns, event.angular)
+            elif event.topic == "/cmd_vel":
+                live.command(event.stamp_ns, event.v, event.omega)
+            else:
+                live.ranges(event.stamp_ns, [(s.landmark_id, s.range_m, s.bearing_rad) for s in event.sightings])
+        assert live.wait(PATIENCE_S)
+        pose = live.pose_at()
+        assert np.hypot(*(pose.pose - truth_at((pose.stamp_ns - START_NS) * 1e-9))[:2]) < 0.15
+        assert set(live.status().topics) == {"odometry", "imu", "command", "sightings"}
+        with pytest.raises(RecordingError, match=r"image of shape \(4, 4\) and type float64"):
+            live.image(1, np.zeros((4, 4)))
+
+
+def test_images_may_be_arrays_or_files():
+    sample = SAMPLES / "first_run"
+    settings = load_config(sample / "robot.yaml")
+    with open_recording(sample / "bag", settings.recording) as recording:
+        events, roles = until(3.0, recording.events()), recording.roles
+    forms = (
+        lambda data: data.tobytes(),
+        lambda data: cv2.imdecode(data, cv2.IMREAD_GRAYSCALE),
+        lambda data: np.dstack([cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)] * 3),
+    )
+    poses = []
+    for form in forms:
+        with Live(settings, sample / "map.yaml", roles=roles) as live:
+            for event in events:
+                if isinstance(event, ImageEvent):
+                    live.image(event.stamp_ns, form(event.data), event.frame_id)
+                    assert live.wait(PATIENCE_S)
+                else:
+                    live.push(event)
+            assert live.wait(PATIENCE_S)
+            poses.append(live.pose_at())
+    assert poses[0].mode is Mode.OK
+    assert np.allclose([p.pose for p in poses[1:]], poses[0].pose, atol=2e-3)
+
+
+def test_the_status_says_how_the_topics_come_in():
+    world = World(room(), seconds=6.0, late_s=0.04)
+    events = [e for e in world.events() if e.topic != "/cmd_vel" or e.stamp_ns < START_NS + 2_000_000_000]
+    with live_in(world) as live:
+        feed(live, events)
+        status = live.status()
+    assert status.topics["/odom"].rate_hz == pytest.approx(20.0, rel=0.05)
+    assert status.topics["/tags"].delay_s == pytest.approx(0.04, abs=0.005)
+    assert status.topics["/tags"].role == "sightings"
+    assert "/cmd_vel: silent for 4 s" in status.notes
+    assert status.mode is Mode.OK
+    assert status.running
+    assert 0.0 < status.step_ms <= status.step_ms_max
+    assert 0.0 <= status.reordering_s < 0.2
+    assert status.keyframes > 30
+
+
+def test_the_example_runs(tmp_path):
+    """On a short drive: the bundled one takes longer."""
+    write_world(tmp_path, World(room(), seconds=8.0, rate=5))
+    (tmp_path / "robot.yaml").write_text(yaml_of(config(), tmp_path), encoding="utf-8")
+    example = Path(__file__).parent.parent / "examples" / "live_loop.py"
+    assert len(example.read_text(encoding="utf-8").splitlines()) < 40
+    done = subprocess.run([sys.executable, example, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [line for line in done.stdout.splitlines() if line.endswith(" OK")]

@@ -1,0 +1,246 @@
+"""Saved and resumed: the pose goes on over the time away, and what is damaged or foreign is refused."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_feed import ROLES, errors, feed, live_in
+from robot_world import START_NS, World, beacons, config, nees, room
+
+from fgloc.errors import OutputError
+from fgloc.live import Live
+from fgloc.live.state import fingerprint, read_state
+from fgloc.types import ImuEvent, Mode, OdometryEvent
+
+GAP = (6.0, 9.0)  # s, nothing listens
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(room(), seed=4, seconds=12.0)
+
+
+def between(world, start, end):
+    """The events of a time [s]."""
+    return [e for e in world.events() if start <= (e.received_ns - START_NS) * 1e-9 < end]
+
+
+@pytest.fixture(scope="module")
+def saved(world, tmp_path_factory):
+    """State after the first part of the drive."""
+    path = tmp_path_factory.mktemp("state") / "state.json"
+    with live_in(world, state=path) as live:
+        feed(live, between(world, 0.0, GAP[0]))
+    return path
+
+
+def resumed(world, path, events, **options):
+    """A second run from that state, and its notes."""
+    with live_in(world, state=path, **options) as live:
+        made = feed(live, events)
+        notes = live.status().notes
+    return made, notes
+
+
+def copied(path, tmp_path):
+    """The state, to be written over."""
+    target = tmp_path / "state.json"
+    target.write_bytes(path.read_bytes())
+    return target
+
+
+def test_while_the_odometry_goes_on_it_tells_the_motion_of_the_gap(world, saved, tmp_path):
+    blind = [e for e in between(world, GAP[1], 10.0) if e.topic != "/tags"]
+    made, notes = resumed(world, copied(saved, tmp_path), blind, roles=("odometry", "command"))
+    assert "the odometry went on and tells the motion since" in notes[0]
+    assert errors(world, made[:1])[0] < 0.1
+    assert made[0].mode is Mode.OK
+    assert nees(made[0], world.truth(made[0].stamp_ns)) < 12.0
+    before = np.array(read_state(saved, fingerprint(world.map)).state.cov)
+    assert np.trace(made[0].cov) > 2.0 * np.trace(before)
+
+
+def test_with_sightings_it_goes_on_without_a_search(world, saved, tmp_path):
+    made, notes = resumed(world, copied(saved, tmp_path), between(world, GAP[1], 12.0))
+    assert {e.mode for e in made} == {Mode.OK}
+    assert made[0].stamp_ns - START_NS < (GAP[1] + 0.3) * 1e9
+    assert errors(world, made[1:]).max() < 0.08
+    assert not [n for n in notes if "jumped" in n]
+
+
+def test_an_odometry_that_was_set_to_zero_tells_nothing(world, saved, tmp_path):
+    """It begins anew at the origin: taken at its word, it would put the robot back to where its frame began."""
+
+    def zeroed(event):
+        if not isinstance(event, OdometryEvent):
+            return event
+        moved = np.array([0.01 * (event.stamp_ns * 1e-9 - START_NS * 1e-9 - GAP[1]), 0.0, 0.0])
+        return dataclasses.replace(event, position=moved, orientation=np.array([0.0, 0.0, 0.0, 1.0]))
+
+    events = [zeroed(e) for e in between(world, GAP[1], 12.0)]
+    made, notes = resumed(world, copied(saved, tmp_path), events)
+    assert "nothing tells the motion since" in notes[0]
+    assert errors(world, made[5:]).max() < 0.1
+    assert made[-1].mode is Mode.OK
+
+
+def test_after_a_long_time_the_map_is_searched(world, saved, tmp_path):
+    """The robot was switched off overnight and carried; its odometry begins anew."""
+    night = 36_000_000_000_000
+
+    def next_day(event):
+        later = dict(stamp_ns=event.stamp_ns + night, received_ns=event.received_ns + night)
+        fresh = dict(frame_id="odom_2") if isinstance(event, OdometryEvent) else {}
+        return dataclasses.replace(event, **later, **fresh)
+
+    made, notes = resumed(world, copied(saved, tmp_path), [next_day(e) for e in between(world, 2.0, 6.0)])
+    assert "the pose is searched for on the whole map" in notes[0]
+    back = [dataclasses.replace(e, stamp_ns=e.stamp_ns - night) for e in made]
+    assert errors(world, back[-10:]).max() < 0.06
+
+
+def test_a_robot_that_was_carried_away_meanwhile_is_found_again(world, saved, tmp_path):
+    """The odometry saw nothing of it: sightings contradict the resumed pose, and win."""
+    carried = dataclasses.replace(world, kidnap_s=GAP[1])
+    still = [e for e in between(carried, GAP[1], 12.0) if not isinstance(e, OdometryEvent)]
+    still += [e for e in between(world, GAP[1], 12.0) if isinstance(e, OdometryEvent)]
+    made, notes = resumed(carried, copied(saved, tmp_path), sorted(still, key=lambda e: e.received_ns))
+    assert errors(carried, made[-10:]).max() < 0.06
+    assert [n for n in notes if "jumped by" in n]
+
+
+def test_what_was_learned_goes_on(world, tmp_path):
+    """The gyro's bias, the installation, and a landmark that does not stand where the map has it."""
+    events = between(world, 0.0, 6.0)
+    rate = np.array([0.0, 0.0, 0.33 + 0.05])
+    for k in range(600):
+        stamp = START_NS + k * 10_000_000
+        events.append(ImuEvent(stamp, stamp, "/imu", "base_link", rate, np.zeros(3), np.zeros((3, 3))))
+    path, roles = tmp_path / "state.json", (*ROLES, "imu")
+    with live_in(world, state=path, roles=roles) as live:
+        feed(live, sorted(events, key=lambda e: e.received_ns))
+        live._run.parts.localizer.association.exclusion.exclude(13, np.array([0.4, -0.1]))
+        gyro = live._run.parts.localizer.sources.gyro
+        installed = live._run.parts.localizer.estimator.installed
+    assert gyro.bias > 0.02
+    with live_in(world, state=path, roles=roles) as live:
+        feed(live, [e for e in events if (e.received_ns - START_NS) * 1e-9 < 0.3])
+        parts = live._run.parts
+        assert parts.localizer.sources.gyro.bias == pytest.approx(gyro.bias, abs=0.01)
+        assert parts.localizer.association.exclusion.excludes(13)
+        now = np.diag(parts.localizer.estimator.installed.cov)
+        assert (now <= np.diag(installed.cov) * (1.0 + 1e-6) + 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (lambda text: text[: len(text) // 2], "no saved state"),
+        (lambda text: "", "no saved state"),
+        (lambda text: "[1, 2]", "no saved state"),
+        (lambda text: text.replace("0.", "1.", 1), "its checksum does not fit"),
+        (lambda text: json.dumps({"state": "{}", "sha256": "0"}), "its checksum does not fit"),
+    ],
+)
+def test_a_damaged_file_is_refused_and_replaced(world, saved, tmp_path, damage, why):
+    path = copied(saved, tmp_path)
+    path.write_text(damage(path.read_text(encoding="utf-8")), encoding="utf-8")
+    made, notes = resumed(world, path, between(world, GAP[1], 10.5))
+    assert [n for n in notes if why in n and "the start is fresh" in n]
+    assert errors(world, made[-3:]).max() < 0.08
+    assert read_state(path, fingerprint(world.map)).state is not None
+
+
+def with_content(path, **changes):
+    """The state with other values and a checksum that fits."""
+    content = json.loads(json.loads(path.read_text(encoding="utf-8"))["state"])
+    body = json.dumps(content | changes)
+    checksum = hashlib.sha256(body.encode()).hexdigest()
+    path.write_text(json.dumps({"state": body, "sha256": checksum}), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"version": 2}, "not a state of this version"),
+        ({"format": "another"}, "not a state of this version"),
+        ({"extra": 1}, "not a state of this version"),
+        ({"pose": [0.0, 0.0]}, "not a state of this version"),
+        ({"cov": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "the covariance of the pose is none"),
+        ({"cov": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "the covariance of the pose is none"),
+        ({"installation": {"names": ["a"], "mean": [0.0], "cov": [[1.0, 2.0]]}}, "do not fit"),
+    ],
+)
+def test_values_that_cannot_be_used_are_refused(world, saved, tmp_path, changes, why):
+    path = copied(saved, tmp_path)
+    with_content(path, **changes)
+    read = read_state(path, fingerprint(world.map))
+    assert read.state is None
+    assert why in read.note
+
+
+def test_a_state_of_another_map_is_refused(saved):
+    read = read_state(saved, fingerprint(beacons()))
+    assert read.state is None
+    assert "saved with another map" in read.note
+
+
+def test_without_a_pose_an_old_state_is_kept(world, saved, tmp_path):
+    """The robot is started and stopped at once: what an earlier run knew is not lost."""
+    path = copied(saved, tmp_path)
+    before = path.read_bytes()
+    with live_in(world, state=path):
+        pass
+    assert path.read_bytes() == before
+
+
+def test_a_file_that_cannot_be_written_is_told(world, tmp_path):
+    target = tmp_path / "folder"
+    target.mkdir()
+    live = live_in(world, state=None)
+    feed(live, between(world, 0.0, 3.0))
+    with pytest.raises(OutputError, match="cannot be written"):
+        live.save(target)
+    assert live.save(tmp_path / "state.json")
+    live.close()
+
+
+def test_killed_at_any_time_it_leaves_a_state_that_can_be_used(tmp_path):
+    """kill -9 while the state is written again and again."""
+    path = tmp_path / "state.json"
+    code = f"""
+        import sys
+        sys.path[:0] = {[str(Path(__file__).parent)]!r}
+        from pathlib import Path
+        from live_feed import feed, live_in
+        from robot_world import World, beacons
+        live = live_in(World(beacons(), seconds=4.0))
+        feed(live, World(beacons(), seconds=4.0).events())
+        live.save(Path({str(path)!r}))
+        print("driving", flush=True)
+        while True:
+            live.save(Path({str(path)!r}))
+    """
+    for wait in (0.02, 0.05):
+        child = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True)
+        assert child.stdout.readline() == "driving\n"
+        try:
+            child.wait(wait)
+        except subprocess.TimeoutExpired:
+            os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        child.stdout.close()
+        assert child.returncode == -signal.SIGKILL
+        read = read_state(path, fingerprint(beacons()))
+        assert read.state is not None, read.note
+        with Live(config(), beacons(), state=path, roles=ROLES) as live:
+            made = feed(live, World(beacons(), seconds=6.0).events()[-60:])
+        assert made[0].mode is Mode.OK

@@ -1,0 +1,242 @@
+"""ROS 2's wire: names, types, messages, and recordings that arrive as they are."""
+
+import dataclasses
+import threading
+import time
+
+import numpy as np
+import pytest
+from recording_bags import storage_file, write_drive, write_ros1
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
+from wire import DOMAIN, wait_until
+
+from fgloc.config import RecordingConfig, TopicsConfig
+from fgloc.errors import WireError
+from fgloc.live.wire import intake, play
+from fgloc.live.wire.clock import WireClock
+from fgloc.live.wire.intake import Intake
+from fgloc.live.wire.names import dds_topic, dds_type, ros_topic, ros_type
+from fgloc.live.wire.participant import Participant, Publication, Sample
+from fgloc.live.wire.play import Player
+from fgloc.recording.cdr import Messages
+from fgloc.recording.decode import CONVERTERS
+from fgloc.recording.reader import open_recording
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(intake, "SETTLED_S", 0.2)
+    monkeypatch.setattr(play, "_QUIET_S", 0.5)
+
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+def test_names_are_those_of_ros2():
+    assert (dds_topic("/odom"), dds_topic("wheels/odom")) == ("rt/odom", "rt/wheels/odom")
+    assert dds_type("nav_msgs/msg/Odometry") == "nav_msgs::msg::dds_::Odometry_"
+    assert (ros_topic("rt/a/b"), ros_topic("rq/add_two_intsRequest"), ros_topic("ros_discovery_info")) == (
+        "/a/b",
+        None,
+        None,
+    )
+    assert ros_type("nav_msgs::msg::dds_::Odometry_") == "nav_msgs/msg/Odometry"
+    assert ros_type("HelloWorld") is None
+    assert (
+        ros_type("rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_") == "rmw_dds_common/msg/ParticipantEntitiesInfo"
+    )
+
+
+def test_messages_are_encoded_with_what_is_given_and_zeros():
+    messages = Messages()
+    values = {"name": ["a", "b"], "position": [1.0, 2.0], "header": {"frame_id": "base", "stamp": {"sec": 3}}}
+    back = messages.decode("sensor_msgs/msg/JointState", messages.encode("sensor_msgs/msg/JointState", values))
+    assert back.name == ["a", "b"]
+    assert back.position.tolist() == [1.0, 2.0]
+    assert len(back.effort) == 0
+    assert (back.header.frame_id, back.header.stamp.sec, back.header.stamp.nanosec) == ("base", 3, 0)
+    odometry = messages.decode("nav_msgs/msg/Odometry", messages.encode("nav_msgs/msg/Odometry", {}))
+    assert odometry.pose.covariance.tolist() == [0.0] * 36
+    with pytest.raises(KeyError, match="speed"):
+        messages.encode(TWIST, {"speed": 1.0})
+
+
+def test_types_on_the_wire_are_those_of_the_definitions():
+    """Every message type that fgloc reads can be announced, with the very fields of its definition."""
+    messages = Messages()
+    layout = messages.layout("sensor_msgs/msg/CameraInfo")
+    assert [field.name for field in layout["sensor_msgs/msg/RegionOfInterest"]][:2] == ["x_offset", "y_offset"]
+    assert next(field for field in layout["sensor_msgs/msg/CameraInfo"] if field.name == "k").array == 9
+    kinds = {kind for converters in CONVERTERS.values() for kind in converters}
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        writers = [one.writer(f"/t{k}", kind) for k, kind in enumerate(sorted(kinds))]
+        expected = {Publication(f"/t{k}", kind) for k, kind in enumerate(sorted(kinds))}
+        assert wait_until(lambda: set(other.publications()) == expected)
+        assert one.publications() == ()  # its own are not input
+        assert len(writers) == len(kinds)
+
+
+def test_what_was_written_before_reaches_late_readers_of_a_latched_topic_only():
+    heard = []
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        for topic, latched in (("/tf_static", True), ("/cmd_vel", False)):
+            writer = one.writer(topic, TWIST, latched)
+            for k in range(3):
+                writer.write(one.messages.encode(TWIST, {"linear": {"x": float(k)}}))
+            other.read(topic, TWIST, heard.append, latched)
+            assert wait_until(lambda w=writer: w.readers == 1)
+            writer.write(one.messages.encode(TWIST, {"linear": {"x": 9.0}}), source_ns=123)
+            writer.flush(1.0)
+        assert wait_until(lambda: len(heard) == 5)
+        told = [(s.topic, other.messages.decode(TWIST, s.cdr).linear.x) for s in heard]
+        assert sorted(told) == [("/cmd_vel", 9.0), *(("/tf_static", x) for x in (0.0, 1.0, 2.0, 9.0))]
+        assert heard[-1].source_ns == 123
+
+
+def test_leaving_is_noticed_and_quick():
+    one, other = Participant(DOMAIN), Participant(DOMAIN)
+    writers = [one.writer("/cmd_vel", TWIST), one.writer("/odom", "nav_msgs/msg/Odometry")]
+    other.read("/odom", "nav_msgs/msg/Odometry", lambda sample: None)
+    assert wait_until(lambda: len(other.publications()) == 2 and writers[1].readers == 1)
+    began = time.monotonic()
+    writers.clear()
+    one.close()
+    assert time.monotonic() - began < 5.0
+    assert wait_until(lambda: other.publications() == ())
+    other.close()
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("simulated_ns", "source_ns", "received_ns"),
+    [
+        (10**18, 10**18 + 3 * 10**9, 10**18 + 3 * 10**9),  # of a player with our clock, though /clock came late
+        (10**18, None, 10**18),  # of a simulator, which writes by the machine's clock
+        (None, 12345, None),  # of a machine with another clock
+    ],
+)
+def test_the_receive_time_is_that_of_writing_where_the_clocks_agree(simulated_ns, source_ns, received_ns):
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        clock = WireClock(other)
+        writer = one.writer("/clock", "rosgraph_msgs/msg/Clock")
+        assert wait_until(lambda: writer.readers == 1)
+        if simulated_ns is not None:
+            stamp = {"sec": simulated_ns // 10**9, "nanosec": simulated_ns % 10**9}
+            writer.write(one.messages.encode("rosgraph_msgs/msg/Clock", {"clock": stamp}))
+            assert wait_until(lambda: clock.simulated)
+        sample = Sample("/a", TWIST, b"", time.time_ns() if source_ns is None else source_ns)
+        found = clock.received_ns(sample)
+    assert abs(found - (time.time_ns() if received_ns is None else received_ns)) < (0.5e9 if received_ns is None else 1)
+
+
+def test_a_domain_that_is_none_is_refused():
+    with pytest.raises(WireError, match="domain 300: expected 0 to 232"):
+        Participant(300)
+
+
+# --- recordings -------------------------------------------------------------------------------------------------------
+
+
+def told(event):
+    """All of an event, to be compared."""
+    values = [getattr(event, field.name) for field in dataclasses.fields(event)]
+    return (type(event).__name__, *(v.tobytes() if isinstance(v, np.ndarray) else repr(v) for v in values))
+
+
+def played(path, config, rate):
+    """Events that arrive when a recording is played, and the player."""
+    events = []
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other, Player(path, one) as player:
+        topics = Intake(other, WireClock(other), config, events.append)
+
+        def follow():
+            while not ended.wait(0.05):
+                topics.find()
+                topics.subscribe()
+
+        ended = threading.Event()
+        following = threading.Thread(target=follow)
+        following.start()
+        try:
+            assert player.wait_for_readers(10.0)
+            player.play(rate)
+            player.finish()
+            with open_recording(path, config) as recording:
+                count = sum(1 for _ in recording.events())
+            wait_until(lambda: len(events) >= count, 2.0)
+        finally:
+            ended.set()
+            following.join()
+    assert not topics.undecodable
+    return events, player
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite3"])
+def test_events_of_a_recording_arrive_as_they_are(tmp_path, kind):
+    """Every field of every event, receive times and stamps of messages without a header included."""
+    if kind == "ros1":
+        path = write_ros1(tmp_path / "run.bag")
+        config = RecordingConfig(topics=TopicsConfig(image="none", sightings="none"))
+    else:
+        path, config = storage_file(write_drive(tmp_path / "run", kind, n=100)), RecordingConfig()
+    events, player = played(path, config, rate=20.0)
+    with open_recording(path, config) as recording:
+        expected = [told(event) for event in recording.events()]
+        assert player.topics == tuple(sorted(t.name for t in recording.topics))
+    assert len(expected) >= 300
+    assert sorted(map(told, events)) == sorted(expected)
+    assert not player.notes
+    assert player.damaged == 0
+
+
+def test_timing_is_the_recorded_one(tmp_path):
+    path = write_drive(tmp_path / "run", n=40)  # 2 s
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other, Player(path, one) as player:
+        came, clock = [], WireClock(other)
+        other.read(
+            "/odom", "nav_msgs/msg/Odometry", lambda s: came.append((time.monotonic(), s.source_ns, clock.now_ns()))
+        )
+        assert player.wait_for_readers(10.0)
+        began = time.monotonic()
+        player.play(rate=2.0)
+        took = time.monotonic() - began
+        length_s = player.duration_s
+        assert wait_until(lambda: len(came) == 40, 2.0)
+    assert length_s / 2.0 - 0.01 < took < length_s  # not faster than asked; slower only on a busy machine
+    times, sources, clocks = (np.array(column) for column in zip(*came, strict=True))
+    assert (np.diff(sources) == 50_000_000).all()
+    late = (times - times[0]) - (sources - sources[0]) * 1e-9 / 2.0
+    assert np.abs(np.median(late)) < 0.1
+    assert np.median(np.abs(clocks - sources)) < 0.2e9  # /clock goes with it
+
+
+def test_playing_can_be_stopped_and_needs_no_reader(tmp_path):
+    path = write_drive(tmp_path / "run", n=100)  # 5 s
+    stop = threading.Event()
+    with Participant(DOMAIN) as one, Player(path, one) as player:
+        assert not player.wait_for_readers(0.1)
+        threading.Timer(0.3, stop.set).start()
+        began = time.monotonic()
+        player.play(1.0, stop)
+        assert time.monotonic() - began < 4.0
+        assert 0 < player.published < 400
+
+
+def test_a_topic_that_cannot_be_sent_is_named_and_left_out(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    wide = "own_msgs/msg/Wide"
+    with Writer(tmp_path / "run", version=9) as writer:
+        connections = [
+            writer.add_connection("/wide", wide, msgdef="wstring text\n", rihs01="RIHS01_" + "0" * 64),
+            writer.add_connection("/cmd_vel", TWIST, typestore=store),
+        ]
+        for k in range(3):
+            writer.write(connections[0], k * 10, b"\0\1\0\0" + bytes(8))
+            writer.write(connections[1], k * 10, Messages().encode(TWIST, {}))
+    with Participant(DOMAIN) as one, Player(tmp_path / "run", one) as player:
+        assert player.topics == ("/cmd_vel",)
+        (note,) = player.notes
+        assert "/wide" in note
+        player.play(1000.0)
+        assert player.published == 3

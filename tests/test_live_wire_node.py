@@ -1,0 +1,300 @@
+"""``fgloc live`` and ``fgloc play``: poses on the wire are those of an online run; frames, map, commands."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recording_bags import write_drive
+from typer.testing import CliRunner
+from wire import DOMAIN, wait_until
+
+import fgloc
+from datasets.bag import BagWriter
+from fgloc import se2
+from fgloc.cli import app
+from fgloc.config import Config, load_config
+from fgloc.errors import WireError
+from fgloc.frames import quaternion_yaw, yaw_quaternion
+from fgloc.live import Live, LivePose
+from fgloc.live.wire import intake, play
+from fgloc.live.wire import node as nodes
+from fgloc.live.wire.node import Node
+from fgloc.live.wire.odom_frame import OdomFrame
+from fgloc.live.wire.participant import Participant
+from fgloc.live.wire.play import Player
+from fgloc.live.wire.recent import RecentPoses
+from fgloc.live.wire.teller import Teller
+from fgloc.recording.storage import Storage
+from fgloc.runner import run
+from fgloc.sensors.maps import load_map
+from fgloc.types import Mode, TransformEvent
+
+SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+OUTPUTS = {
+    "/fgloc/odometry": "nav_msgs/msg/Odometry",
+    "/fgloc/pose": POSE,
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(intake, "SETTLED_S", 0.2)
+    monkeypatch.setattr(play, "_QUIET_S", 0.5)
+
+
+class Session:
+    """A node and someone who listens to it, both in this process."""
+
+    def __init__(self, config, landmarks=None):
+        self.heard = {topic: [] for topic in OUTPUTS}
+        self.told = []
+        self.stop = threading.Event()
+        self.other = Participant(DOMAIN)
+        for topic, kind in OUTPUTS.items():
+            self.other.read(topic, kind, self._hear)
+        self.participant = Participant(DOMAIN)
+        self.node = Node(self.participant, config, landmarks)
+        self._thread = threading.Thread(target=self.node.run, args=(self.stop, self.told.append))
+
+    def _hear(self, sample):
+        self.heard[sample.topic].append((sample.source_ns, self.other.messages.decode(sample.message_type, sample.cdr)))
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error):
+        self.stop.set()
+        self._thread.join()
+        self.node.close()
+        self.participant.close()
+        self.other.close()
+
+    def planar(self, topic):
+        """Stamps and poses of what was published."""
+        messages = [message for _, message in self.heard[topic]]
+        return np.array([ns(m) for m in messages]), np.array([pose_of(m.pose.pose) for m in messages])
+
+
+def ns(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def pose_of(pose):
+    q = pose.orientation
+    return (pose.position.x, pose.position.y, quaternion_yaw((q.x, q.y, q.z, q.w)))
+
+
+def excerpt(folder, seconds):
+    """The beginning of the sample."""
+    storage = Storage(SAMPLE / "bag")
+    end_ns = storage.span_ns[0] + round(seconds * 1e9)
+    with BagWriter(folder) as bag:
+        for topic, kind, received_ns, raw in storage.messages():
+            if received_ns <= end_ns and bag.knows(kind):
+                bag.copy(topic, kind, raw, received_ns)
+    storage.close()
+    return folder
+
+
+def test_poses_on_the_wire_are_those_of_an_online_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(nodes, "Live", partial(Live, image_queue=1000))  # however busy this machine is
+    bag = excerpt(tmp_path / "bag", 8.0)
+    config, landmarks = load_config(SAMPLE / "robot.yaml"), load_map(SAMPLE / "map.yaml")
+    with Session(config, landmarks) as session, Participant(DOMAIN) as one, Player(bag, one) as player:
+        assert player.wait_for_readers(20.0)
+        player.play(2.5)
+        player.finish()
+        drawn = []
+        session.other.read("/fgloc/map", "visualization_msgs/msg/MarkerArray", drawn.append, latched=True)
+        assert session.node.live.wait(10.0)
+        assert wait_until(lambda: len(session.heard["/diagnostics"]) >= 4 and drawn)
+    online = run(bag, SAMPLE / "map.yaml", config, "online").trajectory
+    stamps, poses = session.planar("/fgloc/pose")
+    order = np.argsort(stamps)
+    assert set(stamps) == set(online.stamps_ns)
+    assert np.abs(poses[order] - online.poses).max() < 1e-6
+    covariance = np.array(
+        [m.pose.covariance.reshape(6, 6)[np.ix_((0, 1, 5), (0, 1, 5))] for _, m in session.heard["/fgloc/pose"]]
+    )
+    np.testing.assert_allclose(covariance[order], online.covs, atol=1e-9)
+
+    stamps, poses = session.planar("/fgloc/odometry")
+    assert len(stamps) > 20
+    assert (np.diff(stamps) > 0).all()
+    inside = (stamps > online.stamps_ns[0]) & (stamps < online.stamps_ns[-1])
+    apart = poses[inside] - se2.interpolate(online.stamps_ns, online.poses, stamps[inside])
+    assert np.median(np.abs(apart[:, :2])) < 0.01  # carried on beyond a keyframe; further on a busy machine
+    assert session.heard["/fgloc/odometry"][0][1].child_frame_id == "base_link"
+    (transform,) = session.heard["/tf"][-1][1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+    markers = session.other.messages.decode("visualization_msgs/msg/MarkerArray", drawn[0].cdr).markers
+    assert {m.text for m in markers if m.ns == "ids"} == {str(i) for i in landmarks.landmarks}
+    status = session.heard["/diagnostics"][-1][1].status[0]
+    assert (status.message, status.level) == ("OK", 0)
+    values = {pair.key: pair.value for pair in status.values}
+    assert values["image topic"] == "/camera/image/compressed"
+    assert float(values["joints rate [Hz]"]) == pytest.approx(50.0, rel=0.2)
+    assert any("/odom (odometry)" in sentence for sentence in session.told)
+
+
+def test_a_pose_told_on_the_wire_moves_the_robot_and_its_odometry_frame(tmp_path):
+    """Dead reckoning on a circle from a configured pose; then somebody corrects it."""
+    bag = write_drive(tmp_path / "run")  # 10 s
+    topics = {"image": "none", "sightings": "none", "command": "none", "joints": "none"}
+    config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (1.0, 2.0, 0.0)}})
+    stop = threading.Event()
+    with Session(config) as session, Participant(DOMAIN) as one, Player(bag, one) as player:
+        assert player.wait_for_readers(20.0)
+        writer = one.writer("/initialpose", POSE)
+        playing = threading.Thread(target=player.play, args=(3.0, stop))
+        playing.start()
+        assert wait_until(lambda: len(session.heard["/tf"]) > 20 and writer.readers)
+        (before,) = session.heard["/tf"][-1][1].transforms
+        for frame, x in (("somewhere", 90.0), ("map", 50.0)):
+            variances = np.zeros((6, 6))
+            variances[[0, 1, 5], [0, 1, 5]] = 1e-4
+            pose = {"position": {"x": x, "y": -7.0}, "orientation": dict(zip("xyzw", yaw_quaternion(1.0), strict=True))}
+            message = {"header": {"frame_id": frame}, "pose": {"pose": pose, "covariance": variances.ravel()}}
+            writer.write(one.messages.encode(POSE, message))
+        assert wait_until(lambda: session.heard["/fgloc/odometry"][-1][1].pose.pose.position.x > 40.0)
+        assert wait_until(lambda: any("frame 'somewhere'" in sentence for sentence in session.told))
+        stop.set()
+        playing.join()
+    t = before.transform.translation
+    assert (t.x, t.y) == pytest.approx((1.0, 2.0), abs=0.05)
+    _, poses = session.planar("/fgloc/odometry")
+    assert np.hypot(poses[-1, 0] - 50.0, poses[-1, 1] + 7.0) < 3.0
+
+
+def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
+    told = []
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        node = Node(other, Config(), None)
+        writers = [one.writer("/left/odometry", "nav_msgs/msg/Odometry")]
+        threading.Timer(2.5, lambda: writers.append(one.writer("/right/odometry", "nav_msgs/msg/Odometry"))).start()
+        with pytest.raises(WireError, match="2 topics could be the odometry: /left/odometry, /right/odometry"):
+            node.run(threading.Event(), told.append)
+        node.close()
+    assert told == ["Waiting for images or marker sightings; topics there: /left/odometry (nav_msgs/msg/Odometry)."]
+
+
+def test_a_keyframe_that_moves_the_robot_is_no_motion():
+    """A circle at 0.4 m/s and 0.5 rad/s; every 0.2 s a keyframe moves everything since by some centimetres."""
+
+    def pose_at(stamp_ns):
+        corrected = keyframes[-1]
+        on_circle = se2.exp((0.4e-9 * stamp_ns, 0.0, 0.5e-9 * stamp_ns))
+        moved = se2.compose((0.03 * len(keyframes), -0.02, 0.01 * len(keyframes)), on_circle)
+        return LivePose(stamp_ns, moved, np.eye(3), Mode.OK, corrected)
+
+    keyframes = [0]
+    recent = RecentPoses(pose_at)
+    for k in range(1, 60):
+        if k % 10 == 0:
+            keyframes.append((k - 5) * 20_000_000)
+        recent.add(pose_at(k * 20_000_000))
+        if k > 1:
+            assert recent.twist() == pytest.approx([0.4, 0.0, 0.5], abs=1e-6)
+    between = 59 * 20_000_000 - 30_000_000
+    assert recent.at(between) == pytest.approx(pose_at(between).pose, abs=1e-4)  # linear between two poses
+    assert recent.at(0) is None
+    recent.add(pose_at(20_000_000))  # the clock was set back
+    assert recent.twist().tolist() == [0.0, 0.0, 0.0]
+
+
+def transform(parent, child, x, static=False):
+    return TransformEvent(1, 1, "/tf", parent, child, np.array([x, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]), static)
+
+
+def test_the_transform_to_the_base_is_the_odometry_frame():
+    odom = OdomFrame(Config().recording)
+    assert odom.base == "base_link"
+    assert odom.latest() is None
+    odom.add(transform("base_footprint", "camera", 0.1, static=True))
+    odom.add(transform("/wheel_odom", "/base_footprint", 3.0))
+    odom.add(transform("map", "wheel_odom", 9.0))
+    assert odom.base == "base_footprint"
+    assert (odom.latest().frame, odom.latest().T_odom_base.tolist()) == ("wheel_odom", [3.0, 0.0, 0.0])
+
+
+def test_a_sentence_is_told_once_whatever_its_figures():
+    told = []
+    teller = Teller(told.append)
+    teller.tell("12 images dropped", "wheels slip")
+    teller.tell("13 images dropped", "wheels slip")
+    teller.waiting("Waiting for odometry.")
+    assert told == ["12 images dropped", "wheels slip"]
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "fgloc.cli", *map(str, arguments)]
+
+
+def test_two_commands_as_two_processes(tmp_path):
+    """Ctrl-C ends with a summary; how soon, `benchmarks.live_wire` tells."""
+    bag = excerpt(tmp_path / "bag", 4.0)
+    files = ["--map", SAMPLE / "map.yaml", "--config", SAMPLE / "robot.yaml", "--state", tmp_path / "state.json"]
+    live = subprocess.Popen(
+        command("live", "--domain", DOMAIN, *files), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        done = subprocess.run(
+            command("play", bag, "--domain", DOMAIN, "--rate", 4),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        time.sleep(0.3)
+        live.send_signal(signal.SIGINT)
+        said, _ = live.communicate(timeout=20)
+    finally:
+        live.kill()
+    assert done.returncode == 0, done.stderr
+    assert "messages published" in done.stdout
+    assert live.returncode == 0, said
+    summary = dict(line.split(maxsplit=1) for line in said.splitlines() if line.startswith(("keyframes", "duration")))
+    assert int(summary["keyframes"]) == pytest.approx(20, abs=6), said
+    assert "Subscribed: /odom (odometry)." in said
+    assert "last mode" in said
+    assert (tmp_path / "state.json").stat().st_size > 100
+
+
+@pytest.mark.parametrize("arguments", [["live"], ["play", str(SAMPLE / "bag")]])
+def test_without_cyclonedds_the_remedy_is_named(monkeypatch, arguments):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "cyclonedds"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    done = CliRunner().invoke(app, arguments)
+    assert (done.exit_code, "pip install 'fgloc[live]'" in done.stderr) == (1, True), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["live", "--initial-pose", "1,2"], "--initial-pose 1,2: expected x, y [m] and yaw [rad]"),
+        (["live", "--domain", "900"], "domain 900: expected 0 to 232"),
+        (["live", "--map", "nowhere.yaml"], "nowhere.yaml"),
+        (["play", "nowhere.bag"], "nowhere.bag: does not exist"),
+        (["play", str(SAMPLE / "bag"), "--rate", "0"], "--rate 0: expected a multiple"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line(arguments, why):
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 1
+    assert done.stderr.startswith("error: ")
+    assert why in done.stderr
+    assert os.linesep not in done.stderr.strip()

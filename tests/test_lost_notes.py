@@ -1,0 +1,91 @@
+"""What a run must not keep to itself: ignored ids, a missing map, sightings dropped for their stamps, a lost robot."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import BEACONS, START_NS, fgloc, sight, write_circle
+
+import fgloc as fgloc_package
+from datasets.bag import BagWriter
+from fgloc import se2
+from fgloc.config import Config, load_config
+from fgloc.recording.reader import open_recording
+from fgloc.runner import run
+from fgloc.types import CornersEvent, ImageEvent, MarkerCorners, Mode
+
+
+def write_late_circle(folder, late_s, seconds=6.0):
+    """The circle of the command line's tests, its sightings stamped by a clock that is wrong."""
+    rng = np.random.default_rng(3)
+    pose = np.array([1.0, 0.0, np.pi / 2])
+    with BagWriter(folder / "bag") as bag:
+        for k in range(round(seconds * 20)):
+            stamp = START_NS + k * 50_000_000
+            bag.odometry("/odom", stamp, pose, (0.4, 0.4))
+            if k % 5 == 0:
+                sightings = [sight(rng, pose, i) for i in BEACONS]
+                bag.range_bearing("/landmarks", stamp - round(late_s * 1e9), sightings, received_ns=stamp)
+            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
+    return folder / "bag"
+
+
+@pytest.mark.parametrize("command", ["smooth", "online"])
+def test_sightings_dropped_for_their_stamps_are_said_first_and_exit_with_3(tmp_path, command):
+    bag = write_late_circle(tmp_path, 20.0)
+    code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
+    assert code == 3, stderr
+    first = stdout.splitlines()[0]
+    assert first.startswith("mistake: None of the sightings on /landmarks was used, for their stamps do not fit")
+    assert "recording.received_stamps: [sightings]" in first
+    assert "dead reckoning" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_map_that_is_missing_is_said(tmp_path):
+    bag = write_circle(tmp_path, seconds=4.0)
+    (tmp_path / "map.yaml").unlink()
+    code, stdout, _ = fgloc("smooth", bag, "--out", tmp_path / "out")
+    assert code == 0
+    assert "note: No map: landmarks are estimated with the trajectory" in stdout
+
+
+def test_lost_poses_have_sigmas_of_the_maps_size(tmp_path):
+    for mode in ("online", "batch"):
+        result = run(
+            write_circle(tmp_path / mode, seconds=5.0, sees=False), tmp_path / mode / "map.yaml", Config(), mode
+        )
+        assert set(result.modes) == {Mode.LOST}
+        sigmas = np.sqrt(np.diagonal(result.trajectory.covs, axis1=1, axis2=2))
+        assert sigmas[:, :2].min() > 1.5  # the beacons are 3 m from the middle
+        assert sigmas[:, 2].min() > 1.5
+
+
+def test_fault_50_ids_outside_the_map_are_named_in_runs_with_images(tmp_path):
+    """The detector's sightings have a gate of their own."""
+    corners = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
+    sample = "datasets/samples/installed_run"
+
+    def also_49(events):
+        for event in events:
+            if isinstance(event, CornersEvent):
+                stranger = (MarkerCorners(49, corners + 5.0),)
+                event = replace(event, sightings=(*event.sightings, *stranger))
+            yield event
+
+    folder = Path(fgloc_package.__file__).parent.parent / sample
+
+    def first_seconds(events):
+        images = 0
+        for event in events:
+            images += isinstance(event, ImageEvent)
+            if images > 40:
+                return
+            yield event
+
+    config = load_config(folder / "robot.yaml")
+    result = run(folder / "bag", folder / "map.yaml", config, "online", events=first_seconds, sightings=also_49)
+    assert result.rejections["sightings.unknown_id"] > 20
+    assert [note for note in result.notes if "ids that are not in the map are ignored" in note and "49" in note]
+    with open_recording(folder / "bag", config.recording) as recording:
+        assert "image" in recording.roles
