@@ -79,7 +79,7 @@ class LandmarkModes:
 
     def sensitivity(self, landmark_id: int) -> FloatArray:
         """Derivative ``(3 + n, 2)`` of the error of pose and installation by a landmark's displacement."""
-        return self._M[self._rows[landmark_id]]
+        return np.asarray(self._M[self._rows[landmark_id]])
 
     def observe(
         self,
@@ -275,7 +275,7 @@ def _explain(w: FloatArray, G: FloatArray, mean: FloatArray, cov: FloatArray) ->
 def _by_displacement(one: Linearized, pose: FloatArray) -> FloatArray:
     """Derivative ``(d, 2)`` of a sighting's residual by its landmark's displacement in the map."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    return -one.J[:, :2] @ np.array([[c, s], [-s, c]])
+    return np.asarray(-one.J[:, :2] @ np.array([[c, s], [-s, c]]))
 
 
 def _turned(one: Linearized, rows: tuple[int, int]) -> FloatArray:
