@@ -171,7 +171,6 @@ class Localizer:
     def _replay(self, started: InitialPose) -> list[Estimate]:
         """Run the collected steps through the estimator."""
         first, *rest = started.steps
-        self.association.outliers = started.outliers
         self.sources.begin_segment()
         estimates = [self._start(first.step, started.first, first.sightings)]
         estimates += [self._advance(later.step, later.readings, later.sightings) for later in rest]
@@ -293,8 +292,7 @@ class Localizer:
     ) -> list[Decision]:
         """Leave out a landmark that was moved; take back what it did to the pose."""
         modes, belief = self.association.modes, self.estimator.log.keyframes[self.estimator.k].belief
-        against = [s for s in refused if (s.alone.stamp_ns, s.alone.landmark_id) not in self.association.outliers]
-        moved = modes.observe(motions, predicted, belief, fused, against)
+        moved = modes.observe(motions, predicted, belief, fused, refused)
         if moved is None:
             return []
         without, evidence = modes.exclude(moved, belief)

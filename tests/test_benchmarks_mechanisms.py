@@ -116,7 +116,7 @@ def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():
     with BY_NAME["gate"].off():
         assert "gate" not in refusals(world)
     with BY_NAME["landmark_modes"].off():
-        assert set(refusals(world)) == {"gate", "contradicts_start"}
+        assert set(refusals(world)) == {"gate", "contradicts_others"}
 
 
 def test_what_is_returned_may_be_changed_by_the_caller():

@@ -255,7 +255,7 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
     counts = chain.localizer.association.rejections
-    assert sum(counts[f"sightings.{why}"] for why in ("gate", "quarantined", "contradicts_start")) == len(refused)
+    assert sum(counts[f"sightings.{why}"] for why in ("gate", "contradicts_others", "quarantined")) == len(refused)
     assert counts["sightings.quarantined"] > 40
     moved_by = chain.localizer.association.modes.displacements
     assert list(moved_by) == [2]

@@ -33,7 +33,6 @@ class Association:
 
     Attributes:
         rejections: refused sightings by reason.
-        contrary: sightings, by stamp and landmark, that contradict the place where the run starts: not to be believed.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
@@ -42,7 +41,6 @@ class Association:
         self._last_used_ns: dict[int, int] = {}
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
-        self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
         self.modes = LandmarkModes(config, factors)
 
@@ -67,8 +65,6 @@ class Association:
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
             if self.modes.excludes(m.landmark_id):
                 reason = "quarantined"
-            elif (m.stamp_ns, m.landmark_id) in self.outliers:
-                reason = "contradicts_start"
             if reason:
                 refused.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
