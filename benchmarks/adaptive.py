@@ -3,12 +3,12 @@
 Simulated recordings of the suite's scenarios (see `benchmarks.adaptive_recordings`), failures of the ablations, and
 MRCLAM 6 with failures injected. Of one case are run, on the same events: ours; *fixed*, the same graph with constant
 covariances, tuned on training recordings (`benchmarks.adaptive_fixed`); *nominal*, the same with the covariances of
-``robot.yaml``; the *oracle*, which is fixed but told when the wheels are wrong; and the peers: kernels on the wheels'
-factors and an extended Kalman filter online, GNC on every factor in batch. Values are ratios of means over the seeds,
-spreads the standard deviation of the ratios of single runs. ATE is the mean distance from the truth, online where not
-said otherwise. Settings are chosen on the training and validation splits; the rows are of the test split.
+``robot.yaml``; the *oracle*, which is fixed but given the times when the wheels are wrong; and the peers: kernels on
+the wheels' factors and an extended Kalman filter online, GNC on every factor in batch. Values are ratios of means over
+the seeds, spreads the standard deviation of the ratios of single runs. ATE is the mean distance from the truth, online
+where not stated otherwise. Settings are chosen on the training and validation splits; the rows are of the test split.
 
-The detector's delay is that of the slips it found; a slip is what the simulator says to slip for 0.1 s or more.
+The detector's delay is that of the slips it found; a slip lasts 0.1 s or more in the simulator.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def tune(changes: dict[str, Any]) -> Iterator[tuple[float, float, list[float]]]:
     """Factors and the geometric means of the ATE [m] of each case over the training seeds.
 
     Args:
-        changes: of the configuration, common to all (the motion model, say).
+        changes: of the configuration, common to all (such as the motion model).
     """
     for way, turn in product(_FACTORS, _FACTORS):
         found = {name: cell(name, SEEDS["train"], changes | constant(way, turn), split="train") for name in _CASES}

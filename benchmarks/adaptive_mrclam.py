@@ -2,7 +2,7 @@
 
 The robots recorded commands and no wheels. So that wheels can slip here, an odometry is made that repeats the commands,
 and spoiled; the motion model reads the commands themselves. Each robot's model and constants come from the other four.
-*Fixed* keeps the covariances of ``robot.yaml``; the oracle is fixed and told when the wheels are wrong.
+*Fixed* keeps the covariances of ``robot.yaml``; the oracle is fixed and given the times when the wheels are wrong.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def load(source: Path, robot: int, scratch: Path) -> Recorded:
 
 
 def _with_odometry(events: Iterable[Event]) -> Iterator[Event]:
-    """The events, and after each command what a wheel odometry that obeys at once would say."""
+    """The events, and after each command what a wheel odometry that follows at once would report."""
     pose, twist = np.zeros(3), (0.0, 0.0)
     last_ns: int | None = None
     unknown = np.zeros((6, 6))

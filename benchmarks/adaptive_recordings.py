@@ -49,7 +49,7 @@ from fgloc.types import (
 Split = Literal["train", "validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]
 Change = Callable[[Scenario], Scenario]
-"""Of a floor's scenario, by another benchmark: a function of a module, so that recordings can be told apart."""
+"""Of a floor's scenario, by another benchmark: a function of a module, so that recordings can be distinguished."""
 SEEDS: dict[Split, tuple[int, ...]] = {
     "train": (13, 14),
     "validation": (22, 23, 24),
@@ -69,7 +69,7 @@ class Recorded:
     name: str
     bag: Path
     map_path: Path
-    config: Config  # what robot.yaml says
+    config: Config  # as in robot.yaml
     landmarks: LandmarkMap
     events: tuple[Event, ...]
     start_ns: int  # receive time of the first message
@@ -78,7 +78,7 @@ class Recorded:
     slip: FloatArray  # (n, 3) true minus wheels' twist: forward, sideways [m/s], turn [rad/s]
     truth: FloatArray  # (m, 4) seconds from the start, x, y, yaw
     duration_s: float
-    camera: Camera | None = None  # as the recording says
+    camera: Camera | None = None  # as in the recording
     installed: Mapping[str, Any] | None = None  # where it is not what is written: the truth
 
     @property

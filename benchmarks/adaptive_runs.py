@@ -53,7 +53,7 @@ class Case:
     floor: Floor
     chain: Callable[[Recorded], list[dict[str, Any]]] = lambda recorded: []
     wheels_wrong: Callable[[Recorded], list[Interval]] | None = (
-        None  # what an oracle is told [s]; None: nothing to tell
+        None  # when wheels fail, for the oracle [s]; None: not known
     )
 
 
@@ -109,7 +109,7 @@ def cell(
         name: of `CASES`.
         seeds: of the split's recordings.
         changes: of the configuration, as nested mappings.
-        oracle: tell the weights when the wheels are wrong.
+        oracle: give the weights the times when the wheels are wrong.
         batch: smooth as well.
         split: of the simulated suite.
     """
@@ -200,16 +200,16 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
             if estimates:
                 raise
             return None
-    online = replace(
-        result,
-        trajectory=Trajectory(
-            np.array([e.stamp_ns for e in estimates], dtype=np.int64),
-            np.array([e.pose for e in estimates]),
-            np.array([e.cov for e in estimates]),
-        ),
-        modes=tuple(e.mode for e in estimates),
-    )
+    online = replace(result, trajectory=_trajectory(estimates), modes=tuple(e.mode for e in estimates))
     return Replayed(online, result if batch else None, chain, given, steps, landmarks)
+
+
+def _trajectory(estimates: Sequence[Estimate]) -> Trajectory:
+    return Trajectory(
+        np.array([e.stamp_ns for e in estimates], dtype=np.int64),
+        np.array([e.pose for e in estimates]),
+        np.array([e.cov for e in estimates]),
+    )
 
 
 def changed(config: Config, changes: Changes) -> Config:
@@ -222,7 +222,7 @@ def changed(config: Config, changes: Changes) -> Config:
 
 
 def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:
-    """Configuration that tells when the wheels are wrong."""
+    """Configuration with the times when the wheels are wrong."""
     return {"weights": {"distrust": [{"source": "wheels", "start_s": a, "end_s": b} for a, b in intervals]}}
 
 

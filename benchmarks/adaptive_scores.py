@@ -21,7 +21,7 @@ from fgloc.types import CornersEvent, Decision, Event, FloatArray, Mode, RunResu
 _NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
 _NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")
 _LINGER_S = 0.5  # a slip that is flagged so long after its end was still found
-_WINDOW_S = 2.0  # a flag may speak of a slip, however short, so long before it: the detector's window
+_WINDOW_S = 2.0  # a flag may be of a slip, however short, so long before it: the detector's window
 _STEP_S = 0.45  # flagged steps closer than this are of one flag
 _OFF_M, _OFF_RAD = 0.3, 0.2  # nearer to the truth than this, a kidnapped robot is found again ...
 _STAYS_S = 1.0  # ... if it stays so for this long
@@ -57,7 +57,7 @@ class Figures:
     batch_ate_m: float  # NaN if it was not smoothed
     batch_nees_over_3: float
     step_ms: FloatArray  # of the steps after the first pose
-    named: frozenset[int]  # markers that the run says do not stand where the map has them
+    named: frozenset[int]  # markers that the run named as moved
     moved: frozenset[int]  # those that do not
     slips: Slips | None
     found_again_s: float | None  # of a kidnapped robot
@@ -129,7 +129,7 @@ def slips(recorded: Recorded, online: RunResult) -> Slips:
 
 
 def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float, float]]:
-    """When the wheels were not believed, because other motion sources spoke against them [s from the start].
+    """When the wheels were rejected, because other motion sources contradicted them [s from the start].
 
     A flag counts from the step that raised it, not from the earlier ones that it revised.
     """

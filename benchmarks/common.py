@@ -11,7 +11,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure. ``value`` is None, and ``reason`` says why, if it was not run."""
+    """One figure. ``value`` is None, and ``reason`` is why, if it was not run."""
 
     id: str
     value: float | None
@@ -22,7 +22,7 @@ class Row:
 
 
 def not_run(ids: Iterable[str], reason: str) -> list[Row]:
-    """Rows that say why they have no value."""
+    """Rows without a value, with the reason."""
     return [Row(name, None, n=0, reason=reason) for name in ids]
 
 

@@ -40,6 +40,12 @@ def digests() -> dict[str, str]:
     return found
 
 
+def differences() -> list[str]:
+    """Samples and modes whose results are not the committed ones."""
+    found, expected = digests(), json.loads(EXPECTED.read_text(encoding="utf-8"))
+    return [name for name in sorted(found | expected) if found.get(name) != expected.get(name)]
+
+
 def main(
     write: Annotated[bool, typer.Option("--write", help="Make today's results the expected ones.")] = False,
 ) -> None:

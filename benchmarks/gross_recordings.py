@@ -1,7 +1,7 @@
 """Recordings of `benchmarks.gross`: a minute of a simulated drive as installed, with one gross mistake made on purpose.
 
 A mistake changes ``robot.yaml``, ``map.yaml`` or the messages of the bag; everything else is as it was recorded. What
-has to be said of it is a pattern of the first sentence.
+has to be reported of it is a pattern of the first sentence.
 """
 
 from __future__ import annotations

@@ -234,7 +234,7 @@ def _row(name: str, values: list[float], unit: str = "") -> Row:
 
 
 def _ensemble(scratch: Path) -> MotionModel:
-    """Five networks of the shipped model's size; what they say does not change how long they take."""
+    """Five networks of the shipped model's size; their weights do not change how long they take."""
     tensors, card = read_model(_MODEL)
     path = scratch / "ensemble.safetensors"
     stacked = {name: np.stack([tensor] * 5) for name, tensor in tensors.items()}

@@ -1,7 +1,7 @@
 """Maps for `benchmarks.installed`: surveyed from images, then fed back.
 
-A robot tours a room of 6 m for three minutes; camera, clocks, wheels and gyro are as installed. `fgloc map` is told the
-dictionary and size of the markers and nothing else; then `fgloc smooth` takes the file that it wrote.
+A robot tours a room of 6 m for three minutes; camera, clocks, wheels and gyro are as installed. `fgloc map` is given
+the dictionary and size of the markers and nothing else; then `fgloc smooth` takes the file that it wrote.
 
 - ``map.images.rms_mm``, ``.direction_deg``: root mean square over the markers of a run, of their distance from where
   they hang and of the angle by which they are turned, after SE(3) alignment of the places; ``map.images.missing``

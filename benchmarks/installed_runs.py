@@ -44,7 +44,7 @@ from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.atomic import atomic_file
 from fgloc.config import Config
 from fgloc.errors import FglocError
-from fgloc.evaluation.metrics import match
+from fgloc.evaluation.matching import match
 from fgloc.localizer import Localizer
 from fgloc.types import Estimate, Step, Trajectory
 
@@ -129,7 +129,7 @@ def _sources() -> str:
 
 
 def run_cell(cell: Cell) -> Scores:
-    """Replay and score a case; what fails says why."""
+    """Replay and score a case; what fails has its reason."""
     recorded = load(cell.take)
     try:
         chain = [failure(described) for described in FAILURES[cell.case].chain(recorded)]

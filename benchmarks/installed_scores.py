@@ -1,7 +1,7 @@
 """What one run shows of an installation: errors, honesty, refused sightings, and what it found of the truth.
 
-**What a run says of the installation** is a mapping of names to values with their sigmas. The names, and what the truth
-has under them, are those of `truth_values`; a run may say any part of them.
+**What a run found of the installation** is a mapping of names to values with their sigmas. The names, and what the
+truth has under them, are those of `truth_values`; a run may have any part of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ANGLES = frozenset({"roll", "pitch", "yaw"})
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """How far a trajectory is from the truth, and whether its covariance says so."""
+    """How far a trajectory is from the truth, and whether its covariance is right."""
 
     ate_mm: float
     yaw_deg: float
@@ -43,7 +43,7 @@ class Scores:
         lost_share: of the poses, those of a robot that took itself for lost without cause.
         refused_share: of the sightings.
         update_ms: processor time of each update after the first pose.
-        found: error and sigma of what was found of the installation, by name; None if the run says nothing of it.
+        found: error and sigma of what was found of the installation, by name; None if the run found nothing of it.
         map_over_survey: error of the markers' places over that of the survey.
         textbook_mm: mean distance from the truth of each textbook pipeline, by name.
         failed: why there are no figures.
@@ -85,7 +85,7 @@ def errors(result: RunResult, config: Config, unknown_ns: tuple[int, int] | None
     Args:
         result: with its truth.
         config: of the run.
-        unknown_ns: from when until when nothing can tell where the robot is: this time is left out of the NEES.
+        unknown_ns: from when until when the pose cannot be known: this time is left out of the NEES.
 
     Raises:
         ValueError: the run and the truth have no time in common.
@@ -129,7 +129,7 @@ def refused_share(decisions: Sequence[Decision]) -> float:
 
 
 def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
-    """What is true of an installation, by the names that a run says it under.
+    """What is true of an installation, by the names that a run gives it.
 
     - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
       ``camera.focal_scale``: true over believed; ``camera.cx_px``, ``.cy_px``, ``.k1``, ``.k2``, ``.p1``, ``.p2``;
@@ -168,7 +168,7 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
 
 
 def found_by(result: RunResult) -> Found | None:
-    """What a run says of the installation, but for the learned motion's scale, which has no truth."""
+    """What a run found of the installation, but for the learned motion's scale, which has no truth."""
     told = result.installation
     if not told:
         return None
@@ -227,7 +227,7 @@ def map_over_survey(
 
 
 def places_in(found: Found) -> dict[int, FloatArray]:
-    """Places ``(3,)`` of markers of which a run says all three coordinates."""
+    """Places ``(3,)`` of markers of which a run found all three coordinates."""
     ids = {int(name.split(".")[1]) for name in found if name.startswith("map.")}
     names = {i: [f"map.{i}.{axis}" for axis in "xyz"] for i in ids}
     return {i: np.array([found[n][0] for n in names[i]]) for i in sorted(ids) if all(n in found for n in names[i])}

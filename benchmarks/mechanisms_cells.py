@@ -87,7 +87,7 @@ class Outcome:
 
 
 def run(cell: Cell) -> Outcome:
-    """Replay and score a case; what fails says why. The run with everything on is smoothed, too."""
+    """Replay and score a case; what fails has its reason. The run with everything on is smoothed, too."""
     mechanism = BY_NAME.get(cell.off)
     recorded = robot(cell.source) if isinstance(cell.source, int) else load(cell.source)
     seed = cell.source if isinstance(cell.source, int) else cell.source.seed

@@ -90,7 +90,7 @@ def mean(row_id: str, values: Sequence[float], unit: str = "") -> Row:
 
 
 def failed(row_id: str, outcomes: Sequence[Outcome]) -> Row:
-    """A row that says why there is no value."""
+    """A row without a value, with the reason."""
     why = [o.failed for o in outcomes if o.failed]
     return Row(row_id, None, n=len(outcomes), reason=f"in {len(why)} of {len(outcomes)} runs: {why[0] if why else '-'}")
 

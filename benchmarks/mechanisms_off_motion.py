@@ -71,8 +71,8 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
-        ("robust/motion_fusion.py",),
-        (Switch("fgloc.robust.motion_fusion:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
+        ("robust/motion_noise.py",),
+        (Switch("fgloc.robust.motion_noise:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
         Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _without_wheels),
         batch=True,
     ),
@@ -86,7 +86,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     ),
     Mechanism(
         "failure_kind",
-        "Tells frozen encoders and one dead wheel from slip.",
+        "Distinguishes frozen encoders and one dead wheel from slip.",
         ("robust/motion_faults.py",),
         (Switch(f"{_TRUST}:MotionFaultMonitor._failure", Returns("slip")),),
         Probe(f"{_TRUST}:MotionFaultMonitor._failure", lambda kind, *_: kind != "slip"),

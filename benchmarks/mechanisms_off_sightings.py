@@ -110,7 +110,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "blur_noise",
         "Noise of corners grows with the speed of the image.",
-        ("sensors/landmarks.py", "graph/observation.py"),
+        ("sensors/landmarks.py", "graph/corner_batch.py"),
         (Switch("fgloc.sensors.landmarks:LandmarkSensor._corner", _unblurred),),
         Probe("fgloc.sensors.landmarks:LandmarkSensor._corner", called),
         batch=True,

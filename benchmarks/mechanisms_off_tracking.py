@@ -69,7 +69,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     ),
     Mechanism(
         "start_leave_one_out",
-        "A place told by beacons must stand without any one of them.",
+        "A place found from beacons must hold without any one of them.",
         ("relocalization/global_search.py",),
         (Switch(f"{_SEARCH}:GlobalSearch._checked", Returns(True)),),
         Probe(f"{_SEARCH}:GlobalSearch._checked", lambda checked, *_: not checked),
@@ -99,7 +99,7 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
     ),
     Mechanism(
         "corrected_linearisation",
-        "Far from linear a keyframe is first linearized at the pose that its sightings tell.",
+        "Far from linear a keyframe is first linearized at the pose that its sightings give.",
         ("graph/isam2.py", "graph/joint.py"),
         (Switch(f"{_WINDOW}._linearization", _at_prediction),),
         Probe(

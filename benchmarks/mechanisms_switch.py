@@ -116,7 +116,7 @@ class Mechanism:
         purpose: what it is for.
         modules: that hold it, below ``fgloc``.
         switches: all of them together take it away.
-        probe: tells where it acts; None: it acts always, or there is no one function that tells.
+        probe: observes where it acts; None: it acts always, or no single function shows it.
         batch: whether the smoothed result can depend on it.
     """
 

@@ -1,4 +1,4 @@
-"""The simulator: physics against theory, camera against projection, speed, bags against what was said."""
+"""The simulator: physics against theory, camera against projection, speed, bags against what was written."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _coulomb_acceleration(scene: Scene, mu: float) -> float:
 
 
 def _slip_contrast(quick: bool) -> Row:
-    """How much more the wheels are wrong where the simulator says that they slip."""
+    """How much more the wheels are wrong where they slip in the simulator."""
     ratios = []
     for job in jobs(load_suite(BUNDLED), 20.0 if quick else None):
         if job.scenario.name == "patches" and (not quick or job.split == "test"):
@@ -181,10 +181,10 @@ class _Remembering(BagWriter):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, compress=True)
-        self.said: list[tuple[str, int, Any]] = []
+        self.written: list[tuple[str, int, Any]] = []
 
     def write(self, topic: str, message_type: str, message: Any, received_ns: int) -> None:
-        self.said.append((topic, received_ns, message))
+        self.written.append((topic, received_ns, message))
         super().write(topic, message_type, message, received_ns)
 
 
@@ -201,12 +201,12 @@ def _round_trip(seconds: float) -> Row:
             for _, write in sorted(messages, key=lambda m: m[0]):
                 write()
         with AnyReader([bag]) as reader:
-            heard = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
-        said = writer.said
-    wrong = abs(len(said) - len(heard))
-    for (topic, received, message), (topic_back, received_back, back) in zip(said, heard, strict=False):
+            read_back = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+        written = writer.written
+    wrong = abs(len(written) - len(read_back))
+    for (topic, received, message), (topic_back, received_back, back) in zip(written, read_back, strict=False):
         wrong += not (topic == topic_back and received == received_back and _same(message, back))
-    return Row("roundtrip.mismatches", float(wrong), None, len(said))
+    return Row("roundtrip.mismatches", float(wrong), None, len(written))
 
 
 def _can_render(scene: Scene) -> bool:

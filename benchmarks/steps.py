@@ -23,7 +23,7 @@ from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.factors import motion_factor, pose_key, prior_factor
-from fgloc.graph.isam2 import isam2_params
+from fgloc.graph.isam2_backends import isam2_params
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer

@@ -22,7 +22,6 @@ Source: Leung, Halpern, Barfoot, Liu, "The UTIAS multi-robot cooperative localiz
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,10 +40,11 @@ from datasets.convert import (
     write_robot,
 )
 from datasets.download import Remote, fetch, unpack
+from datasets.mrclam_run import Calibration, Run
 from fgloc.errors import RecordingError
 from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
-from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
+from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 ROBOTS = (1, 2, 3, 4, 5)
 _LANDMARKS = range(6, 21)  # subjects; 1 to 5 are the robots
@@ -55,30 +55,6 @@ _CORRELATION_S = 10.0  # bearing and depth errors of one landmark are still corr
 _SHARED_IN_FRAME = 1.3  # bearings of one image share half of their error; two or three are seen at a time
 _SCALE_SPREAD = 0.02  # of the range scale from robot to robot
 _BIAS_SPREAD_RAD = 0.01  # of the bearing offset
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """Constants of ``robot.yaml``, named as in `fgloc.config`."""
-
-    scale_v: float
-    scale_omega: float
-    delay_s: float
-    yaw_per_m: float  # rad/m
-    x_per_sqrt_m: float
-    y_per_sqrt_m: float
-    yaw_per_sqrt_m: float
-    xy_per_sqrt_rad: float
-    yaw_per_sqrt_rad: float
-    xy_per_sqrt_s: float
-    yaw_per_sqrt_s: float
-    range_scale: float
-    camera_x: float  # m, in the base frame
-    bearing_bias_rad: float
-    latency_s: float
-    range_sigma_m: float
-    range_sigma_per_m: float
-    bearing_sigma_rad: float
 
 
 # Robots 1 to 5, each column fitted on the other four robots of dataset 6 (printed by --fit).
@@ -107,22 +83,6 @@ _LEFT_OUT = {
 def calibration(robot: int) -> Calibration:
     """Constants for one robot, none of which has seen that robot's run of dataset 6."""
     return Calibration(**{name: row[robot - 1] for name, row in _LEFT_OUT.items()})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """One robot's files. Stamps are integer nanoseconds, in order."""
-
-    commands_ns: IntArray  # (n,)
-    commands: FloatArray  # (n, 2) v [m/s], omega [rad/s]
-    sightings_ns: IntArray  # (m,)
-    subjects: IntArray  # (m,) landmark ids, 6 to 20
-    sightings: FloatArray  # (m, 2) reported range [m], bearing [rad]
-    truth_ns: IntArray  # (k,)
-    truth: FloatArray  # (k, 3) x, y [m], yaw [rad]
-    landmarks: dict[int, tuple[float, float]]  # subject -> x, y [m]
-    robots_left_out: int  # sightings of other robots
-    unknown_left_out: int  # sightings of barcodes that no subject carries
 
 
 def read(source: Path, robot: int) -> Run:

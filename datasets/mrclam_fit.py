@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize, nnls
 
-from datasets.mrclam import Calibration, Run
+from datasets.mrclam_run import Calibration, Run
 from fgloc import se2
 from fgloc.types import FloatArray, IntArray
 

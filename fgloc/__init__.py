@@ -1,29 +1,101 @@
-"""fgloc: where a wheeled robot is, without GPS, with an honest covariance."""
+"""fgloc: where a wheeled robot is, without GPS, with an honest covariance.
+
+The public API. Everything else may change from one version to the next::
+
+    from pathlib import Path
+
+    import fgloc
+
+    config = fgloc.load_config(Path("robot.yaml"))
+    result = fgloc.run(Path("bag"), Path("map.yaml"), config, "batch")
+    result.write(Path("out"))
+
+Names are imported when they are first used: the estimator's libraries take a second to load.
+"""
 
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from fgloc.errors import (
+    CameraError,
+    ConfigError,
+    CovarianceError,
+    EstimatorError,
+    FglocError,
+    MapError,
+    ModelError,
+    OutputError,
+    RecordingError,
+    TrajectoryError,
+    WireError,
+)
+
 if TYPE_CHECKING:
-    from fgloc.live import Live as Live
+    from fgloc.config import Config, load_config
+    from fgloc.live import Live
+    from fgloc.runner import run
+    from fgloc.sensors.maps import load_map
+    from fgloc.types import Decision, Estimate, LandmarkMap, Mode, RunResult, Trajectory
+
+__all__ = [
+    "CameraError",
+    "Config",
+    "ConfigError",
+    "CovarianceError",
+    "Decision",
+    "Estimate",
+    "EstimatorError",
+    "FglocError",
+    "LandmarkMap",
+    "Live",
+    "MapError",
+    "Mode",
+    "ModelError",
+    "OutputError",
+    "RecordingError",
+    "RunResult",
+    "Trajectory",
+    "TrajectoryError",
+    "WireError",
+    "load_config",
+    "load_map",
+    "run",
+]
+
+_IMPORTED_LATE = {
+    "Config": "fgloc.config",
+    "load_config": "fgloc.config",
+    "Live": "fgloc.live",
+    "run": "fgloc.runner",
+    "load_map": "fgloc.sensors.maps",
+    "Decision": "fgloc.types",
+    "Estimate": "fgloc.types",
+    "LandmarkMap": "fgloc.types",
+    "Mode": "fgloc.types",
+    "RunResult": "fgloc.types",
+    "Trajectory": "fgloc.types",
+}
 
 try:
     __version__ = version("fgloc")
 except PackageNotFoundError:  # run from a source tree that is not installed
     __version__ = "0+unknown"
 
-
-def __getattr__(name: str) -> Any:
-    """`Live`, imported when it is asked for: it loads the estimator's libraries."""
-    if name == "Live":
-        from fgloc.live import Live
-
-        return Live
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
 # Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel. OpenCV reads this when it
 # is loaded, and keeps to it whatever the format.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 24))
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first used."""
+    if name not in _IMPORTED_LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_IMPORTED_LATE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -20,9 +20,20 @@ from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.global_search import InitialPose
 from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
 from fgloc.robust.association import Association
-from fgloc.robust.decision_log import flag_notes, motion_decisions, moved_notes, place_decision
+from fgloc.robust.decision_log import (
+    JUMP,
+    OVERRULED,
+    flag_notes,
+    mode_decisions,
+    motion_decisions,
+    moved_notes,
+    place_decision,
+    segment_decision,
+)
+from fgloc.robust.landmark_modes import ALARM
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
-from fgloc.robust.motion_fusion import MotionFusion, with_noise
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration
@@ -98,6 +109,7 @@ class Localizer:
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
+        self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
         self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
         self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
 
@@ -135,6 +147,8 @@ class Localizer:
         """The clock jumped, or this is the first step: nothing connects the robot to where it was."""
         if self._keep_all:
             self.finish()
+        if self._segment not in (-1, step.segment):
+            self._clock_jumps.append(segment_decision(self.estimator.k + 1, step.start_ns))
         self._segment = step.segment
         self.sources.begin_segment()
         self.motion_faults.begin(step)
@@ -166,7 +180,8 @@ class Localizer:
         if belief is None:
             return None
         cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
-        return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED)
+        told = mode_decisions(self.estimator.k + 1, step.stamp_ns, Mode.UNCONFIRMED, self._tracking.blind_s, np.nan)
+        return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED, told)
 
     def _replay(self, started: InitialPose) -> list[Estimate]:
         """Run the collected steps through the estimator."""
@@ -242,6 +257,8 @@ class Localizer:
             if not believed and not self._tracking.keeps_initial_pose:
                 fit = self.association.nearby_consensus(refused, weighed, predicted)
             if fit is not None:
+                fitted = PoseWithCovariance(fit.pose, fit.cov)
+                decisions.append(place_decision(k, step.stamp_ns, predicted, fitted, OVERRULED))
                 extra_cov = np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2)
                 motions = [with_noise(m, extra_cov=extra_cov) for m in motions]
                 self.rejections["motion.overruled"] += 1
@@ -265,9 +282,7 @@ class Localizer:
         moved = self._judge_landmarks(step, motions, predicted, believed, kept)
         frame = self.estimator.log.keyframes[k]
         frame.readings, frame.off, frame.scale, frame.extra_cov = readings, trust.off, trust.scale, extra_cov
-        decisions += motion_decisions(
-            k, motions, readings, trust.off, "overruled by sightings" if fit is not None else "", trust.scale
-        )
+        decisions += motion_decisions(k, motions, readings, trust.off, OVERRULED if fit is not None else "", trust)
         return self._estimate(step, frame.belief, [*decisions, *weighed, *moved])
 
     def _associate(
@@ -300,19 +315,8 @@ class Localizer:
             self.estimator.correct(without, moved)
             self.sources.begin_segment()  # no motion leads from where it was thought to be
             self.motion_faults.reset()
-        return [
-            Decision(
-                self.estimator.k,
-                step.stamp_ns,
-                "place",
-                moved,
-                math.sqrt(evidence),
-                evidence,
-                2,
-                1.0,
-                "landmark_moved",
-            )
-        ]
+        nis, k = evidence, self.estimator.k
+        return [Decision(k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", ALARM)]
 
     def _revise(self, k: int, trust: FaultVerdict) -> list[Decision]:
         """Weigh the motion of the steps before this one anew, back to where the disagreement began.
@@ -331,14 +335,14 @@ class Localizer:
                 continue
             if motions := self.sources.combine_again(frame):
                 changed[frame.k] = motions
-                decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "", frame.scale)
+                decisions += motion_decisions(frame.k, motions, frame.readings, frame.off, "", trust)
         self.estimator.revise(changed)
         return decisions
 
     def _found(self, step: Step, place: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         """Go on from a place that nothing connects with where the robot was believed to be."""
         if self.estimator.belief is not None:
-            told = place_decision(self.estimator.k + 1, step.stamp_ns, self.estimator.belief, place, "jump")
+            told = place_decision(self.estimator.k + 1, step.stamp_ns, self.estimator.belief, place, JUMP)
             decisions = [*decisions, told]
             self._tracking.found(self.estimator.belief, place)
         self.rejections["motion.jump"] += 1
@@ -346,7 +350,7 @@ class Localizer:
         self.motion_faults.reset()
         self.association.forget_contradictions()
         estimate = self._start(step, place, ())
-        return dataclasses.replace(estimate, decisions=tuple(decisions))
+        return dataclasses.replace(estimate, decisions=(*decisions, *estimate.decisions))
 
     def _get_lost(self) -> None:
         self.association.modes.forget()
@@ -359,7 +363,10 @@ class Localizer:
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + self._tracking.lost_cov(belief)
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
-        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, tuple(decisions))
+        after_s = self.config.estimator.dead_reckoning_after_s
+        modes = mode_decisions(self.estimator.k, step.stamp_ns, frame.mode, self._tracking.blind_s, after_s)
+        jumps, self._clock_jumps = self._clock_jumps, []
+        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*jumps, *decisions, *modes))
 
     def _by_clock(self, step: Step) -> FloatArray:
         """Covariance ``(3, 3)`` of the pose that comes from the clock to which the others are compared."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
 from fgloc.sensors.remembered import RememberedDetections
-from fgloc.smoothing import smooth_run
+from fgloc.smoothing import SmoothedRun, smooth_run
 from fgloc.threads import one_blas_thread
 from fgloc.types import (
     CornersEvent,
@@ -35,6 +36,7 @@ from fgloc.types import (
     Estimate,
     Event,
     ImageEvent,
+    InstallationFound,
     RunResult,
     SightingsEvent,
     Step,
@@ -56,6 +58,28 @@ def find_beside(bag: Path, name: str) -> Path | None:
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
+class RunOptions(TypedDict, total=False):
+    """What `run` takes besides, by keyword.
+
+    Attributes:
+        pace: replay at this multiple of real time; None: as fast as possible.
+        on_step: called after each step (online displays, benchmarks).
+        events: filter of the recorded events (ablations).
+        sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
+        detections: file that remembers what was found in the images, for other runs of the same ones.
+        check: look for gross mistakes of the set-up first, and run with those undone that are sure; afterwards, where a
+            clock seems to be wrong, run again with it corrected, to see whether it is. True if not given; not done on
+            filtered events.
+    """
+
+    pace: float | None
+    on_step: Callable[[Step, Estimate | None], None] | None
+    events: EventFilter | None
+    sightings: EventFilter | None
+    detections: Path | None
+    check: bool
+
+
 @one_blas_thread
 def run(
     recording_path: Path,
@@ -63,12 +87,7 @@ def run(
     config: Config,
     mode: RunMode,
     progress: Progress | None = None,
-    pace: float | None = None,
-    on_step: Callable[[Step, Estimate | None], None] | None = None,
-    events: EventFilter | None = None,
-    sightings: EventFilter | None = None,
-    detections: Path | None = None,
-    check: bool = True,
+    **options: Unpack[RunOptions],
 ) -> RunResult:
     """Localise one recording.
 
@@ -78,87 +97,153 @@ def run(
         config: all settings.
         mode: "batch" smooths after the replay; "online" keeps the filtered estimates.
         progress: called now and then.
-        pace: replay at this multiple of real time; None: as fast as possible.
-        on_step: called after each step (online displays, benchmarks).
-        events: filter of the recorded events (ablations).
-        sightings: likewise, of the events once the markers are found: after detection, without images on the recorded.
-        detections: file that remembers what was found in the images, for other runs of the same ones.
-        check: look for gross mistakes of the set-up first, and run with those undone that are sure; afterwards, where a
-            clock seems to be wrong, run again with it corrected, to see whether it is. Not done on filtered events.
+        options: as `RunOptions` has them.
 
     Raises:
         FglocError: the input cannot be used, or no pose was ever found.
     """
     began = time.perf_counter()
-    check = check and events is None and sightings is None
+    check = options.get("check", True) and options.get("events") is None and options.get("sightings") is None
     wrong = find_mistakes(recording_path, map_path, config) if check else Mistakes((), config)
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
-        memory = None
-        if parts.detector is not None:
-            memory = RememberedDetections(detections, parts.detector, wrong.detections, note=detections is not None)
-        replay = _Replay(parts, recording.roles, memory, recording.duration_s, progress, pace, sightings)
-        replay.run(recording.events() if events is None else events(recording.events()), on_step)
-        if mode == "batch" or not replay.estimates:
-            replay.make_up(parts.localizer.finish(replay.blind))
-        if memory is not None:
-            memory.save()
+        replay = _replayed(recording, parts, mode, wrong, progress, options)
+        outcome = _Outcome.of(recording, parts, replay, wrong)
+    if not replay.estimates:
+        raise EstimatorError(outcome.failed(_never_found(replay, outcome.rejections)))
+    smoothed = _smoothed(parts, outcome) if mode == "batch" else None
+    all_estimates = replay.estimates if smoothed is None else smoothed.estimates
+    estimates = last_pass(all_estimates)
+    installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
+    found, tried = installation_found(parts, outcome.roles, installed), None
+    if check and not wrong.sentences and options.get("on_step") is None:
+        trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
+        tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))
+    notes = _notes(wrong, outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))
+    result = _result(parts, replay, outcome, estimates, smoothed)
+    return replace(
+        result,
+        notes=notes,
+        source=recording_path,
+        config=config,
+        found=found,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def _notes(
+    wrong: Mistakes,
+    outcome: _Outcome,
+    smoothed: SmoothedRun | None,
+    left_out: int,
+    tried: str | None,
+    found: InstallationFound,
+) -> tuple[str, ...]:
+    """What the user should know, as sentences, the gravest first."""
+    notes = (
+        *outcome.mistakes[len(wrong.sentences) :],
+        *wrong.notes,
+        *(() if tried is None else (tried,)),
+        *outcome.notes,
+        *(() if smoothed is None else smoothed.notes),
+        *_left_out(left_out),
+        *contradictions(found),
+    )
+    return tuple(dict.fromkeys(map(_sentence, notes)))
+
+
+def _replayed(
+    recording: Recording,
+    parts: Assembly,
+    mode: RunMode,
+    wrong: Mistakes,
+    progress: Progress | None,
+    options: RunOptions,
+) -> _Replay:
+    """Run all events through the localizer."""
+    memory, file = None, options.get("detections")
+    if parts.detector is not None:
+        memory = RememberedDetections(file, parts.detector, wrong.detections, note=file is not None)
+    replay = _Replay(parts, recording, memory, progress, options)
+    replay.run(recording.events())
+    if mode == "batch" or not replay.estimates:
+        replay.make_up(parts.localizer.finish(replay.blind))
+    if memory is not None:
+        memory.save()
+    return replay
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What the replay found besides poses: read while the recording is open.
+
+    Attributes:
+        roles: topics by role.
+        rejections: everything refused anywhere, by reason.
+        mistakes: of the set-up, gross and sure; before the run and after it.
+        hints: what surely does not fit together.
+        untried: what seems to be wrong with the clocks, and was not tried.
+        notes: what the user should know of the replay.
+    """
+
+    roles: Mapping[Role, str]
+    rejections: Counter[str]
+    mistakes: tuple[str, ...]
+    hints: tuple[str, ...]
+    untried: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, recording: Recording, parts: Assembly, replay: _Replay, wrong: Mistakes) -> _Outcome:
+        """Collect it from the parts of a run."""
         hints, untried = _hints(recording, parts, replay)
-        notes = (
-            *hints,
-            *recording.notes,
-            *replay.clocks.notes,
-            *parts.sentences,
-        )
+        notes = (*hints, *recording.notes, *replay.clocks.notes, *parts.sentences)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
-        roles = recording.roles
-    seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
-    mistakes = (*wrong.sentences, *unused_sightings(rejections, roles, seen))
-    if not replay.estimates:
-        raise EstimatorError(" ".join([*mistakes, _never_found(replay, rejections), *hints, *untried]))
+        seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
+        mistakes = (*wrong.sentences, *unused_sightings(rejections, recording.roles, seen))
+        return cls(recording.roles, rejections, mistakes, tuple(hints), tuple(untried), notes)
+
+    def failed(self, why: str) -> str:
+        """Message of a run that failed: what is wrong with the set-up, why it failed, what may be the cause."""
+        return " ".join([*self.mistakes, why, *self.hints, *self.untried])
+
+
+def _smoothed(parts: Assembly, outcome: _Outcome) -> SmoothedRun:
     try:
-        smoothed = smooth_run(parts) if mode == "batch" else None
+        return smooth_run(parts)
     except EstimatorError as error:
-        raise EstimatorError(" ".join([*mistakes, _sentence(str(error)), *hints, *untried])) from error
-    estimates = last_pass(replay.estimates if smoothed is None else smoothed.estimates)
+        raise EstimatorError(outcome.failed(_sentence(str(error)))) from error
+
+
+def _result(
+    parts: Assembly,
+    replay: _Replay,
+    outcome: _Outcome,
+    estimates: list[Estimate],
+    smoothed: SmoothedRun | None,
+) -> RunResult:
+    """The result of the replay and the smoothing; `run` adds the rest."""
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
-    found = installation_found(parts, roles, installed)
-    tried = None
-    if check and not wrong.sentences and on_step is None:
-        trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
-        tried = clock_note(trials, config, partial(_tried, recording_path, map_path, detections))
-    notes = (
-        *mistakes[len(wrong.sentences) :],
-        *wrong.notes,
-        *(() if tried is None else tried[:1]),
-        *notes,
-        *(() if smoothed is None else smoothed.notes),
-        *_left_out(len(replay.estimates if smoothed is None else smoothed.estimates) - len(estimates)),
-        *contradictions(found if tried is None else tried[1]),
-    )
     return RunResult(
         trajectory=_trajectory(estimates),
         modes=tuple(e.mode for e in estimates),
         decisions=tuple(replay.decisions),
         counts=dict(parts.localizer.counts),
-        rejections=dict(sorted(rejections.items())),
-        notes=tuple(dict.fromkeys(map(_sentence, notes))),
+        rejections=dict(sorted(outcome.rejections.items())),
+        notes=(),
         step_ms=np.array(replay.step_ms),
-        wall_s=time.perf_counter() - began,
+        wall_s=0.0,
         truth=replay.truth.trajectory(),
         landmarks=parts.landmark_map if smoothed is None else smoothed.landmarks,
         spans=replay.spans(),
-        source=recording_path,
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),
-        found=found,
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
-        mistakes=mistakes,
-        config=config,
+        mistakes=outcome.mistakes,
     )
 
 
@@ -186,25 +271,25 @@ class _Replay:
     def __init__(
         self,
         parts: Assembly,
-        roles: Mapping[Role, str],
+        recording: Recording,
         detector: Detector | None,
-        duration_s: float,
         progress: Progress | None,
-        pace: float | None,
-        sightings: EventFilter | None,
+        options: RunOptions,
     ) -> None:
         self._parts = parts
         self._detector = detector
-        self._duration_s = duration_s
+        self._duration_s = recording.duration_s
         self._progress = progress
-        self._pace = pace
-        self._sightings = sightings if sightings is not None else iter
+        self._pace = options.get("pace")
+        self._on_step = options.get("on_step")
+        self._events: EventFilter = options.get("events") or iter
+        self._sightings: EventFilter = options.get("sightings") or iter
         self._image_rejections: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
         self.blind = True  # no image and no sighting was recorded, not even an unusable one
-        self.activity = TopicActivity(roles)
+        self.activity = TopicActivity(recording.roles)
         self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
         self.estimates: list[Estimate] = []
@@ -223,15 +308,15 @@ class _Replay:
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
-    def run(self, events: Iterator[Event], on_step: Callable[[Step, Estimate | None], None] | None) -> None:
+    def run(self, events: Iterator[Event]) -> None:
         """Localise, step by step."""
-        for step in self.steps(events):
+        for step in self.steps(self._events(events)):
             start = time.perf_counter()
             estimate = self._parts.localizer.update(step)
             self.record(step, estimate, (time.perf_counter() - start) * 1e3)
             self._parts.diagnosis.observe(step, self._parts.wheels.measure(step))
-            if on_step is not None:
-                on_step(step, estimate)
+            if self._on_step is not None:
+                self._on_step(step, estimate)
 
     def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note one step's outcome."""

@@ -17,6 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fgloc import se2
+from fgloc.errors import TrajectoryError
+
 if TYPE_CHECKING:
     from fgloc.config import Config
 
@@ -360,17 +363,21 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What became of one measurement: a row of ``steps.csv``."""
+    """What became of one measurement, or of the pose: a row of ``steps.csv``."""
 
     step: int
     stamp_ns: int
-    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "prior"
+    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "place", "mode", "clock"
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float
     dof: int
     weight: float  # 1 as given, less if inflated, 0 if rejected
     reason: str  # "" if used as given
+    threshold: float = math.nan  # that the NIS is held against; NaN: none
+    shift_m: float = (
+        math.nan
+    )  # of a motion: how much further forward than its reference; of a place: from the believed pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -394,6 +401,31 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def interpolate(self, stamp_ns: int | IntArray) -> FloatArray:
+        """Poses between the known ones: linear in x and y, and in yaw the shorter way round.
+
+        Args:
+            stamp_ns: one time, or ``(m,)`` times, between the first and the last of ``stamps_ns``.
+
+        Returns:
+            ``(3,)`` for one time, else ``(m, 3)``.
+
+        Raises:
+            TrajectoryError: the trajectory is empty, or a time lies outside it.
+        """
+        if not len(self):
+            raise TrajectoryError("the trajectory is empty: nothing to interpolate")
+        asked = np.atleast_1d(np.asarray(stamp_ns, dtype=np.int64))
+        first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
+        outside = asked[(asked < first) | (asked > last)]
+        if outside.size:
+            raise TrajectoryError(
+                f"stamp {outside[0]} ns lies outside the trajectory; expected {first} to {last} ns. fgloc.Live "
+                "extrapolates beyond the last pose"
+            )
+        poses = se2.interpolate(self.stamps_ns, self.poses, asked)
+        return poses[0] if np.ndim(stamp_ns) == 0 else poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -473,3 +505,19 @@ class RunResult:
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
     mistakes: tuple[str, ...] = ()  # of the set-up, gross and sure; the first notes too
     config: Config | None = None  # as the run used it: with the mistakes undone
+
+    def write(self, folder: Path) -> None:
+        """Write all files of the run, as ``fgloc smooth`` and ``fgloc online`` do; see ``docs/formats.md``.
+
+        Args:
+            folder: made if missing; an error leaves what was there as it was.
+
+        Raises:
+            OutputError: the folder cannot be written.
+            TrajectoryError: a pose is not finite.
+            CovarianceError: a covariance is not positive definite.
+        """
+        from fgloc.config import Config
+        from fgloc.evaluation.report import write_results
+
+        write_results(self, self.config or Config(), folder, "fgloc.RunResult.write")

@@ -101,7 +101,7 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     blind = sentence(SUITE, runs, "blind")
     assert blind.startswith("Blind at 2 s: the mean error of 'full' rises from 10 to 150 mm over 2 runs")
     assert "1 of 3 runs gave no figure" in blind
-    assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they say nothing about it."
+    assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they show nothing about it."
 
 
 def test_worst_case_is_the_largest_error(bag):

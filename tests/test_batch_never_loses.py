@@ -91,7 +91,7 @@ def test_a_map_but_no_sightings_at_all(tmp_path, mode):
     assert span_s(result) > (9.5 if mode == "batch" else 4.5)  # online keeps no more than the search looks at
     assert set(result.modes) == {Mode.LOST}
     assert result.first_pose_s is None
-    assert any("never told where on the map" in note for note in result.notes)
+    assert any("never determined where on the map" in note for note in result.notes)
     relative = result.trajectory.poses[:, :2] - result.trajectory.poses[0, :2]
     assert np.hypot(*relative[len(relative) // 2]) > 0.3
 

@@ -174,3 +174,32 @@ def test_a_small_marker_is_not_believed_but_a_slanted_one_is(gate):
     slanted = SQUARE * np.array([0.1, 1.0])
     assert gate.check(corners(1.1, at=slanted)) is not None
     assert gate.rejections == {"sightings.corners_small": 1}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "reverse"])
+@pytest.mark.parametrize("axis", range(3))
+def test_speeds_are_bounded_in_both_directions(gate, sign, axis):
+    bound = GateConfig().max_speed
+    linear = np.zeros(3)
+    linear[axis] = sign * 1.01 * bound
+    event = gate.check(odometry(1.0, linear=linear))
+    assert np.isnan(event.linear).all()
+    assert gate.rejections == {"odometry.twist_speed_bound": 1}
+    linear[axis] = sign * 0.99 * bound
+    kept = odometry(1.1, linear=linear)
+    assert gate.check(kept) is kept
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "reverse"])
+def test_commands_are_bounded_in_both_directions(gate, sign):
+    config = GateConfig()
+    assert gate.check(command(1.0, sign * 1.01 * config.max_speed)) is None
+    assert gate.check(command(1.1, 0.0, sign * 1.01 * config.max_yaw_rate)) is None
+    assert gate.rejections == {"command.speed_bound": 1, "command.yaw_rate_bound": 1}
+    kept = command(1.2, sign * 0.99 * config.max_speed, sign * 0.99 * config.max_yaw_rate)
+    assert gate.check(kept) is kept
+
+
+def test_yaw_rates_of_odometry_are_bounded_in_both_directions(gate):
+    gate.check(odometry(1.0, twist=(0.0, -1.01 * GateConfig().max_yaw_rate)))
+    assert gate.rejections == {"odometry.twist_yaw_rate_bound": 1}

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation import consistency, metrics
-from fgloc.evaluation.metrics import Matched, align_se2, match, relative_error, transform
+from fgloc.evaluation.matching import Matched, align_se2, match, transform
+from fgloc.evaluation.metrics import relative_error
 from fgloc.frames import yaw_quaternion
 from fgloc.types import Trajectory
 

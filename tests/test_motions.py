@@ -20,7 +20,9 @@ from fgloc.graph.joint import fuse, predict
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.localizer import Localizer
 from fgloc.robust.decision_log import motion_decisions
-from fgloc.robust.motion_fusion import MotionFusion, with_noise
+from fgloc.robust.motion_faults import FaultVerdict
+from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model
@@ -213,7 +215,7 @@ def test_factors_made_again_keep_what_sightings_said_against_them():
 def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, off, scale, weights):
     readings = MotionReadings(WHEELS, LEARNED)
     made = sources(learned_motion(tmp_path)).combine(readings, off, scale)
-    rows = {d.kind: d for d in motion_decisions(3, made, readings, off, "", scale)}
+    rows = {d.kind: d for d in motion_decisions(3, made, readings, off, "", FaultVerdict(scale=scale))}
     assert (rows["wheels"].weight, rows["learned"].weight) == pytest.approx(weights)
     for m in made:
         given = {"wheels": W, "learned": N}[m.source]

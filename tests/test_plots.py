@@ -51,6 +51,7 @@ KEYS = [
     "rejections",
     "installation",
     "mistakes",
+    "judgements",
 ]
 CONFIG = Config()
 COMMAND = 'fgloc smooth "first <run>" --out out'
@@ -143,8 +144,8 @@ def names(axes):
 
 def test_timeline_shows_silence_and_every_flag():
     figure = plot_timeline(figure_eight())
-    assert names(panel(figure, "heard")) == ["/odom (600)", "/camera (200)"]
-    assert [len(bars.get_paths()) for bars in panel(figure, "heard").collections] == [1, 2]
+    assert names(panel(figure, "received")) == ["/odom (600)", "/camera (200)"]
+    assert [len(bars.get_paths()) for bars in panel(figure, "received").collections] == [1, 2]
     assert names(panel(figure, "flags")) == ["corners: gate (30)"]
     assert len(panel(figure, "flags").collections[0].get_paths()) == 30
 
@@ -298,7 +299,7 @@ def test_report_tells_all_and_escapes(written):
         "odometry&#x27;s &lt;twist&gt; is zero",
         "odometry.duplicate_stamp",
         "LOST 33.3 %",
-        "do not trust these stretches",
+        "do not use these stretches",
         "matched at 200 of 300 keyframes",
         "c0ffee",
     ):

@@ -94,7 +94,7 @@ def test_a_given_pose_that_is_right_is_confirmed_and_then_no_better_than_any_oth
     (leap,) = [i for i, far in enumerate(leaps(estimates)) if far > 0.3]
     assert estimates[leap + 1] is e
     (note,) = [n for n in chain.localizer.notes if "jumped by" in n]
-    assert "sightings contradicted the believed pose: jumped by 2.4" in note  # across the circle
+    assert "sightings contradicted the estimated pose: jumped by 2.4" in note  # across the circle
     assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates if seconds(e) > 10.5]) < 0.01
 
 

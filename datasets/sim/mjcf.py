@@ -199,22 +199,26 @@ def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
         _wheel(base, robot, joint, index)
         _motor(actuator, robot.motor, joint)
     if robot.kind == "diff_drive":
-        _add(
-            base,
-            "geom",
-            name="caster",
-            type="sphere",
-            size=(_CASTER_RADIUS_M,),
-            pos=(-robot.caster_behind_m, 0, _CASTER_RADIUS_M),
-            condim=3,
-            priority=3,
-            friction=(robot.contact.caster_friction, 0.001, 0.0001),
-            solref=robot.contact.solref,
-            solimp=robot.contact.solimp,
-            mass=0,
-        )
+        _caster(base, robot)
     if robot.payload is not None:
         _payload(base, actuator, robot.payload)
+
+
+def _caster(base: ET.Element, robot: Robot) -> None:
+    _add(
+        base,
+        "geom",
+        name="caster",
+        type="sphere",
+        size=(_CASTER_RADIUS_M,),
+        pos=(-robot.caster_behind_m, 0, _CASTER_RADIUS_M),
+        condim=3,
+        priority=3,
+        friction=(robot.contact.caster_friction, 0.001, 0.0001),
+        solref=robot.contact.solref,
+        solimp=robot.contact.solimp,
+        mass=0,
+    )
 
 
 def _wheel(base: ET.Element, robot: Robot, joint: str, index: int) -> None:

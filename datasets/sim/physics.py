@@ -96,7 +96,7 @@ def simulate(scene: Scene) -> Log:
     n = round(scenario.duration_s / TICK_S) + 1
     all_q, all_v, all_force = np.empty((n, model.nq)), np.empty((n, model.nv)), np.empty((n, model.nu))
     commands: list[tuple[float, float, float]] = []
-    heard: deque[tuple[int, float, float]] = deque()
+    delayed: deque[tuple[int, float, float]] = deque()
     set_point = (0.0, 0.0)
     for tick in range(-round(_SETTLE_S / TICK_S), n):
         if tick >= 0:
@@ -104,9 +104,9 @@ def simulate(scene: Scene) -> Log:
             if tick % every_command == 0:
                 wanted = driver.command(tick * TICK_S, _planar(qpos))
                 commands.append((tick * TICK_S, *wanted))
-                heard.append((tick + delay, *wanted))
-            while heard and heard[0][0] <= tick:
-                set_point = heard.popleft()[1:]
+                delayed.append((tick + delay, *wanted))
+            while delayed and delayed[0][0] <= tick:
+                set_point = delayed.popleft()[1:]
         if tick % every_regulation == 0:
             ctrl[: len(names)] = regulator.volts(set_point, qpos[q].tolist())
             if robot.payload is not None:
@@ -117,15 +117,34 @@ def simulate(scene: Scene) -> Log:
         mujoco.mj_step(model, data, nstep=substeps)
     if not (np.isfinite(all_q).all() and np.abs(all_v).max() < _DIVERGED):
         raise SimulationError(f"{scenario.name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
+    wheels = (all_q[:, q], all_v[:, v], all_force[:, : len(names)])
+    return _log(all_q, all_v, wheels, commands)
+
+
+def _log(
+    q: FloatArray,
+    v: FloatArray,
+    wheels: tuple[FloatArray, FloatArray, FloatArray],
+    commands: list[tuple[float, float, float]],
+) -> Log:
+    """The log of a run.
+
+    Args:
+        q: positions ``(n, nq)`` at each tick, the base first.
+        v: velocities ``(n, nv)``.
+        wheels: angles, rates and torques of the wheels, each ``(n, wheels)``.
+        commands: time [s], forward speed [m/s], yaw rate [rad/s].
+    """
+    angles, rates, torques = wheels
     return Log(
-        stamps_s=np.arange(n) * TICK_S,
-        positions=all_q[:, :3],
-        quaternions=np.roll(all_q[:, 3:7], -1, axis=1),
-        velocities=all_v[:, :3],
-        rates=all_v[:, 3:6],
-        wheel_angles=np.ascontiguousarray(all_q[:, q]),
-        wheel_rates=np.ascontiguousarray(all_v[:, v]),
-        torques=all_force[:, : len(names)],
+        stamps_s=np.arange(len(q)) * TICK_S,
+        positions=q[:, :3],
+        quaternions=np.roll(q[:, 3:7], -1, axis=1),
+        velocities=v[:, :3],
+        rates=v[:, 3:6],
+        wheel_angles=np.ascontiguousarray(angles),
+        wheel_rates=np.ascontiguousarray(rates),
+        torques=torques,
         commands=np.array(commands),
     )
 

@@ -147,7 +147,7 @@ def execute(job: Job, out: Path) -> str:
     try:
         outcome = {"outcome": "done", **_localise(job, out)}
     except OutputError:
-        raise  # a full disk says nothing of the job
+        raise  # a full disk is no property of the job
     except FglocError as error:
         outcome = {"outcome": "refused", "error": f"{type(error).__name__}: {error}"}
     except Exception:  # a bug: the sweep goes on, and the report lists it

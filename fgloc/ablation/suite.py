@@ -1,4 +1,4 @@
-"""What a suite file says: recordings × failures × severities × variants × seeds."""
+"""A suite file: recordings × failures × severities × variants × seeds."""
 
 from __future__ import annotations
 

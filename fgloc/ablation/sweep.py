@@ -33,7 +33,7 @@ def sweep(
     """Run all jobs that have no record yet; return all records by key.
 
     A job whose record exists is not run again: a sweep that was killed goes on where it was. A job that fails, or that
-    kills its worker again and again, gets a record that says so, and is left alone afterwards.
+    kills its worker again and again, gets a record with that outcome, and is not run again.
 
     Args:
         jobs: from `make_jobs`.
@@ -61,19 +61,22 @@ def sweep(
     out = out.resolve()
     with _client(min(workers or os.cpu_count() or 1, len(todo)), scheduler) as client:
         for key, error in _finished(client, todo, out):
-            if error is not None and not record_path(out, key).exists():
-                write_record(
-                    out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
-                )
-            record = read_record(out, key)
-            if record is None:
-                raise OutputError(
-                    f"{record_path(out, key)}: was written by a worker, but is not here: do all see {out}?"
-                )
-            records[key] = record
+            records[key] = _recorded(out, key, error)
             if progress is not None:
                 progress(len(records), len(unique))
     return records
+
+
+def _recorded(out: Path, key: str, error: str | None) -> Record:
+    """The record of a job that ended; written here if its worker could not."""
+    if error is not None and not record_path(out, key).exists():
+        write_record(
+            out, Record(key=key, outcome="crashed", error=error, cost=Cost(seconds=0.0, cpu_s=0.0, peak_mb=0.0))
+        )
+    record = read_record(out, key)
+    if record is None:
+        raise OutputError(f"{record_path(out, key)}: was written by a worker, but is not here: do all see {out}?")
+    return record
 
 
 def _by_turns(jobs: Sequence[Job]) -> list[Job]:

@@ -134,7 +134,7 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     if not any(run.record.affected for run in here if run.record.outcome == "done") and all(
         run.record.outcome == "done" for run in here
     ):
-        return f"{name}{at} changed no message of these recordings: they say nothing about it."
+        return f"{name}{at} changed no message of these recordings: they show nothing about it."
     without = {run.cell.recording: ATE.of(run.record) for run in select(runs, NOTHING, None, variant)}
     pairs = [
         (before, after)

@@ -85,12 +85,12 @@ def clock_note(
         return None
     has_gyro = any(s.name == "gyro.scale" for s in result.found.settings)
     name, against = _names(trial.role, has_gyro)
-    said = (
+    sentence = (
         f"The stamps of the {name} are {abs(late):.3f} ± {sigma:.3f} s {'late' if late > 0 else 'early'} against the "
         f"{against}: set recording.stamp_offset_s: {{{trial.role}: {setting:.3f}}}; tried, and the recording fits "
         "better."
     )
-    return said, result.found
+    return sentence, result.found
 
 
 def _late(s: Setting) -> bool:

@@ -1,8 +1,8 @@
 """Which given values of the installation a run contradicts, in sentences with the line to be set.
 
 A careful installation is off by its prior sigmas, and finding that is what the state is for: it is no reason to write.
-Said is what the measurements alone have further off than three sigmas of the two together (`Setting.off`), and what was
-found further off than three of its own: of 20 parameters of a careful installation one in every 19 runs.
+Reported is what the measurements alone have further off than three sigmas of the two together (`Setting.off`), and
+what was found further off than three of its own: of 20 parameters of a careful installation one in every 19 runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from fgloc.types import InstallationFound, Setting
 
-_SURE = 3.0  # sigmas, of what was found and of what was given
+SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given
 _SURE_2 = 11.8  # χ² of two degrees of freedom, as rare as three sigmas of one
 _MOST_NAMED = 5  # landmarks
 
@@ -22,13 +22,13 @@ _MOST_NAMED = 5  # landmarks
 def contradictions(found: InstallationFound) -> tuple[str, ...]:
     """A sentence for every given value that is contradicted, one for all landmarks; clocks: `clock_trials`."""
     off = [s for s in found.settings if not s.name.startswith("stamp_offset_s.") and contradicted(s)]
-    said = [f"{s.name} is {_number(s)}, {s.given:.6g} was given: set {_line(s)}." for s in off]
-    return (*said, *_landmarks(found))
+    sentences = [f"{s.name} is {_number(s)}, {s.given:.6g} was given: set {_line(s)}." for s in off]
+    return (*sentences, *_landmarks(found))
 
 
 def contradicted(s: Setting) -> bool:
     """Whether what was found is surely further from what was given than that may be off."""
-    return abs(s.off) > _SURE and abs(s.found - s.given) > _SURE * s.sigma
+    return abs(s.off) > SURE_SIGMAS and abs(s.found - s.given) > SURE_SIGMAS * s.sigma
 
 
 def _landmarks(found: InstallationFound) -> Iterator[str]:

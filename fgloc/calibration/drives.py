@@ -38,7 +38,7 @@ _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """One recording, its trajectory known from odometry and from what single views say of the markers.
+    """One recording, its trajectory known from odometry and from single views of the markers.
 
     Attributes:
         bag: the recording.
@@ -152,11 +152,13 @@ def _check(bag: Path, recording: Recording, config: Config) -> None:
         raise RecordingError(f"{bag}: no images and no corners of markers: nothing to survey; see `fgloc info {bag}`")
     if "image" in recording.roles and not config.markers.dictionary:
         fitting = fitting_dictionary(recording)
-        told = f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
-        raise ConfigError(f"{bag}: no marker dictionary; {told}, or markers.dictionary in --config")
+        listed = (
+            f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
+        )
+        raise ConfigError(f"{bag}: no marker dictionary; {listed}, or markers.dictionary in --config")
     if config.markers.default_size_m is None:
         raise ConfigError(
-            f"{bag}: how large the markers are tells how far away they are: give the side of the black square in "
+            f"{bag}: the distance of markers follows from their size: give the side of the black square in "
             "metres, --size 0.16, or markers.default_size_m in --config"
         )
 

@@ -1,4 +1,4 @@
-"""Where markers are, about: what single views say of each, and where two surveys of some of them agree to be one."""
+"""Approximate poses of markers: from single views of each, and by aligning two surveys that share some of them."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from fgloc.types import Camera, FloatArray, LandmarkMap
 Found = Mapping[str, tuple[float, float]]
 """Value and sigma by name."""
 
+_Row = tuple[str, str, float, float]  # name, parameter of the installation, value at 0, change by the parameter
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # optical axes in body axes (REP 103)
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -35,43 +36,65 @@ def found_values(
       ``camera.focal_scale``, ``.cx_px``, ``.cy_px``, ``.k1``, ``.k2``;
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
-    out: dict[str, tuple[float, float]] = {}
-    sigma = np.sqrt(np.diag(belief.cov))
-
-    def add(name: str, source: str, at: float = 0.0, gain: float = 1.0) -> None:
-        if source in installation.index:
-            i = installation.index[source]
-            out[name] = (at + gain * float(belief.mean[i]), abs(gain) * float(sigma[i]))
-
-    add("wheels.radius_scale", "wheels.radius", 1.0)
-    add("wheels.track_scale", "wheels.track", 1.0)
-    track = config.wheels.track
-    if track is not None:
-        add("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -track)
-    else:
-        add("wheels.yaw_per_m", "wheels.yaw_per_m", config.wheels.yaw_per_m)
-    for name in ("slowdown", "delay_s"):
-        add(f"wheels.{name}", f"wheels.{name}", getattr(config.wheels, name))
-    add("gyro.scale", "gyro.scale", 1.0, -1.0)
-    add("learned.scale", "learned.scale", 1.0)
-    add("wheels.time_offset_s", "wheels.time_offset_s")
-    for name in ("range_scale", "bearing_offset_rad", "time_offset_s"):
-        add(f"sightings.{name}", f"sightings.{name}", 1.0 if name == "range_scale" else 0.0)
+    out = _values([*_motion_rows(config), *_sighting_rows()], installation, belief)
     if camera is not None and "camera" in installation.blocks:
         first = installation.blocks["camera"][0]
         out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
-        D = np.concatenate([camera.D, np.zeros(2)])
-        add("camera.focal_scale", "camera.focal", 1.0)
-        add("camera.cx_px", "camera.cx_px", float(camera.K[0, 2]))
-        add("camera.cy_px", "camera.cy_px", float(camera.K[1, 2]))
-        add("camera.k1", "camera.k1", float(D[0]))
-        add("camera.k2", "camera.k2", float(D[1]))
-        add("camera.time_offset_s", "camera.time_offset_s")
+        out |= _values(_lens_rows(camera), installation, belief)
     for i in installation.landmarks if landmark_map is not None else ():
-        place = landmark_map.landmarks[i].position  # type: ignore[union-attr]
-        for axis, at in zip("xyz", place.tolist(), strict=True):
-            add(f"map.{i}.{axis}", f"map.{i}.{axis}_m", at)
+        place = landmark_map.landmarks[i].position.tolist()  # type: ignore[union-attr]
+        rows = [(f"map.{i}.{axis}", f"map.{i}.{axis}_m", at, 1.0) for axis, at in zip("xyz", place, strict=True)]
+        out |= _values(rows, installation, belief)
     return out
+
+
+def _values(
+    rows: Iterable[_Row], installation: Installation, belief: InstallationBelief
+) -> dict[str, tuple[float, float]]:
+    """Value and sigma of those rows whose parameter is estimated."""
+    sigma = np.sqrt(np.diag(belief.cov))
+    out = {}
+    for name, parameter, at, gain in rows:
+        if parameter in installation.index:
+            i = installation.index[parameter]
+            out[name] = (at + gain * float(belief.mean[i]), abs(gain) * float(sigma[i]))
+    return out
+
+
+def _motion_rows(config: Config) -> list[_Row]:
+    track = config.wheels.track
+    return [
+        ("wheels.radius_scale", "wheels.radius", 1.0, 1.0),
+        ("wheels.track_scale", "wheels.track", 1.0, 1.0),
+        ("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -track)
+        if track is not None
+        else ("wheels.yaw_per_m", "wheels.yaw_per_m", config.wheels.yaw_per_m, 1.0),
+        ("wheels.slowdown", "wheels.slowdown", config.wheels.slowdown, 1.0),
+        ("wheels.delay_s", "wheels.delay_s", config.wheels.delay_s, 1.0),
+        ("gyro.scale", "gyro.scale", 1.0, -1.0),
+        ("learned.scale", "learned.scale", 1.0, 1.0),
+        ("wheels.time_offset_s", "wheels.time_offset_s", 0.0, 1.0),
+    ]
+
+
+def _sighting_rows() -> list[_Row]:
+    return [
+        ("sightings.range_scale", "sightings.range_scale", 1.0, 1.0),
+        ("sightings.bearing_offset_rad", "sightings.bearing_offset_rad", 0.0, 1.0),
+        ("sightings.time_offset_s", "sightings.time_offset_s", 0.0, 1.0),
+    ]
+
+
+def _lens_rows(camera: Camera) -> list[_Row]:
+    k1, k2 = np.concatenate([camera.D, np.zeros(2)])[:2]
+    return [
+        ("camera.focal_scale", "camera.focal", 1.0, 1.0),
+        ("camera.cx_px", "camera.cx_px", float(camera.K[0, 2]), 1.0),
+        ("camera.cy_px", "camera.cy_px", float(camera.K[1, 2]), 1.0),
+        ("camera.k1", "camera.k1", float(k1), 1.0),
+        ("camera.k2", "camera.k2", float(k2), 1.0),
+        ("camera.time_offset_s", "camera.time_offset_s", 0.0, 1.0),
+    ]
 
 
 def mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:

@@ -17,7 +17,7 @@ from fgloc.graph.observation import Observations
 from fgloc.types import CornerMeasurement, FloatArray, Landmark
 
 _STEPS = 12
-_MOST = 25.0  # of the squared Mahalanobis distance of a view: more says that it is of another marker
+_MOST = 25.0  # of the squared Mahalanobis distance of a view: above it the view is of another marker
 _ABSURD = 1e4  # sigmas of a residual: its derivatives mean nothing
 _SAME_RAD = 0.08  # two solutions nearer than this are one
 _DAMPING = 1e-3

@@ -15,11 +15,11 @@ from fgloc.runner import Progress, find_beside, run
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _SIGHTINGS = ("corners", "range_bearing", "marker_pose")
-_ROUNDS = 2  # with the gains of the first, sightings are believed and refused that were not before
+_ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before
 _WHEELS = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # before anything was seen
 _COMMANDS = _WHEELS | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
 _FAR = 3.0  # of these sigmas that a gain may move at most
-_UNSEEN = 0.95  # share of its sigma that is left to a gain of which nothing was heard
+_UNSEEN = 0.95  # share of its sigma that is left to a gain that no measurement determines
 
 
 def calibrate(
@@ -55,10 +55,10 @@ def calibrate(
 def _check(settings: Sequence[Setting]) -> None:
     wheels = [s for s in settings if s.name.startswith("wheels.")]
     if any(abs(s.found - s.given) > _FAR * s.prior_sigma for s in wheels):
-        told = ", ".join(f"{s.name.partition('.')[2]} {s.found:.4f} ± {s.sigma:.4f}" for s in wheels)
+        listed = ", ".join(f"{s.name.partition('.')[2]} {s.found:.4f} ± {s.sigma:.4f}" for s in wheels)
         raise EstimatorError(
-            f"the wheels cannot be calibrated on this run: {told} is no robot's; see the rejections of `fgloc smooth`, "
-            "and begin with gains that are less far off"
+            f"the wheels cannot be calibrated on this run: {listed} is no robot's; see the rejections of "
+            "`fgloc smooth`, and begin with gains that are less far off"
         )
 
 
@@ -73,14 +73,14 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
             break
     if not any(result.counts.get(kind) for kind in _SIGHTINGS):
         raise EstimatorError(
-            f"{bag}: no sighting of a landmark was used, and without sightings nothing tells what the wheels' gains "
-            f"are; see `fgloc info {bag}`"
+            f"{bag}: no sighting of a landmark was used, and without sightings nothing determines the "
+            f"gains of the wheels; see `fgloc info {bag}`"
         )
     assert result.found is not None
     radius = next((s for s in result.found.settings if s.name == "wheels.scale_v"), None)
     if not result.found.wheels or radius is None or radius.sigma > _UNSEEN * radius.prior_sigma:
         raise EstimatorError(
-            f"{bag}: nothing was heard of wheels, or of commands in their place, between sightings: see wheels.source "
+            f"{bag}: no messages of wheels, or of commands in their place, between sightings: see wheels.source "
             f"and `fgloc info {bag}`"
         )
     return result

@@ -1,4 +1,4 @@
-"""What a run has found of the installation as settings: the lines of ``robot.yaml`` and the map that say it."""
+"""What a run has found of the installation as settings: the lines of ``robot.yaml`` and the map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fgloc.sensors.cameras import pinhole
 from fgloc.types import Camera, FloatArray, InstallationFound, LandmarkMap, Setting
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-_MOST_LOG_SCALE = 20.0  # of a run that went astray; larger ones are no numbers
+_MOST_LOG_SCALE = 20.0  # of a run that diverged; larger ones overflow
 _SIGMAS = {  # the field that takes the sigma of settings back; of several the largest
     "wheels.scale_v": "wheels.scale_sigma",
     "wheels.scale_omega": "wheels.turn_scale_sigma",

@@ -71,29 +71,14 @@ def survey(
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
     sizes = dict.fromkeys(seen, config.markers.default_size_m or 0.0) | {i: m.size_m for i, m in anchors.items()}
     legs, start, left_out = _joined(drives, sizes, anchors, config.landmarks.min_sightings)
-    absent = [i for d in distances for i in (d.first, d.second) if i not in start]
-    if absent:
-        raise MapError(
-            f"marker {absent[0]}, to which a distance was measured, {left_out.get(absent[0], 'was not seen')}; "
-            f"surveyed are {sorted(start)}"
-        )
+    _need_ends(distances, start, left_out)
     graph = SurveyGraph(legs, start, set(anchors), config, distances)
     graph.solve()
     surveyed, views = graph.landmarks(), graph.views()
-    for i in sorted(set(surveyed) - set(anchors)):
-        sigma = np.sqrt(np.diag(surveyed[i].cov))  # type: ignore[arg-type]
-        if views[i] < config.landmarks.min_sightings:
-            left_out[i] = f"{views[i]} of its sightings fit the rest"
-        elif i in graph.undecided:
-            left_out[i] = "its views fit two directions alike: look at it from the side and from nearer"
-        elif sigma[:3].max() > _KNOWN_M or sigma[3:].max() > _KNOWN_RAD:
-            left_out[i] = (
-                f"known to {100.0 * sigma[:3].max():.0f} cm and {np.degrees(sigma[3:].max()):.0f} degrees only: look "
-                "at it from nearer and from several places"
-            )
+    left_out |= _undetermined(graph, surveyed, views, set(anchors), config.landmarks.min_sightings)
     if not set(surveyed) - set(left_out):
-        told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{bags[0]}: no marker can be surveyed: {told}")
+        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
+        raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
     dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
@@ -105,6 +90,34 @@ def survey(
     misfits = [(d, graph.misfit(d)) for d in distances]
     notes += [_missed(d, sigmas) for d, sigmas in misfits if sigmas > _CONTRADICTS]
     return Survey(landmarks, {i: views[i] for i in kept}, left_out, found, tuple(dict.fromkeys(notes)))
+
+
+def _need_ends(distances: Sequence[Distance], start: Mapping[int, Landmark], left_out: Mapping[int, str]) -> None:
+    absent = [i for d in distances for i in (d.first, d.second) if i not in start]
+    if absent:
+        raise MapError(
+            f"marker {absent[0]}, to which a distance was measured, {left_out.get(absent[0], 'was not seen')}; "
+            f"surveyed are {sorted(start)}"
+        )
+
+
+def _undetermined(
+    graph: SurveyGraph, surveyed: Mapping[int, Landmark], views: Mapping[int, int], anchors: set[int], least: int
+) -> dict[int, str]:
+    """Markers that the solution does not determine well enough for a map, with the reason."""
+    left_out = {}
+    for i in sorted(set(surveyed) - anchors):
+        sigma = np.sqrt(np.diag(surveyed[i].cov))  # type: ignore[arg-type]
+        if views[i] < least:
+            left_out[i] = f"{views[i]} of its sightings fit the rest"
+        elif i in graph.undecided:
+            left_out[i] = "its views fit two directions alike: look at it from the side and from nearer"
+        elif sigma[:3].max() > _KNOWN_M or sigma[3:].max() > _KNOWN_RAD:
+            left_out[i] = (
+                f"known to {100.0 * sigma[:3].max():.0f} cm and {np.degrees(sigma[3:].max()):.0f} degrees only: look "
+                "at it from nearer and from several places"
+            )
+    return left_out
 
 
 def _joined(
@@ -135,8 +148,8 @@ def _joined(
         free = bool(anchors) or bool(legs)
         legs.append(Leg(one, moved_poses(motion, one.poses), _agreeing(guesses), free))
     if not known:
-        told = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {told or 'none was seen'}")
+        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
+        raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {listed or 'none was seen'}")
     start = {
         i: anchors[i] if i in anchors else Landmark(i, T[:3, 3], T[:3, :3], sizes[i]) for i, T in sorted(known.items())
     }

@@ -117,7 +117,7 @@ class SurveyGraph:
                 self._log(factors), factors, self._config.batch, self._config.estimator.gate_probability
             )
             self.belief, self._poses = solver.installed(), solver.poses()
-            self._views = Counter(s.measurement.landmark_id for held in solver.believed.values() for s in held)
+            self._views = Counter(s.measurement.landmark_id for held in solver.accepted.values() for s in held)
             better = self._look_from_the_other_side(solver)
             if self._still() and not better:
                 break
@@ -135,11 +135,11 @@ class SurveyGraph:
         return out
 
     def views(self) -> Counter[int]:
-        """Sightings that are believed, by marker."""
+        """Accepted sightings, by marker."""
         return self._views
 
     def misfit(self, d: Distance) -> float:
-        """By how many sigmas a distance that is in the graph differs from what all else says of it.
+        """By how many sigmas a distance that is in the graph differs from its estimate by everything else.
 
         What is left of a difference r with variance S, once a measurement of variance R is in, is r R / S, and the
         variance of the value is R - R² / S.
@@ -211,11 +211,11 @@ class SurveyGraph:
                 if frame.prior is not None:
                     origin = n == 0 and not leg.free
                     prior = PoseWithCovariance(frame.prior.pose, _ORIGIN) if origin else PoseWithCovariance(pose, _FREE)
-                believed: list[LandmarkFactor] = []
+                accepted: list[LandmarkFactor] = []
                 refused: list[LandmarkFactor] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
-                    (believed if agrees else refused).append(factors.sighting(k, m, cauchy_k(m, self._config)))
+                    (accepted if agrees else refused).append(factors.sighting(k, m, cauchy_k(m, self._config)))
                 log.keyframes[k] = Keyframe(
                     k,
                     frame.stamp_ns,
@@ -223,7 +223,7 @@ class SurveyGraph:
                     PoseWithCovariance(pose, _FREE),
                     prior,
                     frame.motions,
-                    tuple(believed),
+                    tuple(accepted),
                     tuple(refused),
                 )
         return log

@@ -28,8 +28,10 @@ from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:
+    from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
 
+_TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
@@ -56,7 +58,9 @@ def demo(
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
-        result, metrics = _localise(SAMPLE, None, None, None, folder, "batch" if mode == "batch" else "online", text)
+        result, metrics = _localise(
+            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
+        )
         runs.append((mode, metrics))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
@@ -85,7 +89,7 @@ def smooth(
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    result, metrics = _localise(bag, map_file, model, config, out, "batch", typed())
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
     _finish(result, metrics, out, rrd)
 
 
@@ -98,9 +102,9 @@ def online(
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
 ) -> None:
-    """Replay the recording as a live robot would hear it; each pose knows only what came before."""
+    """Replay the recording as on a live robot; each pose depends only on what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    result, metrics = _localise(bag, map_file, model, config, out, "online", typed(), pace)
+    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
     _finish(result, metrics, out, rrd)
 
 
@@ -130,8 +134,7 @@ def calibrate(
 def _localise(
     bag: Path,
     map_file: Path | None,
-    model: Path | None,
-    config_file: Path | None,
+    config: Config,
     out: Path,
     mode: Literal["batch", "online"],
     command: str,
@@ -146,14 +149,16 @@ def _localise(
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
-    config = resolved(configured(bag, config_file, model), map_path)
+    config = resolved(config, map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace)
+        result = run(bag, map_path, config, mode, progress, pace=pace)
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
 def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
     """Say what came out, and write it for rerun's viewer."""
+    from fgloc.evaluation.judgements import gravest
+
     if rrd is not None:
         from fgloc.view.file import write_rrd
 
@@ -167,6 +172,8 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) ->
     for mistake in result.mistakes:
         say(f"mistake: {mistake}")
     say(columns(None, rows))
+    for judgement in gravest(metrics.judgements, _TOLD):
+        say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
     for note in result.notes:
         if note not in result.mistakes:
             say(f"note: {note}")

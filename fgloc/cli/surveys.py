@@ -96,7 +96,7 @@ def _tell(found: Survey, out: Path) -> None:
 
 
 def _with_markers(settings: Config, dictionary: str | None, size: float | None, given: LandmarkMap | None) -> Config:
-    """The configuration with what the command line or the given map says of the markers."""
+    """The configuration with the markers of the command line or the given map."""
     if size is not None and not 0.0 < size <= 5.0:
         raise ConfigError(f"--size {size:g}: expected the side of the black square in metres, more than 0 and up to 5")
     markers = settings.markers

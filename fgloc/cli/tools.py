@@ -39,10 +39,11 @@ def evaluate(
 ) -> None:
     """Compare two TUM trajectories."""
     from fgloc.evaluation import metrics
+    from fgloc.evaluation.matching import match
     from fgloc.recording.outputs import read_tum
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
-    matched = metrics.match(read_tum(estimate), read_tum(truth), kind, max_gap)
+    matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
     drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0, "m")
     rows = [
         ("poses matched", f"{len(matched.stamps_ns)}"),

@@ -1,4 +1,4 @@
-"""What the whole run says about the set-up: clocks, scales, mountings and maps that do not fit together."""
+"""Faults of the set-up, from a whole run: clocks, scales, mountings and maps that do not fit together."""
 
 from fgloc.diagnosis.diagnosis import Diagnosis
 

@@ -26,7 +26,7 @@ from fgloc.types import (
 SPAN_S = 8.0  # sightings of a window
 MARGIN_S = 1.2  # wheel motion before and after them, for clocks that differ
 _MOST_SPOTS = 150
-_SPARSE_S = 0.09  # events closer than this to the one before say little new
+_SPARSE_S = 0.09  # events closer than this to the one before add little information
 _FLOOR_RAD, _FLOOR_M, _FLOOR_SHARE = 0.01, 0.02, 0.01  # what wheels err over a window, whatever the sensor's noise
 
 

@@ -1,4 +1,4 @@
-"""The diagnosis of a run: watches its steps, and says at the end what of the set-up does not fit together."""
+"""The diagnosis of a run: observes its steps, and reports at the end what of the set-up does not fit together."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MIN_SCALE = 0.03
 _MIN_TURN = 0.03  # rad
 _MIN_ARM_M = 0.05
 _SAME_SCALE = 0.02
-_BELIEVABLE = 1.5  # times how large faults may be: what is larger stands in for something that is not modeled
+_PLAUSIBLE = 1.5  # times how large faults may be: what is larger stands in for something that is not modeled
 _MODEL_S, _MODEL_SHARE, _MODEL_DEG, _MODEL_M = 0.003, 0.002, 0.2, 0.005  # what this model of a robot leaves out
 _GROSS_SHARE, _GROSS_KEPT = 0.5, 6
 _ALL_GROSS = 0.8  # without an explanation fewer may be the wheels' slipping
@@ -36,8 +36,8 @@ class Diagnosis:
     """Takes in the steps of a run, in bounded memory, whatever the estimator makes of them.
 
     It finds constant and drifting offsets between the clocks of sightings, wheels and gyro; wrong scales (focal length,
-    marker size, map); a sensor that is not where the transform says; and a map that no motion fits. Only what is many
-    sigmas from right, and matters, is said.
+    marker size, map); a sensor that is not where its transform puts it; and a map that no motion fits. Only what is
+    many sigmas from right, and matters, is reported.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Diagnosis:
 
         Args:
             step: as the localizer got it.
-            wheels: their motion over the step; None if they said nothing.
+            wheels: their motion over the step; None without a measurement.
         """
         self._cutter.begin(step)
         for event in step.sightings:
@@ -114,7 +114,7 @@ class Diagnosis:
         if self._started is None and segment == 0 and self._known is not None:
             self._started = _start(fit, travelled)
 
-    # --- what is said ---
+    # --- the report ---
 
     def clock_offsets(self, source: str) -> dict[str, float]:
         """Values of ``recording.stamp_offset_s`` by role, as the windows suggest them; to be tried."""
@@ -129,7 +129,7 @@ class Diagnosis:
 
         Args:
             source: where wheel motion came from: "ticks", "odometry", "command" or "".
-            offsets: tell constant offsets of clocks too; they have not been tried.
+            offsets: report constant offsets of clocks too; they have not been tried.
         """
         if self._known is not None and self._gross_count > _GROSS_SHARE * max(self._tried, 3):
             found = explanation(self._gross, self._place, self._known, self._camera)
@@ -144,8 +144,8 @@ class Diagnosis:
                 )
         faults = self._faults.constant()
         notes = [*self._clocks(faults, source, offsets), *self._first_pose()]
-        believable = bool((np.abs(faults.values) < _BELIEVABLE * PRIOR_SIGMAS).all())
-        if self._known is not None and believable:
+        plausible = bool((np.abs(faults.values) < _PLAUSIBLE * PRIOR_SIGMAS).all())
+        if self._known is not None and plausible:
             notes += [*self._scales(faults), *self._mounting(faults)]
         return tuple(notes)
 
@@ -243,9 +243,9 @@ class Diagnosis:
 
     def _first_pose(self) -> Iterator[str]:
         """A first pose that was given and is not where the sightings put it: one of the two frames is shifted."""
-        said = None if self._started is None else first_pose_sentence(self._config, self._started)
-        if said is not None:
-            yield said
+        sentence = None if self._started is None else first_pose_sentence(self._config, self._started)
+        if sentence is not None:
+            yield sentence
 
 
 def _sure(pooled: Pooled, i: int, least: float) -> bool:

@@ -48,12 +48,12 @@ class Mistakes:
     @property
     def notes(self) -> tuple[str, ...]:
         """The sentences, and that the run did not follow the settings as given."""
-        said = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
-        return (*self.sentences, *said)
+        sentence = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
+        return (*self.sentences, *sentence)
 
 
 def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:
-    """Check an excerpt of a recording against what is said of map, camera, wheels, clocks and frames.
+    """Check an excerpt of a recording against what is given of map, camera, wheels, clocks and frames.
 
     Args:
         path: recording.
@@ -61,7 +61,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
         config: as given.
 
     Raises:
-        FglocError: the input cannot be used, as `fgloc.runner.run` would say too.
+        FglocError: the input cannot be used, as `fgloc.runner.run` would raise too.
     """
     found = _Search(path, map_path, config)
     found.run()
@@ -145,7 +145,7 @@ class _Search:
         return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
 
     def _images(self, recording: Recording, parts: Assembly) -> bool:
-        """Say why no marker is found; whether another dictionary finds them."""
+        """Report why no marker is found; whether another dictionary finds them."""
         assert parts.detector is not None
         hints, fitting = image_hints(recording, parts.detector)
         self.sentences += hints
@@ -172,13 +172,13 @@ class _Search:
         poses = checked.corrected.poses
         stamps = np.array([p.stamp_ns for s in checked.stretches for p in s.pictures], dtype=np.int64)
         started = self._started(excerpt, int(stamps[0]), poses[0])
-        said = None if started is None else first_pose_sentence(self.config, started)
-        if said is not None:
-            self.sentences.append(said)
+        sentence = None if started is None else first_pose_sentence(self.config, started)
+        if sentence is not None:
+            self.sentences.append(sentence)
             self._change("estimator", initial_pose=None)
-        said = truth_sentence(self.config, excerpt.truth, stamps, poses)
-        if said is not None:
-            self.sentences.append(said)
+        sentence = truth_sentence(self.config, excerpt.truth, stamps, poses)
+        if sentence is not None:
+            self.sentences.append(sentence)
             self._change("truth", align="se2")
 
     def _started(self, excerpt: Excerpt, stamp_ns: int, pose: FloatArray) -> FloatArray | None:

@@ -61,7 +61,9 @@ def _hypotheses(camera: bool) -> list[Hypothesis]:
     over = np.diag([-1.0, -1.0, 1.0]) if camera else np.diag([1.0, -1.0, -1.0])
     found = [Hypothesis(f"the {what} is mounted upside down", mounted, place=_turned(over))]
     for degrees, side in ((180, "backward"), (90, "to the left"), (-90, "to the right")):
-        found.append(Hypothesis(f"the {what} looks {side} of where its transform says", mounted, place=_yawed(degrees)))
+        found.append(
+            Hypothesis(f"the {what} looks {side} of the direction of its transform", mounted, place=_yawed(degrees))
+        )
     found += [
         Hypothesis(
             f"the {what}'s transform is given without the optical axes' rotation (z forward, x right, y down)",

@@ -24,9 +24,9 @@ def image_hints(recording: Recording, detector: MarkerDetector) -> tuple[tuple[s
     fitting = None if any(detector.find(image) for image in images) else suggest_dictionary(images)
     if fitting is None or fitting == detector.dictionary:
         return tuple(hints), None
-    said = f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
+    sentence = f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
 
-    return (*hints, said), fitting
+    return (*hints, sentence), fitting
 
 
 def fitting_dictionary(recording: Recording) -> str | None:

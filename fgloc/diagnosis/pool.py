@@ -94,7 +94,7 @@ def _sum(a: Evidence, b: Evidence) -> Evidence:
 
 
 def _pooled(evidence: Sequence[Evidence], prior: FloatArray) -> Pooled:
-    """Robust mean of the windows; sigmas by what leaving each of them out changes, at least what the information says.
+    """Robust mean of the windows; sigmas by leaving each of them out, at least those of the information.
 
     Source: the jackknife (Efron, "The jackknife, the bootstrap and other resampling plans", 1982, chapter 3).
     """

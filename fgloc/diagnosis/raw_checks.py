@@ -38,11 +38,12 @@ def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, Sequence[float]]
     """The sentence on such roles; ``given``: those that the configuration lists already."""
     usual = float(np.median([np.median(values) for role, values in delays.items() if role not in roles]))
     off = [float(np.median(delays[role])) - usual for role in roles]
-    said = " and ".join(
+    sentence = " and ".join(
         f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
         for role, late in zip(roles, off, strict=True)
     )
-    return f"Some stamps are of another clock ({said}): set recording.received_stamps: [{', '.join([*given, *roles])}]."
+    line = f"recording.received_stamps: [{', '.join([*given, *roles])}]"
+    return f"Some stamps are of another clock ({sentence}): set {line}."
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:
@@ -57,7 +58,7 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
         return None
     try:
         pair = wheel_names(joints[0].names, config.wheels.left_joint, config.wheels.right_joint)
-    except ConfigError:  # ambiguous: the run says so
+    except ConfigError:  # ambiguous: the run reports it
         return None
     if pair is None:
         return None

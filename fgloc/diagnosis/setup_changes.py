@@ -38,7 +38,7 @@ class Change:
         kind: of the mistake.
         setup: with the mistake undone, where it is a definite one.
         free: prior sigmas of what it leaves to be found.
-        has_gyro: whether lateness against the gyro can be told; of clocks.
+        has_gyro: whether delays against the gyro can be determined; of clocks.
     """
 
     kind: str
@@ -58,8 +58,8 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
     Args:
         setup: as given.
         fit: of it; None if there is none.
-        source: of wheel motion: "ticks" or "odometry"; others tell nothing of wheels.
-        has_gyro: whether clocks of wheels and camera can be told apart.
+        source: of wheel motion: "ticks" or "odometry"; others are no evidence on wheels.
+        has_gyro: whether clocks of wheels and camera can be distinguished.
     """
     yield Change("size", setup, {"size": _WIDE})
     yield Change("map_scale", setup, {"map_scale": _WIDE})

@@ -41,7 +41,7 @@ class Checked:
     Attributes:
         fit: of the set-up as given; None where nothing could be fitted.
         correction: of the mistake; None if there is none, or none that is sure.
-        corrected: the fit without the mistake, or `fit`; None where neither tells the poses.
+        corrected: the fit without the mistake, or `fit`; None where neither determines the poses.
         stretches: that were fitted.
     """
 
@@ -91,8 +91,8 @@ def check_fit(
         return Checked(fit, None, fit if fit is not None and fit.misfit < _SEEN_RIGHT else None, stretches)
     change, better = min(sure, key=lambda e: e[1].cost)
     wheels: Role = "joints" if excerpt.wheel_source == "ticks" else "odometry"
-    said = correction(change, setup, excerpt.wheel_source, image, wheels)
-    return Checked(fit, said, better, stretches)
+    sentence = correction(change, setup, excerpt.wheel_source, image, wheels)
+    return Checked(fit, sentence, better, stretches)
 
 
 def _small(tried: Iterable[Change], setup: Setup, fit: Fit) -> list[Change]:

@@ -16,8 +16,8 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.excerpt import Picture, Stretch
 from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
+from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
-from fgloc.graph.observation import CornerBatch
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap, MarkerCorners
@@ -35,7 +35,7 @@ _DONE = 1e-3  # share of the cost by which an iteration has to improve it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """What a run is told, and by how much the motion is changed against the excerpt's.
+    """The set-up of a run, and by how much the motion is changed against the excerpt's.
 
     Attributes:
         turned: signs or rotation of the wheels' twist ``(3, 3)``.
@@ -127,7 +127,7 @@ class Problem:
         return len(self._motion.pairs)
 
     def solve(self, poses: FloatArray | None = None, iterations: int = _ITERATIONS) -> Fit | None:
-        """Levenberg–Marquardt with Cauchy weights; None if the images do not tell where the robot was.
+        """Levenberg–Marquardt with Cauchy weights; None if the images do not determine where the robot was.
 
         Args:
             poses: ``(n, 3)`` to start from; None: wheel motion is laid onto the markers.
@@ -264,7 +264,7 @@ def usable(picture: Picture, landmark_map: LandmarkMap) -> list[MarkerCorners]:
 
 
 def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
-    """Whether the markers seen in a stretch are enough, and far enough apart, to tell where the robot was."""
+    """Whether the markers seen in a stretch are enough, and far enough apart, to determine where the robot was."""
     ids = [m.marker_id for p in stretch.pictures for m in usable(p, landmark_map)]
     places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
     return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2

@@ -89,26 +89,26 @@ def _map_scale(given: Setup, factor: float) -> Correction:
 
 def _map(change: Change, given: Setup) -> Correction:
     if change.kind == "mirrored":
-        said = (
+        sentence = (
             "The map is mirrored against what wheels and camera show: change the sign of the y of all its positions "
             "(and of its markers' directions)."
         )
     else:
         before, after = given.landmark_map.landmarks, change.setup.landmark_map.landmarks
         a, b = sorted(i for i in before if not np.array_equal(before[i].position, after[i].position))
-        said = f"The map has ids {a} and {b} in each other's place: exchange ids {a} and {b} in the map."
-    return Correction(said, given.config, change.setup.landmark_map)
+        sentence = f"The map has ids {a} and {b} in each other's place: exchange ids {a} and {b} in the map."
+    return Correction(sentence, given.config, change.setup.landmark_map)
 
 
 def _lens(change: Change, given: Setup) -> Correction:
     before, after = given.camera, change.setup.camera
     if change.kind == "distortion":
         k1, k2 = after.D[:2].tolist()
-        said = (
+        sentence = (
             f"The camera's distortion is not as given, k1 {k1_of(given):.3g}: by the markers it is about {k1:.3g}; set "
             f"camera.k1: {k1:.3f} and camera.k2: {k2:.3f}, or better calibrate it."
         )
-        return Correction(said, _set(given.config, "camera", k1=k1, k2=k2), given.landmark_map)
+        return Correction(sentence, _set(given.config, "camera", k1=k1, k2=k2), given.landmark_map)
     factor = float(after.K[0, 0] / before.K[0, 0])
     scale = given.config.camera.focal_scale * factor
     line = f"set camera.focal_scale: {scale:.4f}"
@@ -119,11 +119,11 @@ def _lens(change: Change, given: Setup) -> Correction:
         what = "is for another resolution"
     else:
         what = "has the wrong focal length"
-    said = (
+    sentence = (
         f"The camera's calibration {what}: {before.K[0, 0]:.1f} px given, {after.K[0, 0]:.1f} px seen; {line}, or "
         "better calibrate it."
     )
-    return Correction(said, _set(given.config, "camera", **values), given.landmark_map)
+    return Correction(sentence, _set(given.config, "camera", **values), given.landmark_map)
 
 
 def _mounting(change: Change, given: Setup) -> Correction:
@@ -133,8 +133,8 @@ def _mounting(change: Change, given: Setup) -> Correction:
     if change.kind == "position":
         moved = before[:3, :3].T @ (after[:3, 3] - before[:3, 3])
         x, y, z = moved
-        said = f"The camera sits {z:+.2f} m ahead, {x:+.2f} m right, {y:+.2f} m below its transform: {line}."
-        return Correction(said, config, given.landmark_map)
+        sentence = f"The camera sits {z:+.2f} m ahead, {x:+.2f} m right, {y:+.2f} m below its transform: {line}."
+        return Correction(sentence, config, given.landmark_map)
     return Correction(f"The camera {_turned(before, after)}: {line}.", config, given.landmark_map)
 
 
@@ -156,8 +156,8 @@ def _turned(before: FloatArray, after: FloatArray) -> str:
         looks.append(f"{abs(yaw):.1f}° further {'left' if yaw > 0 else 'right'}")
     if abs(pitch) > _SAID_DEG:
         looks.append(f"{abs(pitch):.1f}° further {'up' if pitch > 0 else 'down'}")
-    said = [f"{' and '.join(turned)} against its transform"] if turned else []
-    return " and ".join([*said, *([f"looks {' and '.join(looks)} than its transform says"] if looks else [])])
+    sentence = [f"{' and '.join(turned)} against its transform"] if turned else []
+    return " and ".join([*sentence, *([f"looks {' and '.join(looks)} than its transform says"] if looks else [])])
 
 
 def _degrees(angle: float) -> float:
@@ -181,11 +181,11 @@ def _geometry(kind: str, values: Mapping[str, float], given: Setup, source: str)
         return Correction(f"{what} {how}", _set(given.config, "wheels", **new), given.landmark_map)
     if source == "ticks" and wheels.left_radius is not None and wheels.right_radius is not None:
         new = {"left_radius": wheels.left_radius * factor, "right_radius": wheels.right_radius * factor}
-        said = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
+        sentence = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
     else:
         new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
-        said = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
-    return Correction(said, _set(given.config, "wheels", **new), given.landmark_map)
+        sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
+    return Correction(sentence, _set(given.config, "wheels", **new), given.landmark_map)
 
 
 def _lines(values: Mapping[str, float]) -> str:
@@ -196,12 +196,12 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
     offsets = dict(given.config.recording.stamp_offset_s)
     offset = offsets.get(role, 0.0) - late_s
     side = "late" if late_s > 0 else "early"
-    said = (
+    sentence = (
         f"The stamps of the {name} are {abs(late_s):.3f} s {side} against the others: set recording.stamp_offset_s: "
         f"{{{role}: {offset:.3f}}}."
     )
     return Correction(
-        said, _set(given.config, "recording", stamp_offset_s=offsets | {role: offset}), given.landmark_map
+        sentence, _set(given.config, "recording", stamp_offset_s=offsets | {role: offset}), given.landmark_map
     )
 
 
@@ -210,18 +210,18 @@ def _wheels(change: Change, given: Setup, source: str) -> Correction:
     if change.kind == "odometry_frame":
         c, s = change.setup.turned[:2, 0]
         angle = math.degrees(math.atan2(s, c))
-        said = (
+        sentence = (
             f"The odometry's twist is in axes turned by {-angle:.0f}° against the base: set wheels.source: pose, or "
             "correct its child_frame_id."
         )
-        return Correction(said, _set(given.config, "wheels", source="pose"), given.landmark_map)
+        return Correction(sentence, _set(given.config, "wheels", source="pose"), given.landmark_map)
     if source == "ticks" and change.kind == "exchanged" and wheels.left_joint and wheels.right_joint:
-        said = (
+        sentence = (
             "The left and the right wheel are exchanged: set wheels.left_joint: "
             f"{wheels.right_joint} and wheels.right_joint: {wheels.left_joint}."
         )
         new = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
-        return Correction(said, _set(given.config, "wheels", **new), given.landmark_map)
+        return Correction(sentence, _set(given.config, "wheels", **new), given.landmark_map)
     how = {
         "exchanged": "turn the robot the other way (left and right exchanged)",
         "reversed": "turn backward when the robot goes forward",

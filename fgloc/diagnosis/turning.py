@@ -11,7 +11,7 @@ from fgloc.diagnosis.pool import Evidence, Pool, eliminated
 from fgloc.diagnosis.window import Window
 from fgloc.types import FloatArray, ImuEvent
 
-_MIN_TURNING = 0.15  # rad/s, standard deviation of the yaw rate: less does not tell one time from another
+_MIN_TURNING = 0.15  # rad/s, standard deviation of the yaw rate: less does not distinguish one time from another
 _STARTS_S = np.arange(-1.0, 1.01, 0.1)
 _ITERATIONS = 5
 _KEPT_S = 16.0
@@ -31,7 +31,7 @@ class GyroWitness:
     """Compares yaw angles of gyro and wheels, window by window."""
 
     def __init__(self, up: FloatArray | None) -> None:
-        """``up`` ``(3,)``: the base's z axis in the IMU's frame; None: nothing is heard."""
+        """``up`` ``(3,)``: the base's z axis in the IMU's frame; None: its messages are not used."""
         self._up = up
         self.pool = Pool(np.array([2.0, 2.0]))
         self._times: list[float] = []
@@ -52,7 +52,7 @@ class GyroWitness:
             del self._times[:keep], self._rates[:keep]
 
     def compare(self, window: Window) -> bool:
-        """Add what this window says; whether the wheels slipped in it, as they and the gyro contradict each other."""
+        """Add the evidence of this window; whether the wheels slipped in it, as they and the gyro contradict."""
         times = np.array(self._times) - window.start_s
         if len(times) < 20 or np.diff(times).max() > 0.5:
             return False

@@ -1,8 +1,8 @@
 """A few seconds of wheel motion and sightings, and what systematic errors would make them fit together.
 
 Wheel odometry is good over seconds, however wrong it is over minutes: within a window, the place of the whole window is
-unknown and everything else is told by the wheels. What then remains between sightings and map is noise, or the faults
-that `Fault` lists, which are the same in every window.
+unknown and everything else is taken from the wheels. What then remains between sightings and map is noise, or the
+faults that `Fault` lists, which are the same in every window.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fgloc.types import FloatArray, IntArray
 
 _CAUCHY_K = 3.0
 _ITERATIONS = 8
-_MIN_SPREAD_M = 0.4  # of the landmarks seen: nearer together they do not tell the window's yaw
+_MIN_SPREAD_M = 0.4  # of the landmarks seen: nearer together they do not determine the window's yaw
 _MIN_SIGHTINGS = 8
 _NUDGE = 1e-5
 _POOR = 3.0  # median whitened residual above which other clock offsets are tried as starts
@@ -45,7 +45,7 @@ class Fault(IntEnum):
 
 
 PRIOR_SIGMAS = np.array([1.0, 0.5, 0.5, 0.3, 0.3, 0.2, 0.3, 0.3, 0.3])
-"""How large each fault may be: wide, to bind only what a window does not tell."""
+"""How large each fault may be: wide, to bind only what a window does not determine."""
 PRIOR_SIGMAS_NO_MAP = np.array([1.0, 0.3, 0.5, 0.01, 0.1, 0.1, 0.1, 0.1, 0.3])
 """Without a map the wheels are the measure of length."""
 
@@ -78,8 +78,8 @@ class Fit:
         place: ``T_map_start (3,)`` of the window's first pose; zeros without a map.
         misfit: median whitened residual; about 0.7 for the noise assumed; infinite if no faults make it fit.
         strain: length of the faults in units of how large they may be; 0 if the window fits as well without them, as
-            then it does not tell them (a robot that drives one circle, say).
-        evidence: what the window says of the faults.
+            then it does not determine them (as with a robot that drives one circle).
+        evidence: of the window for the faults.
     """
 
     place: FloatArray
@@ -89,7 +89,7 @@ class Fit:
 
     @property
     def gross(self) -> bool:
-        """Whether no faults of a believable size make the window fit."""
+        """Whether no faults of a plausible size make the window fit."""
         return self.misfit > _GROSS or self.strain > _STRAINED
 
 
@@ -105,7 +105,7 @@ def fit_window(
         any_clock: look for large clock offsets too, where none makes it fit.
 
     Returns:
-        None if the window does not tell its place: too few sightings, or all of one spot.
+        None if the window does not determine its place: too few sightings, or all of one spot.
     """
     problem = _Problem.make(window, T_base_sensor, known)
     if problem is None:

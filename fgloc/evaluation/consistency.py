@@ -1,4 +1,4 @@
-"""Does the covariance tell the truth? NEES, coverage, and the bounds that χ² sets for their averages.
+"""Whether the covariance is right: NEES, coverage, and the bounds that χ² sets for their averages.
 
 Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.
 """

@@ -16,8 +16,8 @@ h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--
 p.sub, figcaption, td.why { color: var(--soft); }
 code, pre { font: 13px/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 pre { background: var(--tint); padding: .8rem 1rem; overflow-x: auto; border-radius: 6px; }
-.tiles { display: flex; flex-wrap: wrap; gap: .7rem; margin: 1.2rem 0; }
-.tile { flex: 1 1 8rem; background: var(--tint); border-radius: 8px; padding: .7rem .9rem; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(7rem, 1fr)); gap: .7rem; margin: 1.2rem 0; }
+.tile { background: var(--tint); border-radius: 8px; padding: .7rem .9rem; }
 .tile b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
 .tile span { color: var(--soft); font-size: .85rem; }
 figure { margin: 1rem 0 1.6rem; } figure img { width: 100%; height: auto; display: block; }
@@ -26,6 +26,7 @@ table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .warn { border-left: 4px solid #d55e00; background: #fdf3ec; padding: .6rem 1rem; }
+.wide { overflow-x: auto; } .judged td:first-child { white-space: nowrap; font-variant-numeric: tabular-nums; }
 .columns { display: flex; flex-wrap: wrap; gap: 0 2.5rem; } .columns > section { flex: 1 1 20rem; }
 """
 

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth, and whether its covariance says so.
+"""How far an estimated trajectory is from the truth, and whether its covariance is right.
 
 Errors live in the map frame. Where the truth's frame is another one (``truth.align: se2``), the truth is moved into the
 map by the rigid motion that fits the positions best; the estimate and its covariance stay as they are.
@@ -18,14 +18,14 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.errors import TrajectoryError
 from fgloc.evaluation.consistency import coverage, nees
-from fgloc.types import RunResult, Trajectory
+from fgloc.evaluation.judgements import Judgement, judgements
+from fgloc.evaluation.matching import FEWEST, Matched, match, matchable
+from fgloc.types import RunResult
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_FEWEST = 2  # matched poses; one cannot be aligned, and is no trajectory
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled
 
 
@@ -72,6 +72,7 @@ class Metrics(BaseModel):
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
     mistakes: tuple[str, ...]  # of the set-up, in sentences
+    judgements: tuple[Judgement, ...]  # what was judged to be wrong, when, and by which evidence
 
 
 def _installation(result: RunResult) -> dict[str, FoundSetting]:
@@ -79,84 +80,6 @@ def _installation(result: RunResult) -> dict[str, FoundSetting]:
     return {
         s.name: FoundSetting(given=s.given, prior_sigma=s.prior_sigma, found=s.found, sigma=s.sigma) for s in settings
     }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Matched:
-    """An estimate and a truth at the same stamps, both in the map frame."""
-
-    stamps_ns: IntArray  # (n,)
-    estimate: FloatArray  # (n, 3)
-    truth: FloatArray  # (n, 3)
-    covs: FloatArray | None  # (n, 3, 3) of the estimate
-    T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
-
-    @property
-    def errors(self) -> FloatArray:
-        """``(n, 3)`` estimate minus truth: x, y [m] and wrapped yaw [rad]."""
-        difference = self.estimate - self.truth
-        difference[:, 2] = se2.wrap_array(difference[:, 2])
-        return difference
-
-    @property
-    def distances(self) -> FloatArray:
-        """``(n,)`` distance from the truth [m]."""
-        return np.asarray(np.hypot(*(self.estimate - self.truth)[:, :2].T))
-
-
-def match(
-    estimate: Trajectory, truth: Trajectory, align: Literal["none", "se2"] = "none", max_gap_s: float = 0.2
-) -> Matched:
-    """Bring the truth to the estimate's stamps and, if asked, into its frame.
-
-    Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
-    interpolated; elsewhere the estimate has no partner and is left out.
-
-    Raises:
-        TrajectoryError: fewer than two poses have a partner.
-    """
-    indices = _matchable(estimate, truth, max_gap_s)
-    if len(indices) < _FEWEST:
-        raise TrajectoryError(
-            f"{len(indices)} of {len(estimate)} poses have a truth at their time, expected {_FEWEST} or more: the "
-            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {max_gap_s} s are not bridged; "
-            "check the clocks, or raise the largest gap"
-        )
-    stamps = estimate.stamps_ns[indices]
-    poses = estimate.poses[indices]
-    reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
-    T_map_truth = np.zeros(3)
-    if align == "se2":
-        T_map_truth = align_se2(reference[:, :2], poses[:, :2])
-        reference = transform(T_map_truth, reference)
-    covs = None if estimate.covs is None else estimate.covs[indices]
-    return Matched(stamps, poses, reference, covs, T_map_truth)
-
-
-def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Rigid motion ``(3,)`` that takes the points ``(n, 2)`` of source nearest to those of target, in least squares.
-
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without
-    scale; in the plane the rotation has a closed form.
-    """
-    center_s, center_t = source.mean(axis=0), target.mean(axis=0)
-    s, t = source - center_s, target - center_t
-    yaw = math.atan2(float(np.sum(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])), float(np.sum(s * t)))
-    turned = se2.compose((0.0, 0.0, yaw), (*center_s, 0.0))
-    return np.array([*(center_t - turned[:2]), yaw])
-
-
-def transform(T: FloatArray, poses: FloatArray) -> FloatArray:
-    """Left-multiply poses ``(n, 3)`` by T ``(3,)``."""
-    x, y, yaw = T
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack(
-        [
-            x + c * poses[:, 0] - s * poses[:, 1],
-            y + s * poses[:, 0] + c * poses[:, 1],
-            se2.wrap_array(poses[:, 2] + yaw),
-        ]
-    )
 
 
 def ate_mean_m(matched: Matched) -> float:
@@ -255,27 +178,16 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
         mistakes=result.mistakes,
+        judgements=judgements(result),
     )
 
 
 def match_result(result: RunResult, config: Config) -> Matched | None:
     """`match` of a run with its truth; None if there is no truth or it has no pose at the run's time."""
     truth = result.truth
-    if truth is None or len(truth) == 0 or len(_matchable(result.trajectory, truth, config.truth.max_gap_s)) < _FEWEST:
+    if truth is None or len(truth) == 0 or len(matchable(result.trajectory, truth, config.truth.max_gap_s)) < FEWEST:
         return None
     return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s)
-
-
-def _matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
-    """Indices of the estimate's poses that have a truth at, or around, their stamp."""
-    if len(estimate) == 0 or len(truth) == 0:
-        return np.array([], dtype=np.int64)
-    after = np.searchsorted(truth.stamps_ns, estimate.stamps_ns)
-    inside = np.clip(after, 0, len(truth) - 1)
-    exact = truth.stamps_ns[inside] == estimate.stamps_ns
-    between = (after > 0) & (after < len(truth))
-    gap_ns = truth.stamps_ns[inside] - truth.stamps_ns[np.maximum(inside - 1, 0)]
-    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(max_gap_s * 1e9)))))
 
 
 def _frame_ends(count: int, delta: float) -> list[int]:
@@ -301,10 +213,3 @@ def _step_times(step_ms: FloatArray) -> StepTimes | None:
         return None
     median, p95, p99 = np.percentile(step_ms, [50, 95, 99]).tolist()
     return StepTimes(median=median, p95=p95, p99=p99, max=float(step_ms.max()))
-
-
-def _span(trajectory: Trajectory) -> str:
-    if len(trajectory) == 0:
-        return "nothing"
-    first, last = trajectory.stamps_ns[[0, -1]].tolist()
-    return f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s"

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from fgloc.evaluation.metrics import Matched
+from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.style import (
     BLUE,
     GREEN,

@@ -18,7 +18,9 @@ from fgloc.calibration.contradictions import contradicted
 from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
 from fgloc.evaluation.html import page, picture, table
-from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
+from fgloc.evaluation.judgements import GRAVITY, Judgement
+from fgloc.evaluation.matching import Matched
+from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_trajectory, png
 from fgloc.evaluation.timeline import plot_timeline
 from fgloc.recording.outputs import (
@@ -35,12 +37,18 @@ from fgloc.sensors.maps import write_map
 from fgloc.types import InstallationFound, IntArray, Mode, RunResult
 
 _TIMELINE = (
-    "What was heard; each motion source at the height of its weight, red where it was not believed; why; the "
-    "sightings' fit to the prediction (1 is expected); every landmark, red where it was refused; the true errors."
+    "Messages received; each motion source at the height of its weight, red where it was left out; the reasons; the "
+    "sightings' fit to the prediction (1 is expected); every landmark, red where its sightings were rejected; the true "
+    "errors."
 )
+_JUDGED = (
+    "Steps of steps.csv that say the same are one row; seconds from the first pose. The statistic is the one that "
+    "exceeds its threshold most."
+)
+_MOST_ROWS = 60  # of the table of judgements
 _INSTALLATION = (
-    "What the run found, and how well; what it cannot tell keeps its value and sigma. A value contradicts the given "
-    "one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
+    "What the run found, and how well; what it cannot determine keeps its value and sigma. A value contradicts the "
+    "given one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
 )
 FILES = (
     "trajectory.tum",
@@ -108,12 +116,16 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
 def installation_yaml(found: InstallationFound, config: Config, folder: Path, command: str) -> str:
     """The configuration of the run with what it has found, for ``--config``; goes with the run's ``map.yaml``."""
     rows = [f"#   {s.name}: {s.given:.6g} -> {s.found:.6g} +- {s.sigma:.2g}" for s in found.settings]
-    head = [f"# {command}", "# Given -> found +- sigma; whatever a run cannot tell keeps its value and sigma.", *rows]
+    head = [
+        f"# {command}",
+        "# Given -> found +- sigma; whatever a run cannot determine keeps its value and sigma.",
+        *rows,
+    ]
     return "\n".join(head) + "\n" + yaml_of(with_settings(config, found.settings), folder)
 
 
 def _slips(result: RunResult, config: Config) -> IntArray | None:
-    """When a wheel truly slipped, if the recording is still there and tells."""
+    """When a wheel truly slipped, if the recording is still there and has it."""
     if result.source is None or not result.source.exists():
         return None
     with open_recording(result.source, config.recording) as recording:
@@ -135,6 +147,7 @@ def render(
         _tiles(metrics),
         _truth_line(result, matched),
         _modes(result.modes),
+        _judged(metrics.judgements),
         _list("Notes", result.notes),
         "<h2>Trajectory</h2>",
         picture(pictures["trajectory"], "Trajectory", "The estimate with 3σ ellipses over the truth and the map."),
@@ -182,8 +195,19 @@ def _truth_line(result: RunResult, matched: Matched | None) -> str:
 def _modes(modes: Sequence[Mode]) -> str:
     counts = Counter(modes)
     shares = ", ".join(f"{mode} {100.0 * counts[mode] / len(modes):.1f} %" for mode in Mode if counts[mode])
-    lost = " The robot was LOST for part of the run: do not trust these stretches." if counts[Mode.LOST] else ""
+    lost = " The robot was LOST for part of the run: do not use these stretches." if counts[Mode.LOST] else ""
     return f"<p{' class=warn' if lost else ''}>Modes: {shares}.{lost}</p>"
+
+
+def _judged(found: Sequence[Judgement]) -> str:
+    """One table of what was judged to be wrong, when, by which evidence, and what that cost or saved."""
+    if not found:
+        return "<h2>What was judged wrong</h2><p>Nothing.</p>"
+    shown = set(map(id, sorted(found, key=lambda j: (GRAVITY[j.kind], -j.rows))[:_MOST_ROWS]))
+    rows = [(j.when, j.what, j.evidence, j.effect) for j in found if id(j) in shown]
+    rest = f" {len(found) - len(rows)} more are in metrics.json." if len(found) > len(rows) else ""
+    content = table(("when", "what", "evidence", "effect"), rows, numbers=0)
+    return f'<h2>What was judged wrong</h2><p>{_JUDGED}{rest}</p><div class="wide judged">{content}</div>'
 
 
 def _figures(metrics: Metrics) -> str:
@@ -218,11 +242,11 @@ def _figures(metrics: Metrics) -> str:
 
 def _sensors(result: RunResult) -> str:
     rows = []
-    for name, heard in result.spans.items():
-        steps = np.diff(np.sort(heard.times)) / heard.every
+    for name, topic in result.spans.items():
+        steps = np.diff(np.sort(topic.times)) / topic.every
         rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
-        rows.append((name, heard.count, rate, f"{heard.longest_silence_s:.2f}" if heard.count > 1 else "–"))
-    return table(("topic", "items", "rate [Hz]", "longest silence [s]"), rows, numbers=3)
+        rows.append((name, topic.count, rate, f"{topic.longest_silence_s:.2f}" if topic.count > 1 else "–"))
+    return table(("topic", "messages", "rate [Hz]", "longest gap [s]"), rows, numbers=3)
 
 
 def _installation(result: RunResult) -> str:

@@ -1,4 +1,4 @@
-"""What a run made of what it heard, over time: sources and their weights, sightings and their fit, flags, errors."""
+"""A run over time: messages received, weights of the sources, fit of the sightings, flags, errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from fgloc.evaluation.metrics import Matched
+from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.style import (
     BLUE,
     GAP_S,
@@ -51,7 +51,7 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     Args:
         result: the run.
         matched: estimate and truth, for the errors.
-        slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator told.
+        slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator recorded them.
     """
     motions = [d for d in result.decisions if d.kind in _SOURCES]
     sightings = [d for d in result.decisions if d.landmark_id >= 0]
@@ -59,8 +59,8 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     known = [d for d in sightings if math.isfinite(d.nis) and d.dof > 0]
     panels: list[Panel] = []
     if result.spans:
-        heard = {f"{topic} ({h.count})": h.times for topic, h in result.spans.items()}
-        panels.append((len(heard), lambda axes: _activity(axes, result, "heard", heard, GREY, bridge=True)))
+        received = {f"{topic} ({t.count})": t.times for topic, t in result.spans.items()}
+        panels.append((len(received), lambda axes: _activity(axes, result, "received", received, GREY, bridge=True)))
     if motions:
         panels.append((1.5 * len({d.kind for d in motions}), lambda axes: _weights(axes, result, motions)))
     if flags:
@@ -105,9 +105,9 @@ def _handles(result: RunResult, motions: Sequence[Decision], known: bool, truth:
         handles.append(Patch(color=BLUE, label="used as given"))
     if any(0.0 < d.weight <= _FULL for d in motions):
         handles.append(Patch(color=ORANGE, label="inflated"))
-    handles.append(Patch(color=RED, label="not believed"))
+    handles.append(Patch(color=RED, label="left out, rejected"))
     if known:
-        handles.append(Line2D([], [], color=BLUE, marker=".", linestyle="none", label="sighting believed"))
+        handles.append(Line2D([], [], color=BLUE, marker=".", linestyle="none", label="sighting accepted"))
     if truth:
         handles += [Patch(color=SKY, alpha=0.55, label="1σ"), Patch(color=SKY, alpha=0.25, label="3σ")]
     if slips:
@@ -119,7 +119,7 @@ def _flags(result: RunResult, decisions: Sequence[Decision]) -> dict[str, FloatA
     """When each reason was given, the most frequent ones, by the order of kinds."""
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
     for d in decisions:
-        if d.reason or d.weight == 0.0:
+        if d.kind != "mode" and (d.reason or d.weight == 0.0):  # modes are shaded
             found[d.kind, d.reason or "weight 0"].append(d.stamp_ns)
     common = sorted(found, key=lambda key: -len(found[key]))[:_MAX_FLAGS]
     return {
@@ -176,8 +176,8 @@ def _weights(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> No
 
 def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
     """NIS of the sightings over its expected value."""
-    for believed, color, marker in ((True, BLUE, "."), (False, RED, "x")):
-        chosen = [d for d in decisions if (d.weight > 0.0) == believed]
+    for accepted, color, marker in ((True, BLUE, "."), (False, RED, "x")):
+        chosen = [d for d in decisions if (d.weight > 0.0) == accepted]
         ratio = np.clip([d.nis / d.dof for d in chosen], 1e-2, 1e4)
         times = seconds(result, [d.stamp_ns for d in chosen])
         axes.plot(times, ratio, color=color, marker=marker, markersize=4, mew=0.9, linestyle="none")
@@ -188,13 +188,13 @@ def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
 
 
 def _landmarks(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
-    """A row for each landmark: when it was believed, and when not."""
+    """A row for each landmark: when its sightings were accepted, and when not."""
     seen = Counter(d.landmark_id for d in decisions)
     ids = sorted(i for i, _ in seen.most_common(_MAX_LANDMARKS))
     span = max(float(np.ptp(_poses(result))), 1.0)
     for row, landmark_id in enumerate(ids):
-        for believed, color in ((True, BLUE), (False, RED)):
-            stamps = [d.stamp_ns for d in decisions if d.landmark_id == landmark_id and (d.weight > 0.0) == believed]
+        for accepted, color in ((True, BLUE), (False, RED)):
+            stamps = [d.stamp_ns for d in decisions if d.landmark_id == landmark_id and (d.weight > 0.0) == accepted]
             bars = _bars(np.unique(seconds(result, stamps)), span, bridge=False)
             axes.broken_barh(bars, (row - 0.35, 0.7), color=color, lw=0)
     _rows(axes, "landmark", [str(i) for i in ids])

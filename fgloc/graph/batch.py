@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -16,30 +13,26 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
+from fgloc.graph.batch_solve import estimated_landmarks, initial_values, solvable, with_deep_stack, without_orphans
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
     installed_motion_factor,
-    landmark_key,
     pose_key,
     prior_factor,
     sighting_factors,
 )
 from fgloc.graph.installation import InstallationBelief
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
+from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
-    MarkerPoseMeasurement,
     MotionMeasurement,
-    RangeBearingMeasurement,
 )
 
-_T = TypeVar("_T")
-_DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
 _LINEARIZATIONS = 6
 _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
 _STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
@@ -60,12 +53,12 @@ class Smoothed:
 class BatchSmoother:
     """Solves the whole log, as often as what depends on the solution is measured again.
 
-    It holds what was believed online. Of an unknown map, sightings that the first solution finds less likely than
-    ``1 - gate_probability`` are left out.
+    It holds the sightings that were accepted online. Of an unknown map, sightings that the first solution finds less
+    likely than ``1 - gate_probability`` are left out.
 
     Attributes:
         frames: the keyframes.
-        believed: the sightings in the graph, by keyframe.
+        accepted: the sightings in the graph, by keyframe.
     """
 
     def __init__(
@@ -86,17 +79,17 @@ class BatchSmoother:
         self._factors = factors
         self._config = config
         self._probability = gate_probability
-        self.believed = {frame.k: frame.sightings for frame in self.frames}
-        self._values = _initial(self.frames, self.believed, self._factors)
+        self.accepted = {frame.k: frame.sightings for frame in self.frames}
+        self._values = initial_values(self.frames, self.accepted, self._factors)
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
 
     def _leave_out_unlikely(self) -> None:
         """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""
-        self.believed = {
+        self.accepted = {
             k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(self._probability, _dof(s)))
-            for k, held in self.believed.items()
+            for k, held in self.accepted.items()
         }
         self._optimize()
 
@@ -135,7 +128,7 @@ class BatchSmoother:
             for s in (*frame.sightings, *frame.refused)
         ]
         if not self._factors.known or not seen:
-            factors = [f for held in self.believed.values() for s in held for f in s.factors]
+            factors = [f for held in self.accepted.values() for s in held for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
         observed = self._factors.observe([s.measurement for _, s in seen])
         lines = observed.linearize(np.array([pose for pose, _ in seen]), self._theta())
@@ -153,18 +146,18 @@ class BatchSmoother:
             EstimatorError: the graph leaves a pose undetermined.
         """
         marginals = self._marginals()
-        return _with_deep_stack(lambda: self._result(marginals))
+        return with_deep_stack(lambda: self._result(marginals))
 
     def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
         """Covariances of the solution; of long stretches that hardly anything determines, by QR."""
         try:
-            return _with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
+            return with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
         except RuntimeError:
             params = gtsam.ISAM2Params()
             params.setFactorization("QR")
             params.relinearizeSkip = 1
             solver = gtsam.ISAM2(params)
-            _solvable(lambda: _with_deep_stack(lambda: solver.update(self._graph, self._values)))
+            solvable(lambda: with_deep_stack(lambda: solver.update(self._graph, self._values)))
             return solver
 
     def _result(self, marginals: gtsam.Marginals | gtsam.ISAM2) -> Smoothed:
@@ -173,7 +166,7 @@ class BatchSmoother:
             stamps_ns=self.stamps_ns(),
             poses=self.poses(),
             covs=np.array(covs),
-            landmarks={} if self._factors.known else _landmarks(self.believed, self._values, marginals),
+            landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
             factors=self._graph.size(),
             error=self._graph.error(self._values),
         )
@@ -187,7 +180,7 @@ class BatchSmoother:
         for _ in range(_LINEARIZATIONS):
             poses, theta = self.poses(), self._theta()
             graph = self._linearized()
-            values = self._solve(graph, _without_orphans(self._values, graph))
+            values = self._solve(graph, without_orphans(self._values, graph))
             if not np.isfinite(graph.error(values)):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
             self._values, self._graph = values, graph
@@ -199,7 +192,7 @@ class BatchSmoother:
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
-        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.believed[f.k]]
+        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.accepted[f.k]]
         for factor in self._sighting_factors(seen):
             graph.add(factor)
         return graph
@@ -249,29 +242,6 @@ class BatchSmoother:
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _solvable(work: Callable[[], _T]) -> _T:
-    """Do what needs the graph's covariances.
-
-    Raises:
-        EstimatorError: the graph leaves a pose undetermined.
-    """
-    try:
-        return work()
-    except RuntimeError as error:
-        why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
-        raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
-
-
-def _with_deep_stack(work: Callable[[], _T]) -> _T:
-    """Run in a thread of its own: GTSAM's elimination of a chain of 1e5 poses overflows the usual 8 MB of stack."""
-    before = threading.stack_size(_DEEP_STACK_BYTES)
-    try:
-        with ThreadPoolExecutor(1) as pool:
-            return pool.submit(work).result()
-    finally:
-        threading.stack_size(before)
-
-
 def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:
     """Squared whitened residual without the kernel, from ``e = k²/2 · log(1 + r²/k²)`` of each robust factor."""
     total = 0.0
@@ -284,62 +254,6 @@ def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:
 
 def _dof(sighting: LandmarkFactor) -> int:
     return sum(factor.dim() for factor in sighting.factors)
-
-
-def _initial(
-    frames: list[Keyframe], believed: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
-) -> gtsam.Values:
-    values = gtsam.Values()
-    for frame in frames:
-        values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
-    if len(factors.installation):
-        values.insert(INSTALLATION, factors.believed.mean)
-    if factors.known:
-        return values
-    seen: dict[int, list[FloatArray]] = {}
-    for frame in frames:
-        for sighting in believed[frame.k]:
-            m = sighting.measurement
-            if isinstance(m, MarkerPoseMeasurement):
-                seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, m.pose))
-            elif isinstance(m, RangeBearingMeasurement):
-                local = [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0]
-                seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, local)[:2])
-    for landmark_id, places in seen.items():
-        middle = places[int(np.argsort([p[0] for p in places])[len(places) // 2])]  # one of them: yaw has no median
-        value = middle if len(middle) == 2 else gtsam.Pose2(*middle)
-        values.insert(landmark_key(landmark_id), value)
-    return values
-
-
-def _without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
-    """Values of the keys that the graph still mentions."""
-    kept, mentioned = gtsam.Values(values), set(graph.keyVector())
-    for key in values.keys():  # noqa: SIM118 (gtsam.Values is not iterable)
-        if key not in mentioned:
-            kept.erase(key)
-    return kept
-
-
-def _landmarks(
-    believed: Mapping[int, tuple[LandmarkFactor, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
-) -> dict[int, Landmark]:
-    landmarks = {}
-    for m in (s.measurement for sightings in believed.values() for s in sightings):
-        key = landmark_key(m.landmark_id)
-        if m.landmark_id in landmarks:
-            continue
-        cov = np.asarray(marginals.marginalCovariance(key))
-        if isinstance(m, MarkerPoseMeasurement):
-            pose = values.atPose2(key)
-            place, yaw = np.array([pose.x(), pose.y(), 0.0]), pose.theta()
-            c, s = np.cos(yaw), np.sin(yaw)
-            rotation = np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]])  # a standing marker, normal at this yaw
-            cov = se2.rotate_cov(cov, yaw)[:2, :2]
-        else:
-            place, rotation = np.array([*values.atPoint2(key), 0.0]), np.eye(3)
-        landmarks[m.landmark_id] = Landmark(m.landmark_id, place, rotation, 0.0, cov)
-    return dict(sorted(landmarks.items()))
 
 
 def _vector(pose: gtsam.Pose2) -> FloatArray:

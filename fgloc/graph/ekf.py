@@ -11,7 +11,7 @@ from fgloc.graph.measurement_log import Keyframe
 
 
 class ExtendedKalmanFilter(Estimator):
-    """Predicts by the fused motion and corrects by all believed sightings at once.
+    """Predicts by the fused motion and corrects by all accepted sightings at once.
 
     It is given the measurements of the fixed-lag smoother, after the same χ² gates. What a filter lacks remains: no
     sighting changes an older pose. Its log serves the batch smoother.

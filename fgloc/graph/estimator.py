@@ -89,7 +89,7 @@ class Estimator(ABC):
             motions: between-factors from the one before; at least one.
             sightings: landmark measurements carried to this keyframe.
             refused: sightings that are only logged, for the cost of the batch.
-            predicted: what `predict` said of these motions, if the caller has asked already.
+            predicted: result of `predict` for these motions, if the caller has it already.
         """
         predicted = predicted or self.predict(motions)
         self._k += 1

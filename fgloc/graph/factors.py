@@ -15,9 +15,12 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
+from fgloc.graph.corner_batch import MIN_DEPTH_M
 from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations
+from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
+from fgloc.graph.observation import Observations
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
@@ -50,25 +53,6 @@ def landmark_key(landmark_id: int) -> int:
     return int(gtsam.symbol("l", landmark_id))
 
 
-def gaussian(cov: FloatArray) -> gtsam.noiseModel.Base:
-    """Noise model of a covariance, which is checked because GTSAM does not.
-
-    Raises:
-        CovarianceError: not finite, not symmetric or not positive definite.
-    """
-    problem = _covariance_problem(cov)
-    if problem:
-        raise CovarianceError(f"{problem}: {cov.tolist()}; a measurement like this has to be rejected by the gate")
-    return gtsam.noiseModel.Gaussian.Covariance(cov)
-
-
-def robust(noise: gtsam.noiseModel.Base, cauchy_k: float | None) -> gtsam.noiseModel.Base:
-    """Wrap a noise model in a Cauchy kernel (k in units of sigma); None leaves it Gaussian."""
-    if cauchy_k is None:
-        return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_k), noise)
-
-
 INSTALLATION = int(gtsam.symbol("i", 0))
 """Key of the installation state: one vector."""
 
@@ -84,7 +68,7 @@ def installed_motion_factor(
     columns = {installation.index[name]: c for name, c in m.depends_on.items() if name in installation.index}
     if not columns:
         return motion_factor(k, m)
-    W = _whitening(m.cov)
+    W = whitening_of(m.cov)
     values = gtsam.Values()
     values.insert(pose_key(k - 1), gtsam.Pose2(*before))
     values.insert(pose_key(k), gtsam.Pose2(*se2.compose(before, m.motion)))
@@ -112,7 +96,7 @@ def installed_prior_factor(
     cov[:3, :3], cov[3:, 3:] = prior.cov, known.cov
     if prior.cross is not None:
         cov[:3, 3:], cov[3:, :3] = prior.cross, prior.cross.T
-    W = _whitening(cov)
+    W = whitening_of(cov)
     return [linear_factor({pose_key(k): W[:, :3], INSTALLATION: W[:, 3:]}, np.zeros(3 + n), values)]
 
 
@@ -148,52 +132,6 @@ def sighting_factors(
             blocks[INSTALLATION] = W @ H
         made.append(linear_factor(blocks, W @ r, values))
     return made
-
-
-def stacked(lines: Sequence[Linearized], n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residual ``(d,)``, Jacobians ``(d, 3)`` and ``(d, n)``, noise covariance ``(d, d)`` of sightings of one image."""
-    r = np.concatenate([one.residual for one in lines])
-    J = np.vstack([one.J for one in lines])
-    H = np.zeros((len(r), n))
-    row, most = 0, max(one.shared.shape[1] for one in lines)
-    shared = np.zeros((len(r), most))
-    for one in lines:
-        d = len(one.residual)
-        H[row : row + d, one.columns] = one.H
-        shared[row : row + d, : one.shared.shape[1]] = one.shared
-        row += d
-    return r, J, H, np.eye(len(r)) + shared @ shared.T
-
-
-def _whitening(cov: FloatArray) -> FloatArray:
-    """W with ``Wᵀ W`` the inverse of a covariance.
-
-    Raises:
-        CovarianceError: it is none.
-    """
-    try:
-        if not np.isfinite(cov).all():
-            raise np.linalg.LinAlgError("not finite")
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
-    except np.linalg.LinAlgError as error:
-        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
-
-
-def sighting_whitening(cov: FloatArray) -> FloatArray:
-    """W with ``Wᵀ W`` the inverse of a covariance that is no less than the identity.
-
-    Of a corner hardly in front of the camera it is so large that the identity is lost to rounding.
-
-    Raises:
-        CovarianceError: it is not finite.
-    """
-    if not np.isfinite(cov).all():
-        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: not finite")
-    try:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(cov)
-        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
 
 
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
@@ -256,7 +194,7 @@ class LandmarkFactors:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
         if m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
-        if not isinstance(m, CornerMeasurement) and (problem := _covariance_problem(m.cov)):
+        if not isinstance(m, CornerMeasurement) and (problem := covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
@@ -347,30 +285,3 @@ def linear_factor(
     pairs: list[Any] = [part for key, A in blocks.items() for part in (key, A)]
     noise = gtsam.noiseModel.Unit.Create(len(residual))
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*pairs, -residual, noise), values)  # type: ignore[call-overload]
-
-
-def _covariance_problem(cov: FloatArray) -> str:
-    """What is wrong with a covariance; "" if nothing.
-
-    Sylvester's criterion in plain floats, because this runs for every factor of every step.
-    """
-    if cov.shape == (3, 3):
-        (a, b, c), (d, e, f), (g, h, i) = cov.tolist()
-        minors: tuple[float, ...] = a, a * e - b * d, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-        skew = abs(b - d) + abs(c - g) + abs(f - h)
-        size = abs(a) + abs(e) + abs(i)
-    elif cov.shape == (2, 2):
-        (a, b), (d, e) = cov.tolist()
-        minors = (a, a * e - b * d)
-        skew, size = abs(b - d), abs(a) + abs(e)
-    else:
-        return f"covariance of shape {cov.shape}, expected (2, 2) or (3, 3)"
-    if not math.isfinite(size + skew):
-        return "covariance with NaN or Inf"
-    if skew > 1e-9 * size:
-        return "asymmetric covariance"
-    return "" if min(minors) > 0.0 else "covariance is not positive definite"
-
-
-def _symmetric(m: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (m + m.T))

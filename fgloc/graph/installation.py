@@ -1,6 +1,6 @@
 """The installation as a state: what map, camera, clocks, wheels and gyro are off by, estimated beside the poses.
 
-The state θ ``(n,)`` holds deviations from what map and configuration say. Each has a prior sigma; one of sigma 0 is
+The state θ ``(n,)`` holds deviations from the given map and configuration. Each has a prior sigma; one of sigma 0 is
 taken as exact and is no state. What can't be observed stays at its prior, and its sigma reaches the pose's covariance
 through the joint covariance of pose and θ.
 """
@@ -106,7 +106,7 @@ class Installation:
 
 
 def _block(name: str) -> str:
-    """Of a parameter that is one of a block; "" for one by itself, whose sigma alone says whether it is a state."""
+    """Of a parameter that is one of a block; "" for a single one, which is a state if its sigma is not 0."""
     section = name.split(".")[0]
     return name.rpartition(".")[0] if section == "map" else section if section in TIME_OFFSET else ""
 

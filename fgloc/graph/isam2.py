@@ -1,7 +1,7 @@
 """The incremental estimator: iSAM2 in a fixed-lag window (flat cost, however long the run) or whole (short runs).
 
-A GTSAM update that throws leaves the smoother in ruins; the window is then rebuilt from our own log
-without the sightings of the step, and the caller is told.
+A GTSAM update that throws leaves the smoother unusable; the window is then rebuilt from the measurement log
+without the sightings of the step, and `rebuilt` counts it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -28,7 +27,7 @@ from fgloc.graph.factors import (
     prior_factor,
     sighting_factors,
 )
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
 from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.types import (
@@ -39,89 +38,8 @@ from fgloc.types import (
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
-_NEVER = 1e9
 _TURNED_RAD = 0.02  # a correction of the yaw from which on linear motion factors are made anew
 _MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
-
-
-class _Backend(Protocol):
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        """Add a keyframe; the slots of its factors, in their order."""
-
-    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Put factors in the place of those in these slots; their own slots."""
-
-    def holds(self, k: int) -> bool:
-        """Whether a keyframe is in the window."""
-
-    def pose(self, k: int) -> FloatArray: ...
-
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
-        """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance."""
-
-
-class _FixedLag:
-    """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
-
-    def __init__(self, config: EstimatorConfig, installed: int, careful: bool = False) -> None:
-        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed, careful))
-        self._installed = False
-
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        stamps = dict.fromkeys(values.keys(), elapsed_s)
-        self._installed |= INSTALLATION in stamps
-        if self._installed:
-            stamps[INSTALLATION] = elapsed_s
-        self._smoother.update(graph, values, stamps)  # type: ignore[arg-type]
-        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
-
-    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        self._smoother.update(graph, gtsam.Values(), {}, slots)
-        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
-
-    def holds(self, k: int) -> bool:
-        return bool(self._smoother.getISAM2().valueExists(pose_key(k)))
-
-    def pose(self, k: int) -> FloatArray:
-        return _vector(self._smoother.calculateEstimatePose2(pose_key(k)))
-
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
-        pose = self.pose(k)
-        if not n:
-            return PoseWithCovariance(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
-        return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
-
-
-class _Full:
-    """``ISAM2`` over the whole run: landmarks may be variables; the cost grows with the run."""
-
-    def __init__(self, config: EstimatorConfig, careful: bool = False) -> None:
-        self._isam2 = gtsam.ISAM2(isam2_params(config, careful=careful))
-
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        return list(self._isam2.update(graph, values).getNewFactorsIndices())
-
-    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
-
-    def holds(self, k: int) -> bool:
-        return bool(self._isam2.valueExists(pose_key(k)))
-
-    def pose(self, k: int) -> FloatArray:
-        return _vector(self._isam2.calculateEstimatePose2(pose_key(k)))
-
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
-        pose = self.pose(k)
-        if not n:
-            return PoseWithCovariance(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
-        return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
-
-
-def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
-    x = pose_key(k)
-    found = isam2.jointMarginalCovariance([x, INSTALLATION])
-    known = InstallationBelief(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
-    return PoseWithCovariance(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
 
 
 class IncrementalEstimator(Estimator):
@@ -129,7 +47,7 @@ class IncrementalEstimator(Estimator):
 
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
         super().__init__(config, factors, keep_all)
-        self._backend: _Backend | None = None
+        self._backend: Backend | None = None
         self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
@@ -342,37 +260,10 @@ class IncrementalEstimator(Estimator):
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
         return self._newest(newest)
 
-    def _new_backend(self) -> _Backend:
+    def _new_backend(self) -> Backend:
         self._fresh = True
         installed = len(self._factors.installation) if self._factors.known else 0
         careful = math.isfinite(self._careful_until_s)
         if self._config.kind == "fixed_lag":
-            return _FixedLag(self._config, installed, careful)
-        return _Full(self._config, careful)
-
-
-def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = False) -> gtsam.ISAM2Params:
-    """iSAM2 settings that every backend shares; see gtsam's defaults for the rest.
-
-    Args:
-        config: for the threshold.
-        installed: parameters of the installation, in which all factors are linear: relinearizing gives the same.
-        careful: by QR; Cholesky takes a third of its time, but fails where sigmas are metres apart from millimetres:
-            at a first pose that is hardly known, and after minutes without a fix.
-    """
-    params = gtsam.ISAM2Params()
-    params.setFactorization("QR" if careful else "CHOLESKY")
-    if installed:
-        thresholds = gtsam.ISAM2ThresholdMap()
-        thresholds.insert(("x", np.full(3, config.relinearize_threshold)))
-        thresholds.insert(("i", np.full(installed, _NEVER)))
-        params.setRelinearizeThreshold(thresholds)
-    else:
-        params.setRelinearizeThreshold(config.relinearize_threshold)
-    params.relinearizeSkip = 1
-    params.findUnusedFactorSlots = True
-    return params
-
-
-def _vector(pose: gtsam.Pose2) -> FloatArray:
-    return np.array([pose.x(), pose.y(), pose.theta()])
+            return FixedLag(self._config, installed, careful)
+        return WholeRun(self._config, careful)

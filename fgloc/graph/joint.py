@@ -13,10 +13,11 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from fgloc import se2
-from fgloc.graph.factors import LandmarkFactors, sighting_whitening, stacked
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.observation import Linearized
+from fgloc.graph.noise_models import sighting_whitening
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 _MOST_STEPS = 6
@@ -87,7 +88,7 @@ def predict(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """What sightings of one step say against a belief.
+    """Innovation of the sightings of one step against a prediction.
 
     Attributes:
         residual: ``(d,)`` predicted minus measured.

@@ -1,4 +1,4 @@
-"""The measurement log: what every keyframe was told. Graphs are built from it, never copied from one another."""
+"""The measurement log: what entered each keyframe. Graphs are built from it, never copied from one another."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class Keyframe:
     prior: PoseWithCovariance | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
     sightings: tuple[LandmarkFactor, ...] = ()
-    refused: tuple[LandmarkFactor, ...] = ()  # not believed online; for the cost of the batch
-    step: Step | None = None  # what was heard, to be measured again
+    refused: tuple[LandmarkFactor, ...] = ()  # rejected online; for the cost of the batch
+    step: Step | None = None  # its events, to be measured again
     mode: Mode = Mode.OK
-    readings: MotionReadings = field(default_factory=MotionReadings)  # what the motion sources said ...
-    off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were not believed, and why
+    readings: MotionReadings = field(default_factory=MotionReadings)  # of the motion sources ...
+    off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were rejected, and why
     scale: float = 1.0  # on the covariances of sources that disagree
     extra_cov: FloatArray | None = None  # added to the covariances of the motions that these make
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
@@ -69,7 +69,7 @@ class Keyframe:
 class MeasurementLog:
     """Keyframes in order. ``window_s`` bounds it, unless ``keep_all`` (batch).
 
-    Older keyframes that are kept lose what they say of the installation: it is large, and needed in the window only.
+    Older keyframes that are kept lose their installation estimate: it is large, and needed in the window only.
     """
 
     window_s: float

@@ -23,7 +23,19 @@ _NS = 1_000_000_000
 _TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
 _COV_COLUMNS = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
 _UPPER = np.triu_indices(3)
-_STEP_COLUMNS = ("step", "stamp", "kind", "landmark_id", "residual", "nis", "dof", "weight", "reason")
+_STEP_COLUMNS = (
+    "step",
+    "stamp",
+    "kind",
+    "landmark_id",
+    "residual",
+    "nis",
+    "dof",
+    "weight",
+    "reason",
+    "threshold",
+    "shift_m",
+)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -98,7 +110,13 @@ def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
         rows.writerow(_STEP_COLUMNS)
         for d in decisions:
             fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
-            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason))
+            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason, *_shown(d)))
+
+
+def _shown(d: Decision) -> tuple[str, str]:
+    """Threshold and shift; empty where there is none."""
+    threshold, shift = ("" if math.isnan(value) else f"{value:.6g}" for value in (d.threshold, d.shift_m))
+    return threshold, shift
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -63,20 +63,9 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
         topics: all topics; those without messages are no candidates.
         config: topics given by the user; they win, and "none" switches a role off.
     """
-    roles: dict[Role, str] = {}
     notes: list[str] = []
-    problems: list[str] = []
+    roles, problems = _given_roles(topics, config)
     filled = [topic for topic in topics if topic.count > 0]
-    for role in ROLES:
-        given: str | None = getattr(config, role)
-        if given is None or given == "none":
-            continue
-        if problem := _misfit(role, given, topics):
-            problems.append(problem)
-        elif given in roles.values():
-            problems.append(f"recording.topics.{role}: {given} is given for another role too; choose one of them")
-        else:
-            roles[role] = given
     for role in sorted(ROLES, key=_by_dependence):
         if getattr(config, role) is not None:
             continue
@@ -91,24 +80,54 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
                 f"configuration (recording.topics.{role}: {candidates[0]}), or none (recording.topics.{role}: none)"
             )
-        elif role in ("image", "truth"):
-            fitting = CONVERTERS[role].keys() - CONVERTERS["odometry"].keys()
-            by_type = [topic.name for topic in filled if topic.message_type in fitting]
-            if by_type:
-                notes.append(
-                    f"No {role}: {', '.join(by_type)} would fit by type but not by name "
-                    f"(to use it all the same: recording.topics.{role}: {by_type[0]})."
-                )
-    if {"image", "sightings"} <= roles.keys() and None in (config.image, config.sightings):
-        # Most often the sightings were found in these very images: nothing may be counted twice.
-        spare: Role = "image" if config.image is None else "sightings"
-        kept: Role = "sightings" if spare == "image" else "image"
-        notes.append(
-            f"{roles.pop(spare)} is not used as {spare}, because {roles[kept]} tells of the markers already "
-            f"(to use both: name both in recording.topics; to use it alone: recording.topics.{kept}: none)."
-        )
+        else:
+            notes.append(_unnamed(role, filled))
+    notes.append(_one_of_images_and_sightings(roles, config))
     notes += [_empty(role, topics) for role in ROLES if role not in roles and getattr(config, role) is None]
     return Selection(roles, tuple(note for note in notes if note), tuple(problems))
+
+
+def _given_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> tuple[dict[Role, str], list[str]]:
+    """Roles that the user gave, and what is wrong with them."""
+    roles: dict[Role, str] = {}
+    problems: list[str] = []
+    for role in ROLES:
+        given: str | None = getattr(config, role)
+        if given is None or given == "none":
+            continue
+        if problem := _misfit(role, given, topics):
+            problems.append(problem)
+        elif given in roles.values():
+            problems.append(f"recording.topics.{role}: {given} is given for another role too; choose one of them")
+        else:
+            roles[role] = given
+    return roles, problems
+
+
+def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
+    """That topics would fit by type but not by name; empty if there is none, or the role is not told by names."""
+    if role not in ("image", "truth"):
+        return ""
+    fitting = CONVERTERS[role].keys() - CONVERTERS["odometry"].keys()
+    by_type = [topic.name for topic in filled if topic.message_type in fitting]
+    if not by_type:
+        return ""
+    return (
+        f"No {role}: {', '.join(by_type)} would fit by type but not by name "
+        f"(to use it all the same: recording.topics.{role}: {by_type[0]})."
+    )
+
+
+def _one_of_images_and_sightings(roles: dict[Role, str], config: TopicsConfig) -> str:
+    """Leave one of them out unless both were given: most often the sightings were found in these very images."""
+    if not {"image", "sightings"} <= roles.keys() or None not in (config.image, config.sightings):
+        return ""
+    spare: Role = "image" if config.image is None else "sightings"
+    kept: Role = "sightings" if spare == "image" else "image"
+    return (
+        f"{roles.pop(spare)} is not used as {spare}, because {roles[kept]} tells of the markers already "
+        f"(to use both: name both in recording.topics; to use it alone: recording.topics.{kept}: none)."
+    )
 
 
 def _empty(role: Role, topics: Iterable[TopicInfo]) -> str:

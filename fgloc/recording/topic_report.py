@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +52,24 @@ def report_topic(topic: TopicInfo, times: Times, start_ns: int, config: Config) 
     report = TopicReport(topic.name, topic.message_type, max(topic.count, len(received)), used_as)
     if len(received) < 2:
         return report, []
+    report, found = _received(report, topic, received, start_ns, config)
+    if topic.role is None or topic.message_type in HEADERLESS or len(times.stamps) < 2:
+        return report, found
+    report, clocks = _stamped(report, topic.role, times, start_ns, config)
+    return report, clocks + found
+
+
+def _received(
+    report: TopicReport, topic: TopicInfo, received: NDArray[np.int64], start_ns: int, config: Config
+) -> tuple[TopicReport, list[str]]:
+    """Rate and longest gap by the receive times ``(n,)`` [ns]; and the gaps that are too long."""
     intervals = np.diff(received) * 1e-9
-    median = float(np.median(intervals))
     longest = int(np.argmax(intervals))
     at = float(received[longest] - start_ns) * 1e-9
     gap = float(intervals[longest])
     found = []
     if topic.role is not None and topic.role not in ("camera_info", "truth", "sightings"):
-        long = intervals > max(config.gate.gap_s, 3.0 * median)
+        long = intervals > max(config.gate.gap_s, 3.0 * float(np.median(intervals)))
         if long.any():
             found.append(
                 f"{topic.name}: {plural(int(long.sum()), 'gap')} of more than {config.gate.gap_s:g} s, "
@@ -67,43 +77,42 @@ def report_topic(topic: TopicInfo, times: Times, start_ns: int, config: Config) 
             )
     span = float(received[-1] - received[0]) * 1e-9
     rate = (len(received) - 1) / span if span > 0 else None
+    return TopicReport(report.name, report.message_type, report.count, report.used_as, rate, gap, at), found
+
+
+def _stamped(
+    report: TopicReport, role: Role, times: Times, start_ns: int, config: Config
+) -> tuple[TopicReport, list[str]]:
+    """Header stamps against receive times; and what is wrong with them."""
     stamps, received = int64(times.stamps), int64(times.decoded)
-    if topic.role is None or topic.message_type in HEADERLESS or len(stamps) < 2:
-        return TopicReport(topic.name, topic.message_type, report.count, used_as, rate, gap, at), found
     zero = stamps == 0
     steps = np.diff(stamps[~zero]) * 1e-9
     delays = (received - stamps)[~zero] * 1e-9
     drifted = np.diff(stamps[~zero]) - np.diff(received[~zero])
     back = steps < 0
     ahead = drifted * 1e-9 > config.gate.gap_s
-    report = TopicReport(
-        topic.name,
-        topic.message_type,
-        report.count,
-        used_as,
-        rate,
-        gap,
-        at,
+    report = replace(
+        report,
         delay_s=float(np.median(delays)) if len(delays) else None,
         zero_stamps=int(zero.sum()),
         repeated_stamps=int((steps == 0).sum()),
         jumps_back=int(back.sum()),
         jumps_ahead=int(ahead.sum()),
     )
-    clocks = _clocks(report, topic.role, delays, bool(back.any() or ahead.any()))
+    clocks = _clocks(report, role, delays, bool(back.any() or ahead.any()))
     if back.any():
         at_back = float(received[~zero][int(np.argmin(steps)) + 1] - start_ns) * 1e-9
         clocks.append(
-            f"{topic.name}: stamps go back {plural(report.jumps_back, 'time')}, by up to {-steps.min():.3g} s "
+            f"{report.name}: stamps go back {plural(report.jumps_back, 'time')}, by up to {-steps.min():.3g} s "
             f"at {at_back:.1f} s."
         )
     if ahead.any():
         at_ahead = float(received[~zero][int(np.argmax(drifted)) + 1] - start_ns) * 1e-9
         clocks.append(
-            f"{topic.name}: stamps jump ahead of the receive times {plural(report.jumps_ahead, 'time')}, by up to "
+            f"{report.name}: stamps jump ahead of the receive times {plural(report.jumps_ahead, 'time')}, by up to "
             f"{drifted.max() * 1e-9:.3g} s at {at_ahead:.1f} s."
         )
-    return report, clocks + found
+    return report, clocks
 
 
 def _clocks(report: TopicReport, role: Role, delays: FloatArray, jumps: bool) -> list[str]:

@@ -54,7 +54,7 @@ class GaussianSum:
         """Nothing is known of the pose."""
         self.poses, self.covs, self.log_weights = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
         self._last_ns: dict[int, int] = {}  # by landmark
-        self._none = 0.0  # log likelihood of all sightings if none of them is to be believed
+        self._none = 0.0  # log likelihood of all sightings if all of them are outliers
 
     def add(self, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]) -> None:
         """Take in one step. The work is bounded: so many hypotheses, so many sightings."""

@@ -31,23 +31,23 @@ from fgloc.types import (
     Step,
 )
 
-_WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings themselves say where the robot is
+_WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings determine the pose
 ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
 _RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
-_HEARD = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
+_LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
 _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 _CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
-_KNOWN_SEEDS = 1  # of a robot whose place is believed: the newest, which any other place has to explain, too
+_KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
 _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
 _UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
 _ITERATIONS, _ROUGH_ITERATIONS = 16, 4
-# After initialise_s in vain it is tried no more often than this: a new sighting seldom changes what 5 s of them say.
+# After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_NS = 800_000_000
 
 
@@ -111,7 +111,7 @@ class GlobalSearch:
         return bool(self._steps)
 
     def forget(self) -> None:
-        """What was collected is of no use any more: the robot is where it was believed to be."""
+        """What was collected is of no use any more: the robot is where it was estimated to be."""
         self._steps.clear()
         self._earlier.clear()
         self.hypotheses.reset()
@@ -133,8 +133,8 @@ class GlobalSearch:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            known: the robot is believed to be elsewhere. Then it takes two landmarks, and nearly everything to agree:
-                some wrong ids agree with some place always.
+            known: the robot has an estimated pose elsewhere. Then it takes two landmarks, and nearly everything to
+                agree: some wrong ids agree with some place always.
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
         horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
@@ -211,7 +211,7 @@ class GlobalSearch:
         return since > _PATIENCE * self._config.estimator.initialise_s * 1e9
 
     def _checked(self, best: PoseConsensus, sightings: Sequence[LandmarkMeasurement]) -> bool:
-        """Whether beacons tell this place even if any one of them is left out: so that no single one can feign it."""
+        """Whether beacons determine this place even if any one of them is left out: one may have been moved."""
         agreeing = [
             m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
@@ -239,12 +239,14 @@ class GlobalSearch:
             if trimmed is None:
                 return None
             fit = trimmed
-        told: dict[int, float] = {}
+        information_of: dict[int, float] = {}
         for m in agreeing:
-            told[m.landmark_id] = told.get(m.landmark_id, 0.0) + _information(m)
-        share = sum(told.values()) / sum(map(_information, sightings))
-        heard = {i for i, information in told.items() if information > _HEARD * max(told.values())}
-        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in heard}
+            information_of[m.landmark_id] = information_of.get(m.landmark_id, 0.0) + _information(m)
+        share = sum(information_of.values()) / sum(map(_information, sightings))
+        contributing = {
+            i for i, information in information_of.items() if information > _LEAST_SHARE * max(information_of.values())
+        }
+        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in contributing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         outliers = [m for m in sightings if not any(m is other for other in agreeing)]
@@ -253,8 +255,8 @@ class GlobalSearch:
             share,
             len(residuals),
             sum(residuals.values()) - 3,
-            frozenset(told),
-            frozenset(m.landmark_id for m in outliers) - frozenset(told),
+            frozenset(information_of),
+            frozenset(m.landmark_id for m in outliers) - frozenset(information_of),
             frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
         )
 

@@ -1,4 +1,4 @@
-"""A place that sightings agree on, and when it is beyond doubt."""
+"""A place that sightings agree on, and when it is certain."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
-_SHARP = 0.4  # times that, of a place that one beacon could feign
+_SHARP = 0.4  # times that, of a place that one moved beacon could produce
 _SAME_PLACE = np.array([0.3, 0.3, 0.35])  # candidates nearer than this are one place
 _LEAST_SHARE = {
     1: 0.8,
@@ -62,7 +62,7 @@ class PoseConsensus:
 
     @property
     def overrides_prior(self) -> bool:
-        """Whether it says that the robot is not where it was believed to be."""
+        """Whether it is evidence that the robot is not where it was estimated to be."""
         known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
         return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * REDUNDANT
 

@@ -1,4 +1,4 @@
-"""The place that sightings tell: the pose that explains them best, and how well it does."""
+"""The pose that explains sightings best, and how well it does."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.observation import CornerBatch, PlanarBatch, Stacked
+from fgloc.graph.linearized import Stacked
+from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.stats import chi2_bound
 from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
 

@@ -1,4 +1,4 @@
-"""Whether the robot is where it is believed to be: its first pose, fixes, contradictions, and the search for it."""
+"""Whether the robot is where it is estimated to be: its first pose, fixes, contradictions, and the search for it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from fgloc.types import (
 )
 
 _NAMED = 3  # jumps
-_CONFIRMED = 2  # sightings in excess of those that speak against it: more confirm a given pose
+_CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
@@ -38,7 +38,7 @@ class Tracking:
     """Looks for the robot while its place is unknown or contradicted, and keeps the time since the last fix.
 
     A first pose that was given, and that sightings contradict from the start, holds against them: whether it or the map
-    is wrong, only the user can tell. They are refused and reported.
+    is wrong, only the user can decide. They are rejected and reported.
 
     Attributes:
         lost: nothing explains where the robot is.
@@ -58,10 +58,10 @@ class Tracking:
         self.initial_pose_conflict: FloatArray | None = None
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
-        self._speaking_for = self._speaking_against = 0  # sightings
+        self._confirming = self._contradicting = 0  # sightings
         self._jumps: list[FloatArray] = []  # the first few ...
         self._jump_count = 0  # ... of so many
-        self._told = False  # whether a pose that is not confirmed has been told
+        self._reported = False  # whether an unconfirmed pose was reported
         places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
         self._places: FloatArray = np.array(places).reshape(-1, 2)
         self._never_found = False
@@ -73,15 +73,15 @@ class Tracking:
 
         Args:
             last: of the segment before.
-            known: where it starts, by what the user or an earlier run says.
+            known: where it starts, by the user or an earlier run.
         """
-        self.lost = self._given = self._told = False
+        self.lost = self._given = self._reported = False
         self._search.reset()
         if known is not None:
             return known
         given = self._config.initial_pose
         if given is not None and last is None:
-            self._given, self._speaking_for, self._speaking_against = True, 0, 0
+            self._given, self._confirming, self._contradicting = True, 0, 0
             return PoseWithCovariance(np.array(given), np.diag(np.square(self._config.initial_sigmas)))
         if self._known:
             return None
@@ -119,37 +119,37 @@ class Tracking:
 
     @property
     def keeps_initial_pose(self) -> bool:
-        """Whether sightings speak against a given first pose, and no more of them for it."""
-        return self._given and self._speaking_against >= max(self._speaking_for, 1)
+        """Whether sightings contradict a given first pose, and no more of them confirm it."""
+        return self._given and self._contradicting >= max(self._confirming, 1)
 
     def gate_initial_pose(
-        self, believed: list[LandmarkFactor], refused: list[LandmarkFactor], decisions: list[Decision]
+        self, accepted: list[LandmarkFactor], refused: list[LandmarkFactor], decisions: list[Decision]
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Judge a given first pose by what `Association.judge` makes of sightings; while it holds, accept none of them.
 
         One that agrees with a contradicted pose does so by accident, and would drag it along.
         """
-        if self.dead_reckoning and not self._speaking_against:  # it is the motion that may be wrong by now
+        if self.dead_reckoning and not self._contradicting:  # it is the motion that may be wrong by now
             self._given = False
-        self._speaking_for += len(believed)
-        self._speaking_against += len(refused)
-        if self._speaking_for > self._speaking_against + _CONFIRMED:
+        self._confirming += len(accepted)
+        self._contradicting += len(refused)
+        if self._confirming > self._contradicting + _CONFIRMED:
             self._given = False
         if not self.keeps_initial_pose:
-            return believed, refused, decisions
-        told = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
-        return [], [*refused, *believed], told
+            return accepted, refused, decisions
+        marked = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
+        return [], [*refused, *accepted], marked
 
-    def record_fix(self, believed: bool = True) -> None:
-        """The robot is where it is believed to be; ``believed``: sightings said so."""
+    def record_fix(self, by_sightings: bool = True) -> None:
+        """The estimated pose is confirmed; ``by_sightings``: by accepted sightings."""
         self._fix_s = self._clock_s
-        if believed:
+        if by_sightings:
             self.lost = False
             self._search.forget()
 
-    def record_conflict(self, believed: PoseWithCovariance, place: PoseWithCovariance) -> None:
+    def record_conflict(self, predicted: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """Sightings agree on another place than the given one."""
-        self.initial_pose_conflict = se2.between(believed.pose, place.pose)
+        self.initial_pose_conflict = se2.between(predicted.pose, place.pose)
 
     def kidnapped_cov(self, contradicting: int, belief: PoseWithCovariance) -> FloatArray:
         """What is added to the covariance ``(3, 3)`` of a pose that all landmarks seen since the last fix contradict.
@@ -171,7 +171,7 @@ class Tracking:
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
         """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map.
 
-        Nothing, where the pose is lost for its covariance, which tells that already.
+        Nothing, where the pose is lost for its covariance, which has that already.
         """
         if self.is_unlocalized(belief):
             return np.zeros((3, 3))
@@ -207,12 +207,12 @@ class Tracking:
     def unconfirmed(self) -> PoseWithCovariance | None:
         """Where the robot is by the sightings so far, before they are enough to check one another.
 
-        Told from when the pose is known well enough for a sighting to be judged by it.
+        Reported once the pose is known well enough to judge a sighting by it.
         """
         belief = self._search.hypotheses.belief()
-        if belief is None or (not self._told and self.is_unlocalized(belief)):
+        if belief is None or (not self._reported and self.is_unlocalized(belief)):
             return None
-        self._told = True
+        self._reported = True
         return belief
 
     def give_up(self, blind: bool) -> InitialPose | None:
@@ -238,15 +238,15 @@ class Tracking:
         readings: MotionReadings,
         predicted: PoseWithCovariance,
     ) -> PoseWithCovariance | None:
-        """While nothing is believed, look for another place that explains what is refused: the robot may be there.
+        """While no sighting is accepted, look for another place that explains the rejected ones.
 
         Returns:
-            A place told by two landmarks or more, and far from the predicted one: nearer ones are the business of
+            A place found from two landmarks or more, and far from the predicted one: nearer ones are the business of
             `Association.nearby_consensus`, unless the first pose was given.
         """
         searching = bool(outliers) or self._search.searching
-        told = self.keeps_initial_pose and self.initial_pose_conflict is not None
-        if not searching or told or self.waiting or not self._adaptive:
+        decided = self.keeps_initial_pose and self.initial_pose_conflict is not None
+        if not searching or decided or self.waiting or not self._adaptive:
             return None
         started = self._search.collect(step, motions, outliers, readings, known=True)
         if started is None or self.keeps_initial_pose:
@@ -254,32 +254,32 @@ class Tracking:
         x, y, yaw = se2.between(predicted.pose, started.newest.pose)
         return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
 
-    def found(self, believed: PoseWithCovariance, place: PoseWithCovariance) -> None:
-        """The robot was found at another place than it was believed to be at."""
+    def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
+        """The robot was found at another place than it was estimated at."""
         self._jump_count += 1
         if self._jump_count <= _NAMED:
-            self._jumps.append(se2.between(believed.pose, place.pose))
+            self._jumps.append(se2.between(estimated.pose, place.pose))
         self.lost = self._given = False
         self._search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know, one sentence each."""
-        said = [f"sightings contradicted the believed pose: jumped by {_far(miss)}" for miss in self._jumps]
+        sentences = [f"sightings contradicted the estimated pose: jumped by {_far(miss)}" for miss in self._jumps]
         if self._jump_count > _NAMED:
-            said.append(f"... and {self._jump_count - _NAMED} times more")
+            sentences.append(f"... and {self._jump_count - _NAMED} times more")
         if self._never_found:
-            said.append(
-                "the sightings never told where on the map the robot is: its poses are LOST, and right relative to one "
-                "another at best (from the map's origin on if nothing was seen); give estimator.initial_pose, or let "
-                "the robot see more landmarks"
+            sentences.append(
+                "the sightings never determined where on the map the robot is: its poses are LOST, and right relative "
+                "to one another at best (from the map's origin on if nothing was seen); give estimator.initial_pose, "
+                "or let the robot see more landmarks"
             )
         if self.initial_pose_conflict is not None:
-            said.append(
+            sentences.append(
                 f"sightings contradict the given first pose: they put the robot {_far(self.initial_pose_conflict)} off "
                 "and were refused; correct estimator.initial_pose or the map, or leave the first pose to the sightings"
             )
-        return tuple(said)
+        return tuple(sentences)
 
 
 def _far(miss: FloatArray) -> str:

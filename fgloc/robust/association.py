@@ -57,42 +57,32 @@ class Association:
         the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
         because after dead reckoning the linear one is far too large.
         """
-        believed, refused, decisions = [], [], []
+        accepted, rejected, decisions = [], [], []
         shared = [self._share_information(m) for m in measurements]
-        for alone, (m, weight), (nis, dof, reason) in zip(
+        for alone, (m, weight), (nis, dof, gate) in zip(
             measurements, shared, self._judge(measurements, predicted), strict=True
         ):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if self.modes.excludes(m.landmark_id):
-                reason = "quarantined"
+            reason = "quarantined" if self.modes.excludes(m.landmark_id) else gate
             if reason:
-                refused.append(sighting)
+                rejected.append(sighting)
                 self.rejections[f"sightings.{reason}"] += 1
             else:
-                believed.append(sighting)
+                accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
+            used = 0.0 if reason else weight
             decisions.append(
-                Decision(
-                    k,
-                    stamp_ns,
-                    KINDS[type(m)],
-                    m.landmark_id,
-                    math.sqrt(nis),
-                    nis,
-                    dof,
-                    0.0 if reason else weight,
-                    reason,
-                )
+                Decision(k, stamp_ns, KINDS[type(m)], m.landmark_id, nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
-        if believed:
+        if accepted:
             self._contradicting.clear()
-            for misread, sighting, decision in self._reassociate(k, stamp_ns, refused, decisions, predicted):
-                refused.remove(misread)
-                believed.append(sighting)
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, predicted):
+                rejected.remove(misread)
+                accepted.append(sighting)
                 decisions.append(decision)
-        if not believed:
+        if not accepted:
             self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
-        return believed, refused, decisions
+        return accepted, rejected, decisions
 
     def _reassociate(
         self,
@@ -135,7 +125,11 @@ class Association:
             self.rejections["sightings.misread"] += 1
             decisions[i] = dataclasses.replace(decisions[i], reason="misread")
             found.append(
-                (misread, sighting, Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, ""))
+                (
+                    misread,
+                    sighting,
+                    Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
+                )
             )
         self.rejections += Counter()  # drops the zeros
         return found
@@ -179,7 +173,7 @@ class Association:
             if one.behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
-            bound = chi2_bound(self._config.estimator.gate_probability, dof)
+            bound = self._gate(dof)
             if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
@@ -243,6 +237,10 @@ class Association:
             for i, one, nis in zip(others, lines, found, strict=True)
         }
         return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
+
+    def _gate(self, dof: int) -> float:
+        """Bound of the NIS of a sighting; NaN where there is nothing to hold it against."""
+        return chi2_bound(self._config.estimator.gate_probability, dof) if dof > 0 else math.nan
 
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:
         self._seen[m.landmark_id] += 1

@@ -1,4 +1,4 @@
-"""What is said of the motion: rows of ``steps.csv``, and sentences for the user."""
+"""Decisions on the motion: rows of ``steps.csv``, and sentences for the user."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.robust.motion_fusion import noise_scales
-from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings
+from fgloc.robust.motion_faults import FaultVerdict
+from fgloc.robust.motion_noise import noise_scales
+from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
+
+JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...
+OVERRULED = "overruled by sightings"  # ... and one nearby, which the motion did not lead to
 
 _REASONS = {
     "slip": "they slipped",
@@ -26,39 +30,62 @@ def motion_decisions(
     readings: MotionReadings,
     off: Mapping[str, str],
     reason: str,
-    scale: float = 1.0,
+    verdict: FaultVerdict | None = None,
 ) -> list[Decision]:
     """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
 
-    Sources that are not believed (``off``: and why) have weight 0. A ``reason`` says why the covariance of all the
+    That of the wheels is the statistic of the GLR test of the ``verdict``, and its threshold the alarm.
+
+    Rejected sources (``off``: and why) have weight 0. A ``reason`` gives why the covariance of all the
     others was inflated; their weight is then 0 too, as they no longer hold the pose. Otherwise the weight is one over
-    the factor on the covariance (`noise_scales` of ``scale``). A step that was judged again has more than one row for a
+    the factor on the covariance (`noise_scales` of the scale). A step that was judged again has more than one row for a
     source; the last one holds.
     """
     rows = []
-    scales = noise_scales(off, scale)
+    verdict = verdict or FaultVerdict()
+    scales = noise_scales(off, verdict.scale)
     used = {m.source: m for m in motions}
     for source in ("wheels", "learned", "gyro", "unknown"):
         reading = getattr(readings, source, None) or used.get(source)
         why = off.get(source, reason)
         if reading is None or (source not in used and not why):
             continue
-        nis = 0.0
-        if readings.wheels is not None and source != "wheels":
-            difference: FloatArray = se2.log(se2.between(readings.wheels.motion, reading.motion))
-            nis = float(difference @ np.linalg.solve(readings.wheels.cov + reading.cov, difference))
+        nis, threshold, shift = 0.0, math.nan, math.nan
+        witness = readings.learned if source == "wheels" else readings.wheels
+        if source == "wheels" and math.isfinite(verdict.nis):
+            nis, threshold = verdict.nis, verdict.threshold
+        if witness is not None:
+            difference: FloatArray = se2.log(se2.between(witness.motion, reading.motion))
+            shift = math.nan if source == "gyro" else float(difference[0])
+            if source != "wheels":
+                nis = float(difference @ np.linalg.solve(witness.cov + reading.cov, difference))
         weight = 0.0 if why else 1.0 / scales.get(source, 1.0)
-        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why))
+        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why, threshold, shift))
     return rows
 
 
 def place_decision(
-    k: int, stamp_ns: int, believed: PoseWithCovariance, place: PoseWithCovariance, reason: str
+    k: int, stamp_ns: int, estimated: PoseWithCovariance, place: PoseWithCovariance, reason: str
 ) -> Decision:
-    """The row for a pose that sightings tell, against the one that was believed: ``jump`` if it is gone to."""
-    miss = se2.log(se2.between(believed.pose, place.pose))
-    nis = float(miss @ np.linalg.solve(believed.cov + place.cov, miss))
-    return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, 1.0 if reason == "jump" else 0.0, reason)
+    """The row for a pose that sightings tell, against the predicted one; weight 0: the run did not go there."""
+    miss = se2.log(se2.between(estimated.pose, place.pose))
+    nis = float(miss @ np.linalg.solve(estimated.cov + place.cov, miss))
+    weight = 1.0 if reason in (JUMP, OVERRULED) else 0.0
+    shift = math.hypot(miss[0], miss[1])
+    return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, weight, reason, shift_m=shift)
+
+
+def mode_decisions(k: int, stamp_ns: int, mode: Mode, blind_s: float, after_s: float) -> tuple[Decision, ...]:
+    """The row of a pose that is not ``OK``: its residual is the time without an accepted sighting [s]."""
+    if mode is Mode.OK:
+        return ()
+    threshold = after_s if mode is Mode.DEAD_RECKONING else math.nan
+    return (Decision(k, stamp_ns, "mode", -1, blind_s, math.nan, 0, 0.0, mode.value.lower(), threshold),)
+
+
+def segment_decision(k: int, stamp_ns: int) -> Decision:
+    """The row of the first step after the clock jumped."""
+    return Decision(k, stamp_ns, "clock", -1, math.nan, math.nan, 0, 0.0, "new_segment")
 
 
 def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:

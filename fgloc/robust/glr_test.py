@@ -42,9 +42,9 @@ class GlrResult:
 class GlrTest:
     """Compares two motion sources over all windows up to a length at once.
 
-    A single step says little (encoder quantization alone trips it), a long window says it late. The test takes, of all
-    windows that end now, the one whose summed difference is least likely; its beginning is the most likely onset of
-    what goes wrong. A flag is taken back after the newest steps have agreed for a while.
+    A single step has little power (encoder quantization alone exceeds its bound), a long window detects late. The
+    test takes, of all windows that end now, the one whose summed difference is least likely; its beginning is the most
+    likely onset of the fault. A flag is taken back after the newest steps have agreed for a while.
 
     Source: Willsky and Jones 1976, generalized likelihood ratio for a jump of unknown time; docs/decisions/0003.
     """
@@ -106,7 +106,7 @@ class GlrTest:
 
     @property
     def _level(self) -> float:
-        """How large differences are while nothing is wrong, as a share of what their covariances say."""
+        """How large differences are while nothing is wrong, as a share of their covariances."""
         return self._low / _LOW_EXPECTED
 
     def _worst(self) -> tuple[float, int]:

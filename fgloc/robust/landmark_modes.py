@@ -28,7 +28,7 @@ from fgloc.stats import chi2_bound
 from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement
 
 _MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
-_ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
+ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
 _MARGIN = 7.0  # ... and to another landmark's displacement as the cause of the same sightings
 _LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
 _MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
@@ -117,7 +117,7 @@ class LandmarkModes:
             if m.stamp_ns - self._fused_ns < _STILL_RIGHT_NS and not self.excludes(m.landmark_id):
                 self._contradicted(P, belief, m)
         self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*fused, *refused)})
-        self._reset(self._evidence.sum(1) < -0.5 * _ALARM)  # it was in place; it may be moved from now on
+        self._reset(self._evidence.sum(1) < -0.5 * ALARM)  # it was in place; it may be moved from now on
         return self._certain() if fused or refused else None
 
     def exclude(self, landmark_id: int, belief: PoseWithCovariance) -> tuple[PoseWithCovariance, float]:
@@ -242,7 +242,7 @@ class LandmarkModes:
         """A landmark that was moved, with no doubt that it was this one."""
         evidence = self._evidence.sum(1)
         for row in np.argsort(-evidence):
-            if evidence[row] < _ALARM:
+            if evidence[row] < ALARM:
                 break
             margins = ((self._evidence[row] - self._evidence) * (self._evidence[row] > 0.0)).sum(1)
             margins[row] = np.inf  # the others' are of what this one explains

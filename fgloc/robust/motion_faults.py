@@ -1,4 +1,4 @@
-"""Which motion sources are believed, step by step, and since when not."""
+"""Which motion sources are rejected, step by step, and since when."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from fgloc.robust.glr_test import GlrTest
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.types import FloatArray, MotionReadings, Step
 
-_MOVED = 0.25  # of the witness's travel: a wheel that turned less than this while it did more stood still
-_LEAST_M = 0.03  # of a wheel's travel: less says nothing
-_EVIDENCE_S = 1.0  # of travel from which a kind of failure is told
+_MOVED = 0.25  # of the reference source's travel: a wheel that turned less than this while it did more stood still
+_LEAST_M = 0.03  # of a wheel's travel: less is no evidence
+_EVIDENCE_S = 1.0  # of travel from which the kind of failure is determined
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,20 +24,22 @@ class FaultVerdict:
     """What is thought of the motion sources.
 
     Attributes:
-        off: source -> why it is not believed.
+        off: source -> why it is rejected.
         span: for how many of the newest steps, this one included, that or the scale holds.
-        nis: of the disagreement between wheels and witness over the least likely window; NaN without a witness.
+        nis: of the disagreement between wheels and reference source over the least likely window; NaN without one.
         scale: on their covariances where neither is left out.
+        threshold: that ``nis`` is held against.
     """
 
     off: Mapping[str, str] = field(default_factory=dict)
     span: int = 1
     nis: float = math.nan
     scale: float = 1.0
+    threshold: float = math.nan
 
 
 class MotionFaultMonitor:
-    """Watches wheels and their witness for a disagreement; known failures are taken as given.
+    """Tests wheels against their reference source; known failures are taken as given.
 
     Attributes:
         flags: how often each source was flagged, by "source.reason".
@@ -48,15 +50,15 @@ class MotionFaultMonitor:
 
         Args:
             config: thresholds, and known failures.
-            sources: says what the difference of two readings means.
-            track_m: distance of the wheels, to tell left from right; None: unknown.
+            sources: gives the difference of two readings with its covariance.
+            track_m: distance of the wheels, to distinguish left from right; None: unknown.
         """
         self.flags: Counter[str] = Counter()
         self._config = config
         self._sources = sources
         self._track_m = track_m
         self._glr = GlrTest(config)
-        self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, wheels' and witness's motion
+        self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, motion of wheels and reference
         self._first_ns: int | None = None  # of the run
         self._reason = "slip"
 
@@ -72,7 +74,7 @@ class MotionFaultMonitor:
         self._travels.clear()
 
     def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
-        """Take in what the sources say of a step that follows the last one."""
+        """Take in the readings of a step that follows the last one."""
         off = self._known_failures(step)
         if "wheels" in off:  # nothing to be found out
             self.reset()
@@ -85,7 +87,7 @@ class MotionFaultMonitor:
         )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
-            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale)
+            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale, self._config.alarm)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -94,7 +96,7 @@ class MotionFaultMonitor:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis)
+        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis, threshold=self._config.alarm)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9
@@ -102,10 +104,10 @@ class MotionFaultMonitor:
         return {d.source: "distrusted" for d in self._config.distrust if start < d.end_s and end > d.start_s}
 
     def _travelled(self, dt: float, readings: MotionReadings) -> None:
-        witness = readings.learned or readings.gyro
-        if readings.wheels is None or witness is None:
+        reference = readings.learned or readings.gyro
+        if readings.wheels is None or reference is None:
             return
-        self._travels.append((dt, readings.wheels.motion, witness.motion))
+        self._travels.append((dt, readings.wheels.motion, reference.motion))
         while sum(t for t, _, _ in self._travels) - self._travels[0][0] > _EVIDENCE_S:
             self._travels.popleft()
 
@@ -117,9 +119,9 @@ class MotionFaultMonitor:
         def sides(motion: FloatArray) -> FloatArray:
             return np.array([motion[0] - half * motion[2], motion[0] + half * motion[2]])
 
-        told = sum((np.abs(sides(w)) for _, w, _ in newest), np.zeros(2))
+        by_wheels = sum((np.abs(sides(w)) for _, w, _ in newest), np.zeros(2))
         did = sum((np.abs(sides(n)) for _, _, n in newest), np.zeros(2))
-        stood = (told < _MOVED * did) & (did > _LEAST_M)
+        stood = (by_wheels < _MOVED * did) & (did > _LEAST_M)
         if stood.all():
             return "frozen"
         if self._track_m is None or not stood.any():

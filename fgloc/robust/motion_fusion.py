@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.robust.motion_noise import add_slip_noise, is_commanded_to_move, noise_scales, turned_by, with_noise
 from fgloc.sensors.gyro import Gyro, Turn
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
@@ -19,12 +19,9 @@ from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
-_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion nothing tells
+_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
-_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
-_WRONG_LASTS_S = 1.0  # ... for this long in one direction
-_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
 
 
 _OF_MOTION = (
@@ -84,8 +81,8 @@ class MotionFusion:
         self._learned = learned
         self.joint = joint
         self.gyro = gyro
-        self._turn: Turn | None = None  # what the gyro says of the step that was read last
-        self._silent_s = 0.0  # how long neither a motion source nor a fix has told where the robot went
+        self._turn: Turn | None = None  # by the gyro, of the step that was read last
+        self._silent_s = 0.0  # how long there was neither a motion source nor a fix
 
     @property
     def gyro_is_read(self) -> bool:
@@ -96,7 +93,7 @@ class MotionFusion:
         """Ask every source once.
 
         Args:
-            step: what was heard.
+            step: its events.
             blind_s: time before the step without a fix.
             velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
@@ -112,10 +109,10 @@ class MotionFusion:
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
-            turn = self.gyro.measure(step, None if wheels is None or _told_to_move(step) else motion, blind_s)
+            turn = self.gyro.measure(step, None if wheels is None or is_commanded_to_move(step) else motion, blind_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
-                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, _turned(motion, turn.yaw), cov)
+                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, turned_by(motion, turn.yaw), cov)
                 gyro = self._installed(gyro, turn)
                 self._turn = turn
         readings = MotionReadings(wheels, self._measure_learned(step, velocity), gyro)
@@ -130,7 +127,7 @@ class MotionFusion:
 
         Args:
             m: as it is reported.
-            turn: what the gyro says, if the motion is made of it.
+            turn: the gyro's, if the motion is made of it.
             change: ``(3,)`` of the wheels' twist over the step: by it a wrong clock shows.
 
         Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
@@ -158,8 +155,8 @@ class MotionFusion:
     def _by_slowdown(self, m: MotionMeasurement, rho_x: float, phi: float) -> FloatArray:
         """Derivative of the wheels' motion by ``slowdown``: it takes from the speed by the turning that is reported."""
         wheels, seconds = self._config.wheels, max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-        told = abs(phi) / seconds / wheels.scale_omega
-        return np.array([-told * rho_x / max(1.0 - wheels.slowdown * told, _SLOWEST), 0.0, 0.0])
+        commanded = abs(phi) / seconds / wheels.scale_omega
+        return np.array([-commanded * rho_x / max(1.0 - wheels.slowdown * commanded, _SLOWEST), 0.0, 0.0])
 
     def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -182,8 +179,8 @@ class MotionFusion:
         """Factors of a step, independent of each other.
 
         Args:
-            readings: what the sources say.
-            off: sources that are not to be trusted, and why. The wheels' factor is then left out or, if nothing else
+            readings: of the sources.
+            off: rejected sources, and why. The wheels' factor is then left out or, if nothing else
                 knows the distance, kept with room for a slip.
             scale: as `noise_scales` takes it.
         """
@@ -204,14 +201,14 @@ class MotionFusion:
                 learned = self.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
         if gyro is not None and known:
-            known.append(replace(gyro, motion=_turned(known[0].motion, float(gyro.motion[2]))))
+            known.append(replace(gyro, motion=turned_by(known[0].motion, float(gyro.motion[2]))))
         return known
 
     def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
-        """Wheels that are not believed, where nothing else knows the way."""
+        """Rejected wheels, where no other source measures the motion: with slip noise."""
         if why == "slip":
-            return with_room(wheels, _SLIP_SPEED, _SLIP_TURN)
-        return with_room(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
+            return add_slip_noise(wheels, _SLIP_SPEED, _SLIP_TURN)
+        return add_slip_noise(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
 
     def combine_again(self, frame: Keyframe, readings: MotionReadings | None = None) -> list[MotionMeasurement]:
         """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
@@ -219,11 +216,11 @@ class MotionFusion:
         return [with_noise(m, extra_cov=frame.extra_cov) for m in made]
 
     def disagreement(self, readings: MotionReadings) -> Difference | None:
-        """How far the wheels and the sources that witness their slip are apart over the step.
+        """How far the wheels and their reference source are apart over the step.
 
         Returns:
-            None where there is no witness: a model that reads the wheels is none, nor is one of the commands that stand
-            in for wheels.
+            None where there is no reference source: a model that reads the wheels is none, nor is one of the commands
+            that replace wheels.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
         if wheels is None or self._wheels.from_commands:
@@ -253,9 +250,9 @@ class MotionFusion:
         return D, self._factors.believed.cov[np.ix_(rows, rows)]
 
     def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
-        """Nothing told the way: sigma grows with the time of silence, however many steps it is cut into.
+        """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
 
-        A gyro, if there is one, still tells the turn.
+        A gyro, if there is one, still measures the turn.
         """
         before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
         gate = self._config.gate
@@ -263,14 +260,14 @@ class MotionFusion:
         cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
-            motion, cov[2, 2] = _turned(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+            motion, cov[2, 2] = turned_by(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
     def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None) -> None:
         """The robot went on by a step.
 
         Args:
-            readings: what the sources said of it.
+            readings: of that step.
             fix: where sightings have it now; None if there were none.
         """
         if fix is not None:
@@ -290,48 +287,3 @@ class MotionFusion:
         self._silent_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
-
-
-def noise_scales(off: Mapping[str, str], scale: float) -> dict[str, float]:
-    """Factors on the covariances of wheels and learned motion.
-
-    Args:
-        off: sources that are left out, and why.
-        scale: on the wheels' covariance, as they and the other sources differ (`MotionFaultMonitor`). The learned
-            motion's follows, up to what it is worth beside wrong wheels; below 1 by the root, as nothing tells which of
-            the two is better than it says.
-    """
-    if "wheels" in off:
-        return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
-    return {"wheels": scale, "learned": min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)}
-
-
-def with_noise(m: MotionMeasurement, scale: float = 1.0, extra_cov: FloatArray | None = None) -> MotionMeasurement:
-    """The motion with its covariance scaled, and with ``doubt (3, 3)``, what sightings say against it, added."""
-    if scale == 1.0 and extra_cov is None:
-        return m
-    return replace(m, cov=m.cov * scale + (0.0 if extra_cov is None else extra_cov))
-
-
-def with_room(m: MotionMeasurement, speed: float, turn: float) -> MotionMeasurement:
-    """The wheels' motion with room: the robot may do anything between what they say and nothing, or these speeds.
-
-    Args:
-        m: what the wheels say.
-        speed: that they may be wrong by, even when they hardly turn [m/s].
-        turn: likewise [rad/s].
-    """
-    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-    told, turned = np.hypot(*m.motion[:2]) / seconds, abs(float(m.motion[2])) / seconds
-    density = np.square([max(told, speed), 0.3 * max(told, speed), max(turned, turn)])
-    return replace(m, cov=m.cov + np.diag(density * _WRONG_LASTS_S * seconds))
-
-
-def _turned(motion: FloatArray, yaw: float) -> FloatArray:
-    return np.array([motion[0], motion[1], yaw])
-
-
-def _told_to_move(step: Step) -> bool:
-    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
-    since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)

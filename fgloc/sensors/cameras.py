@@ -28,7 +28,7 @@ def camera_from_info(event: CameraInfoEvent, T_base_cam: FloatArray) -> Camera:
     """
     source = f"{event.topic} (CameraInfo)"
     return _checked(
-        source, event.width, event.height, event.distortion_model, event.K, event.D, T_base_cam, event.frame_id
+        source, (event.width, event.height), event.distortion_model, event.K, event.D, T_base_cam, event.frame_id
     )
 
 
@@ -139,7 +139,7 @@ def _ros(path: Path, root: Item, T_base_cam: FloatArray) -> Camera:
     model, name = root.get("distortion_model"), root.get("camera_name")
     width, height = (root.need(key).integer() for key in ("image_width", "image_height"))
     frame = "" if name is None else name.text()
-    return _checked(str(path), width, height, "" if model is None else model.text(), K, D, T_base_cam, frame)
+    return _checked(str(path), (width, height), "" if model is None else model.text(), K, D, T_base_cam, frame)
 
 
 def _opencv(path: Path, T_base_cam: FloatArray) -> Camera:
@@ -160,7 +160,7 @@ def _opencv(path: Path, T_base_cam: FloatArray) -> Camera:
         raise CameraError(f"{path}: no camera_matrix in it; expected a calibration file of OpenCV")
     coefficients = np.zeros(0) if D is None else np.asarray(D, dtype=np.float64)
     model = "fisheye" if fisheye else "plumb_bob"
-    return _checked(str(path), width, height, model, np.asarray(K, dtype=np.float64), coefficients, T_base_cam, "")
+    return _checked(str(path), (width, height), model, np.asarray(K, dtype=np.float64), coefficients, T_base_cam, "")
 
 
 def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: str | None) -> Camera:
@@ -176,7 +176,7 @@ def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: 
     model, coefficients = item.get("distortion_model"), item.get("distortion_coeffs")
     D = np.zeros(0) if coefficients is None else coefficients.numbers()
     width, height = (int(v) for v in item.need("resolution").numbers(2))
-    camera = _checked(str(path), width, height, "" if model is None else model.text(), K, D, T_base_cam, "")
+    camera = _checked(str(path), (width, height), "" if model is None else model.text(), K, D, T_base_cam, "")
     if name is None and len(cameras) > 1:
         others = ", ".join(k for k in cameras if k != chosen)
         camera = replace(camera, notes=(*camera.notes, f"{path}: camera {chosen} is used, not {others}."))
@@ -185,8 +185,7 @@ def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: 
 
 def _checked(
     source: str,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     model: str,
     K: FloatArray,
     D: FloatArray | Sequence[float],
@@ -219,6 +218,7 @@ def _checked(
             f"{source}: {len(coefficients)} distortion coefficients, '{model}' has {' or '.join(map(str, lengths))}"
         )
     own = "equidistant" if fisheye else "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
+    width, height = size
     if width <= 0 or height <= 0:
         notes.append(f"{source}: no image size; it is not checked that the images have the calibration's size.")
         width = height = 0

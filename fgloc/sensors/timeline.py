@@ -115,7 +115,7 @@ class TwistTimeline:
             cuts = int(turn * seconds / _MAX_TURN) + 1
             h = seconds / cuts
             for _ in range(cuts):
-                along, left, p = _advance(p, vx, vy, w, h, qx, qy, qt)
+                along, left, p = _advance(p, twist, h, (qx, qy, qt))
                 c, s = math.cos(yaw), math.sin(yaw)
                 x += c * along - s * left
                 y += s * along + c * left
@@ -148,13 +148,21 @@ class TwistTimeline:
 
 
 def _advance(
-    p: tuple[float, ...], vx: float, vy: float, w: float, h: float, qx: float, qy: float, qt: float
+    p: tuple[float, ...], twist: Twist, h: float, density: tuple[float, float, float]
 ) -> tuple[float, float, tuple[float, float, float, float, float, float]]:
     """One arc: its displacement along and left, and the covariance (xx, xy, xt, yy, yt, tt) at its end.
+
+    Args:
+        p: covariance at its start.
+        twist: of the body.
+        h: how long it takes [s].
+        density: of the noise by x, y [m²/s] and yaw [rad²/s].
 
     Source: Solà et al. 2018, SE(2): the integral of ``Ad(exp(-u ξ)) Q Ad(exp(-u ξ))ᵀ`` over u, by quadrature, after
     ``Ad(exp(-h ξ)) P Ad(exp(-h ξ))ᵀ``.
     """
+    vx, vy, w = twist
+    qx, qy, qt = density
     p11, p12, p13, p22, p23, p33 = p
     angle = w * h
     c, s = math.cos(angle), math.sin(angle)

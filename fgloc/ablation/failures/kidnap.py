@@ -1,4 +1,4 @@
-"""The robot is carried away: a piece of the recording is cut out, and nothing but the scene says so."""
+"""The robot is carried away: a piece of the recording is cut out, and only the sightings show it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Kidnap(Failure):
     """What was measured inside each interval is cut out, for all sensors and the truth, and the gap is closed.
 
     The robot goes on from where it was at the interval's end, although its odometry and wheel angles, moved to join on
-    to what they said before, tell of no motion. The recording gets shorter by the length of the intervals. Unlike the
+    to their values before, measure no motion. The recording gets shorter by the length of the intervals. Unlike the
     other failures it goes by stamps, counted from the first message received, so that a late image stays with its time.
     Without ``when`` one piece of 5 s is cut out at random.
     """
@@ -61,7 +61,7 @@ class _Joined:
     def __init__(self) -> None:
         self._shift = 0
         self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
-        self._last: FloatArray | None = None  # as told
+        self._last: FloatArray | None = None  # as reported
 
     def join(self, event: JointsEvent | OdometryEvent, shift: int) -> JointsEvent | OdometryEvent:
         angles = isinstance(event, JointsEvent)

@@ -16,7 +16,7 @@ from fgloc.types import Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
 
 
 class EncoderFrozen(Failure):
-    """Odometry and wheel angles go on with new stamps but repeat what they said last; then they jump to the present.
+    """Odometry and wheel angles go on with new stamps but repeat their last values; then they jump to the present.
 
     Joint efforts, which motor drivers measure, go on as they are.
     """
@@ -109,7 +109,7 @@ class WheelNan(EventFailure):
 
 
 class WrongCovariance(EventFailure):
-    """Odometry's covariances are ``factor`` times what they were: 0 says nothing, a negative one is nonsense."""
+    """Odometry's covariances are ``factor`` times what they were: 0 is unknown, a negative one invalid."""
 
     kind: Literal["wrong_covariance"] = "wrong_covariance"
     factor: float = Field(0.01, description="of variances")

@@ -139,7 +139,7 @@ class DuplicatedId(SightingFailure):
 
 
 class MovedMarker(Failure):
-    """Markers are not where the map says, throughout the run.
+    """Markers are not where the map has them, throughout the run.
 
     Each of ``ids`` (or ``count`` random markers) stands ``distance_m`` away in a random horizontal direction and turned
     by ``yaw_rad`` about the vertical. That the map is moved instead of the marker is the same to the robot.

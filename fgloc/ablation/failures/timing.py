@@ -54,7 +54,7 @@ class Latency(Failure):
 
     With jitter longer than their period they arrive out of order. Stamps keep the time of measurement, unless
     ``stamped_on_arrival``: then they are late as well, and the sensor seems to lag. Commands that arrive late so are
-    commands that the recorder heard late, not commands that the robot obeyed late.
+    commands that the recorder received late, not commands that the robot followed late.
     """
 
     kind: Literal["latency"] = "latency"

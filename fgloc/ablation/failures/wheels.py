@@ -20,7 +20,7 @@ from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
 
 @dataclass(frozen=True, slots=True)
 class Roll:
-    """How one source says that the wheels rolled up to one message."""
+    """Motion of the wheels by one source up to one message."""
 
     source: str  # a topic's positions or rates: each is corrupted with a memory of its own
     speeds: FloatArray  # (2,) left, right: surface speeds [m/s]
@@ -33,7 +33,7 @@ Distort = Callable[[Roll], FloatArray]
 
 
 class WheelFailure(Failure):
-    """A failure of the wheels' surface speeds, told alike to odometry (twist and pose) and to joints.
+    """A failure of the wheels' surface speeds, reported alike by odometry (twist and pose) and to joints.
 
     Odometry is split to wheels by the configured track, else by ``track_m``; joints are changed only where the
     configuration gives the wheels' radii. What was wrongly counted stays counted when the failure is over.
@@ -43,7 +43,7 @@ class WheelFailure(Failure):
 
     @abstractmethod
     def distort(self, scene: Scene) -> Distort:
-        """What the wheels are said to do, with the state of one run."""
+        """Reported motion of the wheels, with the state of one run."""
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The corrupted events, in order of receive time."""
@@ -165,14 +165,14 @@ class _Odometer:
     def __init__(self, track: float) -> None:
         self._track = track
         self._before: tuple[int, FloatArray] | None = None  # stamp and pose as recorded
-        self._told: FloatArray | None = None  # pose as told; None while it is the recorded one
+        self._reported: FloatArray | None = None  # pose as reported; None while it is the recorded one
 
     def rewrite(self, event: OdometryEvent, corrupt: Corrupt) -> OdometryEvent:
         pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
         before, self._before = self._before, (event.stamp_ns, pose)
         dt = 0.0 if before is None else (event.stamp_ns - before[0]) * 1e-9
         if before is None or dt <= 0.0:
-            return event if self._told is None else self._with_pose(event, self._told)
+            return event if self._reported is None else self._with_pose(event, self._reported)
         twist = np.array([event.linear[0], event.angular[2]])
         corrupted = self._spoiled(f"{event.topic} rates", twist, dt, corrupt)
         changed = event
@@ -182,12 +182,12 @@ class _Odometer:
             changed = replace(event, linear=linear, angular=angular)
         moved = se2.log(se2.between(before[1], pose))
         rates = np.array([moved[0], moved[2]]) / dt
-        told = self._spoiled(f"{event.topic} positions", rates, dt, corrupt)
-        if self._told is None and np.array_equal(told, rates, equal_nan=True):
+        reported = self._spoiled(f"{event.topic} positions", rates, dt, corrupt)
+        if self._reported is None and np.array_equal(reported, rates, equal_nan=True):
             return changed
-        start = before[1] if self._told is None else self._told
-        self._told = se2.compose(start, se2.exp((told[0] * dt, moved[1], told[1] * dt)))
-        return self._with_pose(changed, self._told)
+        start = before[1] if self._reported is None else self._reported
+        self._reported = se2.compose(start, se2.exp((reported[0] * dt, moved[1], reported[1] * dt)))
+        return self._with_pose(changed, self._reported)
 
     def _spoiled(self, source: str, rates: FloatArray, dt: float, corrupt: Corrupt) -> FloatArray:
         """Forward speed and yaw rate ``(2,)`` by way of the wheels."""
@@ -214,7 +214,7 @@ class _Encoders:
         self._radii = None if None in radii else np.array(radii, dtype=float)
         self._wanted = (wheels.left_joint, wheels.right_joint)
         self._before: tuple[int, FloatArray] | None = None  # stamp and angles as recorded
-        self._offset = np.zeros(2)  # told minus recorded angles
+        self._offset = np.zeros(2)  # reported minus recorded angles
 
     def rewrite(self, event: JointsEvent, corrupt: Corrupt) -> JointsEvent:
         pair = self._indices(event)
@@ -227,15 +227,15 @@ class _Encoders:
         if before is not None and dt > 0.0:
             speeds = (angles - before[1]) / dt * radii
             if len(event.position):
-                told = corrupt(f"{event.topic} positions", speeds, dt)
-                if told is not speeds:
-                    self._offset = self._offset + (told - speeds) * dt / radii
+                reported = corrupt(f"{event.topic} positions", speeds, dt)
+                if reported is not speeds:
+                    self._offset = self._offset + (reported - speeds) * dt / radii
             if len(event.velocity):
                 rates = event.velocity[pair] * radii
-                told = corrupt(f"{event.topic} rates", rates, dt)
-                if told is not rates:
+                reported = corrupt(f"{event.topic} rates", rates, dt)
+                if reported is not rates:
                     velocity = event.velocity.copy()
-                    velocity[pair] = told / radii
+                    velocity[pair] = reported / radii
                     changed = replace(changed, velocity=velocity)
         if len(event.position) and self._offset.any():
             position = event.position.copy()

@@ -1,0 +1,285 @@
+"""What a run judged to be wrong, as episodes: adjacent rows of ``steps.csv`` that say the same are one judgement."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from fgloc.calibration.contradictions import SURE_SIGMAS, contradicted
+from fgloc.evaluation.judgement_effects import effect, plural
+from fgloc.types import Decision, IntArray, RunResult, Trajectory
+
+Kind = Literal[
+    "gross_mistake",
+    "lost",
+    "initial_pose_contradicted",
+    "relocated",
+    "clock_jump",
+    "landmark_moved",
+    "installation",
+    "unconfirmed",
+    "motion_overruled",
+    "outage",
+    "motion_faulty",
+    "start_outlier",
+    "misread",
+    "solver",
+    "rejected",
+    "outlier",
+]
+"""The gravest first."""
+GRAVITY: Mapping[str, int] = {kind: i for i, kind in enumerate(get_args(Kind))}
+_TITLES: Mapping[str, str] = {
+    "gross_mistake": "set-up wrong",
+    "lost": "robot lost",
+    "initial_pose_contradicted": "given first pose contradicted",
+    "relocated": "pose contradicted, robot relocated",
+    "clock_jump": "clock jumped",
+    "landmark_moved": "moved",
+    "installation": "contradicts the given value",
+    "unconfirmed": "first pose not confirmed",
+    "motion_overruled": "motion contradicted by sightings",
+    "outage": "no accepted sightings: dead reckoning",
+    "motion_faulty": "faulty",
+    "start_outlier": "sightings contradict the first pose",
+    "misread": "markers misread",
+    "solver": "solver failed, window rebuilt",
+    "rejected": "sightings rejected",
+    "outlier": "single sightings rejected",
+}
+_OF_SIGHTINGS: Mapping[str, Kind] = {
+    "gate": "rejected",
+    "behind_camera": "rejected",
+    "contradicts_others": "rejected",
+    "contradicts_start": "start_outlier",
+    "contradicts initial_pose": "initial_pose_contradicted",
+    "misread": "misread",
+    "quarantined": "landmark_moved",
+    "window_rebuilt": "solver",
+}
+_OF_PLACES: Mapping[str, Kind] = {
+    "jump": "relocated",
+    "overruled by sightings": "motion_overruled",
+    "contradicts initial_pose": "initial_pose_contradicted",
+    "landmark_moved": "landmark_moved",
+}
+_OF_MODES: Mapping[str, Kind] = {"dead_reckoning": "outage", "lost": "lost", "unconfirmed": "unconfirmed"}
+_MOTIONS = ("wheels", "learned", "gyro")
+_JOIN_NS = 1_000_000_000  # rows of one kind and subject further apart than this are two episodes ...
+_LASTING = ("landmark_moved", "misread", "start_outlier", "initial_pose_contradicted")  # ... but for these
+_FEW = 2  # sightings rejected: as few of a landmark in a row are outliers, and all outliers one judgement
+_NAMED = 6  # landmarks in one judgement
+
+
+class Judgement(BaseModel):
+    """One thing that was judged to be wrong.
+
+    Attributes:
+        kind: of the judgement.
+        subject: what it is about: a source, a landmark, the pose.
+        what: subject and kind in words.
+        from_s, to_s: seconds from the first pose; None: before the run, or of all of it.
+        from_step, to_step: of the rows of ``steps.csv``.
+        rows: how many rows, or sightings, it is made of.
+        evidence: statistic and number of steps or sightings, in words.
+        statistic: the value that exceeds its threshold most, as ``nis`` in ``steps.csv``.
+        threshold: that the statistic was held against.
+        effect: what it cost or saved.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    kind: Kind
+    subject: str
+    what: str
+    from_s: float | None = None
+    to_s: float | None = None
+    from_step: int | None = None
+    to_step: int | None = None
+    rows: int = 0
+    evidence: str = ""
+    statistic: float | None = None
+    threshold: float | None = None
+    effect: str = ""
+
+    @property
+    def when(self) -> str:
+        """Seconds from the first pose, in words."""
+        if self.from_s is None or self.to_s is None:
+            return "whole run"
+        if self.to_s - self.from_s < 0.05:
+            return f"{self.from_s:.1f} s"
+        return f"{self.from_s:.1f}–{self.to_s:.1f} s"
+
+
+def judgements(result: RunResult) -> tuple[Judgement, ...]:
+    """Everything that a run judged to be wrong: of the whole run first, then by time."""
+    return (*_of_setup(result), *episodes(result.decisions, result.trajectory))
+
+
+def gravest(found: Iterable[Judgement], count: int) -> list[Judgement]:
+    """The gravest judgements, but for what is expected of a sound run and what is said elsewhere.
+
+    By kind, then by the number of rows.
+    """
+    told = [j for j in found if j.kind not in ("gross_mistake", "outlier")]
+    return sorted(told, key=lambda j: (GRAVITY[j.kind], -j.rows))[:count]
+
+
+def episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[Judgement]:
+    """Judgements that rows of ``steps.csv`` make, by time.
+
+    Args:
+        decisions: the rows.
+        trajectory: of the run, for what an episode did to the pose.
+    """
+    grouped = _grouped(decisions)
+    start_ns = int(trajectory.stamps_ns[0])
+    found, outliers = [], []
+    for (kind, subject), rows in grouped.items():
+        for episode in _cut(rows, joined=kind in _LASTING):
+            if kind == "rejected" and len(episode) <= _FEW:
+                outliers += episode
+            else:
+                found.append(_judgement(kind, subject, episode, trajectory, start_ns))
+    if outliers:
+        outliers.sort(key=lambda d: d.stamp_ns)
+        seen = sum(math.isfinite(d.nis) and d.landmark_id >= 0 for d in decisions)
+        made = _judgement("outlier", "", outliers, trajectory, start_ns)
+        found.append(made.model_copy(update={"evidence": f"{made.evidence}, of {seen}"}))
+    return sorted(found, key=lambda j: (j.from_s or 0.0, GRAVITY[j.kind]))
+
+
+def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
+    """Rows by what they say, and of what."""
+    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in _MOTIONS}
+    moved = {d.landmark_id for d in decisions if d.reason in ("quarantined", "landmark_moved")}
+    grouped: dict[tuple[Kind, str], list[Decision]] = defaultdict(list)
+    for i, d in enumerate(decisions):
+        if d.kind in _MOTIONS and last[d.step, d.kind] != i:
+            continue  # judged again further down
+        if (named := _named(d, moved)) is not None:
+            grouped[named].append(d)
+    for rows in grouped.values():
+        rows.sort(key=lambda d: d.stamp_ns)
+    return grouped
+
+
+def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
+    """Kind and subject of a row; None: nothing is wrong, or another row says it."""
+    if not d.reason:
+        return None
+    if d.kind in _MOTIONS:
+        return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
+    if d.kind == "mode":
+        return _OF_MODES[d.reason], "pose"
+    if d.kind == "clock":
+        return "clock_jump", "clock"
+    if d.kind == "place":
+        kind = _OF_PLACES.get(d.reason)
+        return None if kind is None else (kind, f"landmark {d.landmark_id}" if d.landmark_id >= 0 else "pose")
+    kind = _OF_SIGHTINGS.get(d.reason)
+    if kind == "rejected" and d.landmark_id in moved:
+        kind = "landmark_moved"
+    if kind is None or d.landmark_id < 0:
+        return None
+    by_landmark = kind in ("landmark_moved", "rejected")
+    return kind, f"landmark {d.landmark_id}" if by_landmark else "pose" if kind == "initial_pose_contradicted" else ""
+
+
+def _cut(rows: Sequence[Decision], joined: bool) -> Iterator[list[Decision]]:
+    """Episodes of rows that lie close to one another."""
+    stamps: IntArray = np.array([d.stamp_ns for d in rows], dtype=np.int64)
+    cuts = [] if joined else (np.flatnonzero(np.diff(stamps) > _JOIN_NS) + 1).tolist()
+    for first, end in zip([0, *cuts], [*cuts, len(rows)], strict=True):
+        yield list(rows[first:end])
+
+
+def _judgement(kind: Kind, subject: str, rows: Sequence[Decision], trajectory: Trajectory, start_ns: int) -> Judgement:
+    worst = max(rows, key=_excess)
+    statistic = worst.residual if worst.kind == "mode" else worst.nis
+    told = subject if subject and subject != "pose" and not subject.startswith("clock") else ""
+    return Judgement(
+        kind=kind,
+        subject=subject,
+        what=f"{told} {_TITLES[kind]}".strip() + _reasons(kind, rows),
+        from_s=round((rows[0].stamp_ns - start_ns) * 1e-9, 3),
+        to_s=round((rows[-1].stamp_ns - start_ns) * 1e-9, 3),
+        from_step=rows[0].step,
+        to_step=rows[-1].step,
+        rows=len(rows),
+        evidence=_evidence(rows, worst, statistic),
+        statistic=statistic if math.isfinite(statistic) else None,
+        threshold=worst.threshold if math.isfinite(worst.threshold) else None,
+        effect=effect(kind, rows, trajectory),
+    )
+
+
+def _excess(d: Decision) -> float:
+    """How far a row is beyond its threshold."""
+    statistic = d.residual if d.kind == "mode" else d.nis
+    if not math.isfinite(statistic):
+        return -1.0
+    return statistic / d.threshold if d.threshold > 0.0 else 0.0
+
+
+def _reasons(kind: Kind, rows: Sequence[Decision]) -> str:
+    """The most frequent reason, of a fault of motion; the landmarks, where there may be several."""
+    if kind == "motion_faulty":
+        return f": {Counter(d.reason for d in rows).most_common(1)[0][0].replace('_', ' ')}"
+    if kind in ("misread", "outlier", "start_outlier"):
+        ids = sorted({d.landmark_id for d in rows})
+        more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
+        return f" (landmarks {', '.join(map(str, ids[:_NAMED]))}{more})"
+    return ""
+
+
+def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> str:
+    sightings = [d for d in rows if d.landmark_id >= 0 and d.kind != "place"]
+    count = plural(len(sightings), "sighting") if sightings else plural(len({d.step for d in rows}), "step")
+    if worst.kind == "clock":
+        return "stamps of several sensors left the running time together"
+    if worst.kind == "mode":
+        bound = f", threshold {worst.threshold:.3g} s" if math.isfinite(worst.threshold) else ""
+        return f"{statistic:.1f} s without an accepted sighting{bound}; {count}"
+    if not math.isfinite(statistic) or statistic == 0.0:
+        return count
+    names = {"wheels": "GLR", "learned": "NIS", "gyro": "NIS", "place": "NIS"}
+    name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
+    bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""
+    return f"{name} {'up to ' if len(rows) > 1 else ''}{_number(statistic)}{bound}; {count}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
+
+
+def _of_setup(result: RunResult) -> Iterator[Judgement]:
+    """What holds for the whole run: gross mistakes, and given values that the run contradicts."""
+    for sentence in result.mistakes:
+        yield Judgement(
+            kind="gross_mistake",
+            subject="set-up",
+            what=_TITLES["gross_mistake"],
+            evidence=sentence,
+            effect="the run was made without it",
+        )
+    for s in () if result.found is None else result.found.settings:
+        if contradicted(s):
+            yield Judgement(
+                kind="installation",
+                subject=s.name,
+                what=f"{s.name} {_TITLES['installation']}",
+                evidence=f"{abs(s.off):.1f} σ apart, threshold {SURE_SIGMAS:g}",
+                statistic=abs(s.off),
+                threshold=SURE_SIGMAS,
+                effect=f"{s.given:.5g} was given, {s.found:.5g} ± {s.sigma:.2g} was used",
+            )
+
+
+__all__ = ["GRAVITY", "Judgement", "Kind", "episodes", "gravest", "judgements"]

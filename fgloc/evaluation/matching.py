@@ -1,0 +1,112 @@
+"""Pairs of estimated and true poses at the same times."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.errors import TrajectoryError
+from fgloc.types import FloatArray, IntArray, Trajectory
+
+FEWEST = 2  # matched poses; one cannot be aligned, and is no trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """An estimate and a truth at the same stamps, both in the map frame."""
+
+    stamps_ns: IntArray  # (n,)
+    estimate: FloatArray  # (n, 3)
+    truth: FloatArray  # (n, 3)
+    covs: FloatArray | None  # (n, 3, 3) of the estimate
+    T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
+
+    @property
+    def errors(self) -> FloatArray:
+        """``(n, 3)`` estimate minus truth: x, y [m] and wrapped yaw [rad]."""
+        difference = self.estimate - self.truth
+        difference[:, 2] = se2.wrap_array(difference[:, 2])
+        return difference
+
+    @property
+    def distances(self) -> FloatArray:
+        """``(n,)`` distance from the truth [m]."""
+        return np.asarray(np.hypot(*(self.estimate - self.truth)[:, :2].T))
+
+
+def match(
+    estimate: Trajectory, truth: Trajectory, align: Literal["none", "se2"] = "none", max_gap_s: float = 0.2
+) -> Matched:
+    """Bring the truth to the estimate's stamps and, if asked, into its frame.
+
+    Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
+    interpolated; elsewhere the estimate has no partner and is left out.
+
+    Raises:
+        TrajectoryError: fewer than two poses have a partner.
+    """
+    indices = matchable(estimate, truth, max_gap_s)
+    if len(indices) < FEWEST:
+        raise TrajectoryError(
+            f"{len(indices)} of {len(estimate)} poses have a truth at their time, expected {FEWEST} or more: the "
+            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {max_gap_s} s are not bridged; "
+            "check the clocks, or raise the largest gap"
+        )
+    stamps = estimate.stamps_ns[indices]
+    poses = estimate.poses[indices]
+    reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
+    T_map_truth = np.zeros(3)
+    if align == "se2":
+        T_map_truth = align_se2(reference[:, :2], poses[:, :2])
+        reference = transform(T_map_truth, reference)
+    covs = None if estimate.covs is None else estimate.covs[indices]
+    return Matched(stamps, poses, reference, covs, T_map_truth)
+
+
+def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:
+    """Rigid motion ``(3,)`` that takes the points ``(n, 2)`` of source nearest to those of target, in least squares.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without
+    scale; in the plane the rotation has a closed form.
+    """
+    center_s, center_t = source.mean(axis=0), target.mean(axis=0)
+    s, t = source - center_s, target - center_t
+    yaw = math.atan2(float(np.sum(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])), float(np.sum(s * t)))
+    turned = se2.compose((0.0, 0.0, yaw), (*center_s, 0.0))
+    return np.array([*(center_t - turned[:2]), yaw])
+
+
+def transform(T: FloatArray, poses: FloatArray) -> FloatArray:
+    """Left-multiply poses ``(n, 3)`` by T ``(3,)``."""
+    x, y, yaw = T
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.column_stack(
+        [
+            x + c * poses[:, 0] - s * poses[:, 1],
+            y + s * poses[:, 0] + c * poses[:, 1],
+            se2.wrap_array(poses[:, 2] + yaw),
+        ]
+    )
+
+
+def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
+    """Indices of the estimate's poses that have a truth at, or around, their stamp."""
+    if len(estimate) == 0 or len(truth) == 0:
+        return np.array([], dtype=np.int64)
+    after = np.searchsorted(truth.stamps_ns, estimate.stamps_ns)
+    inside = np.clip(after, 0, len(truth) - 1)
+    exact = truth.stamps_ns[inside] == estimate.stamps_ns
+    between = (after > 0) & (after < len(truth))
+    gap_ns = truth.stamps_ns[inside] - truth.stamps_ns[np.maximum(inside - 1, 0)]
+    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(max_gap_s * 1e9)))))
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "nothing"
+    first, last = trajectory.stamps_ns[[0, -1]].tolist()
+    return f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s"

@@ -1,0 +1,202 @@
+"""Corners of markers in images: residuals and Jacobians of many in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fgloc.graph.installation import Installation
+from fgloc.graph.linearized import Stacked, landmark_block
+from fgloc.types import (
+    CornerMeasurement,
+    FloatArray,
+    Landmark,
+)
+
+_BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
+_MOST_BLURRED = 2.0
+MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
+
+
+class CornerBatch:
+    """Corners of markers in images.
+
+    Source: pinhole camera with the distortion of Brown 1966 as OpenCV has it; perturbations on the right.
+    """
+
+    def __init__(
+        self, seen: Sequence[CornerMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
+    ) -> None:
+        held = [landmarks[m.landmark_id] for m in seen]
+        half = np.array([0.5 * landmark.size_m for landmark in held])
+        square = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+        self._local = half[:, None, None] * square  # (m, 4, 3) in the marker's frame
+        self._position = np.array([landmark.position for landmark in held])
+        self._rotation = np.array([landmark.rotation for landmark in held])
+        T = np.array([m.camera.T_base_cam for m in seen])
+        self._R, self._t = T[:, :3, :3], T[:, :3, 3]
+        self._K = np.array([m.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for m in seen])
+        self._D = np.array([np.concatenate([m.camera.D, np.zeros(4)])[:4] for m in seen])
+        self._pixels = np.array([m.corners_px for m in seen])
+        self._sigma = np.array([m.sigma_px for m in seen])
+        self._twist = np.array([m.twist for m in seen])
+        self._offset = np.array([m.offset_s for m in seen])
+        self._jitter = np.array([m.jitter_s for m in seen])
+        self._moved = [None if m.motion_cov is None else _root(m.motion_cov) for m in seen]
+        self._outward, self._small = _shrinking(self._pixels)
+        self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
+        self._noise_px = np.hypot(self._sigma, self._blur_px)
+        self.rows = [8] * len(seen)
+        first = installation.blocks.get("camera")
+        self._camera = None if first is None else np.arange(first[0], first[0] + 12)
+        marker = np.array([landmark_block(installation, m.landmark_id, 6) for m in seen])
+        self._columns = np.full((len(seen), 18), -1)
+        if self._camera is not None:
+            self._columns[:, :12] = self._camera
+        self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
+        n = len(poses)
+        camera = np.zeros(12) if self._camera is None else theta[self._camera]
+        marker = np.append(theta, 0.0)[self._columns[:, 12:]]
+        # 1. Corners in the map, in the base frame, at the exposure, in the camera
+        turned = _cross(marker[:, None, 3:], self._local)
+        local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
+        P = (self._position + marker[:, :3])[:, None] + local @ self._rotation.transpose(0, 2, 1)
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        Rz = np.zeros((n, 3, 3))  # R_map_base
+        Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
+        P[:, :, :2] -= poses[:, None, :2]
+        q = P @ Rz
+        flow = np.zeros_like(q)  # of the point in the base frame by a later stamp
+        flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
+        flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
+        late = camera[11] - self._offset
+        mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
+        X = mounted - camera[:3] - _cross(camera[3:6], mounted)
+        behind = (X[:, :, 2] < MIN_DEPTH_M).any(axis=1)
+        # 2. Image, with its derivatives by the point in the camera, (m, 4, 2, 3), and by the lens
+        predicted, A, by_lens = self._project(X, camera, by_installation)
+        # 3. Derivatives
+        # by the point in the base frame at the exposure
+        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]
+        by_time = (B @ flow[..., None])[..., 0]
+        turn = (late * self._twist[:, 2])[:, None, None]
+        B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
+        scale = 1.0 / self._noise_px
+        J: FloatArray = np.stack(
+            [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
+        )
+        residual = ((predicted - self._pixels) * scale[:, None, None]).reshape(n, 8)
+        J = (J * scale[:, None, None, None]).reshape(n, 8, 3)
+        if not by_installation:
+            return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
+        H: FloatArray = np.empty((n, 4, 2, 18))
+        H[..., :3] = -A
+        H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
+        H[..., 6:11] = by_lens
+        H[..., 11] = by_time
+        M = B @ Rz.transpose(0, 2, 1)[:, None]
+        H[..., 12:15] = M
+        H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
+        H[..., :12] *= self._camera is not None
+        H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
+        H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
+        return Stacked(residual, J, H, self._columns, behind)
+
+    def _project(
+        self, X: FloatArray, camera: FloatArray, with_lens: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Pixels of points in the camera's frame.
+
+        Args:
+            X: ``(m, 4, 3)`` [m].
+            camera: ``(12,)`` what camera and clock are off by.
+            with_lens: whether the derivatives by the lens are needed.
+
+        Returns:
+            Pixels ``(m, 4, 2)``, their derivatives by the points ``(m, 4, 2, 3)``, and those by focal length,
+            principal point, k1 and k2 ``(m, 4, 2, 5)``.
+        """
+        Z = np.maximum(X[:, :, 2], MIN_DEPTH_M)
+        x, y = X[:, :, 0] / Z, X[:, :, 1] / Z
+        k1, k2 = self._D[:, None, 0] + camera[9], self._D[:, None, 1] + camera[10]
+        p1, p2 = self._D[:, None, 2], self._D[:, None, 3]
+        r2 = x * x + y * y
+        radial = 1.0 + k1 * r2 + k2 * r2 * r2
+        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        f = self._K[:, None, :2] * (1.0 + camera[6])
+        image = np.stack([xd, yd], axis=2)
+        predicted = f * image + self._K[:, None, 2:] + camera[7:9]
+        dr = k1 + 2.0 * k2 * r2
+        by_ray = np.empty((len(X), 4, 2, 2))
+        by_ray[..., 0, 0] = radial + 2.0 * x * x * dr + 2.0 * p1 * y + 6.0 * p2 * x
+        by_ray[..., 0, 1] = by_ray[..., 1, 0] = 2.0 * x * y * dr + 2.0 * p1 * x + 2.0 * p2 * y
+        by_ray[..., 1, 1] = radial + 2.0 * y * y * dr + 6.0 * p1 * y + 2.0 * p2 * x
+        by_ray *= f[:, :, :, None]
+        A = np.empty((len(X), 4, 2, 3))
+        A[..., :2] = by_ray / Z[..., None, None]
+        A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
+        if not with_lens:
+            return predicted, A, None
+        by_lens = np.empty((len(X), 4, 2, 5))
+        by_lens[..., 0] = f * image / (1.0 + camera[6])
+        by_lens[..., 1:3] = np.eye(2)
+        by_lens[..., 3] = f * np.stack([x, y], axis=2) * r2[..., None]
+        by_lens[..., 4] = by_lens[..., 3] * r2[..., None]
+        return predicted, A, by_lens
+
+    def _speed(self, size_m: FloatArray) -> FloatArray:
+        """How fast the corners move in the image ``(m,)`` [px/s] where they were seen, whatever marker it is.
+
+        Not where they are expected: a marker that was misread may be expected near the image plane, where all is fast.
+        """
+        f = self._K[:, 0]
+        side = np.linalg.norm(self._pixels - np.roll(self._pixels, 1, axis=1), axis=2).max(axis=1)
+        off = np.linalg.norm((self._pixels.mean(axis=1) - self._K[:, 2:]) / self._K[:, :2], axis=1)
+        depth = f * np.maximum(size_m, 1e-3) / np.maximum(side, 1.0)
+        along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
+        return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it, of one sighting."""
+        shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
+        common = [shrunk, self._jitter[i] * H[:, 11:12]]
+        moved = self._moved[i]
+        if moved is not None:
+            common.append(J @ moved)
+        return np.hstack(common)
+
+
+def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors ``(m, 8)`` by which all four corners ``(m, 4, 2)`` move outwards, and how much a marker shrinks.
+
+    Blur draws in the edges of a marker whose cells are not much wider than it.
+    """
+    outward = pixels - pixels.mean(axis=1, keepdims=True)
+    side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
+    unit = outward / np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
+    return unit.reshape(len(pixels), 8), np.minimum((_BLURRED_SIDE_PX / np.maximum(side, 1.0)) ** 2, _MOST_BLURRED)
+
+
+def _crossed(A: FloatArray, X: FloatArray) -> FloatArray:
+    """``A [X]×``, rows of A ``(..., 2, 3)`` and points X ``(..., 3)``: derivative of ``-A (φ × X)`` by φ."""
+    return _cross(A, X[..., None, :])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product along the last axis; a third of numpy's time for few points."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def _root(cov: FloatArray) -> FloatArray:
+    """A square root of a covariance that may be singular."""
+    values, vectors = np.linalg.eigh(cov)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

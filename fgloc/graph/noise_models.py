@@ -1,0 +1,90 @@
+"""Noise models of GTSAM, and square roots of information, from checked covariances."""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+
+from fgloc.errors import CovarianceError
+from fgloc.types import (
+    FloatArray,
+)
+
+
+def gaussian(cov: FloatArray) -> gtsam.noiseModel.Base:
+    """Noise model of a covariance, which is checked because GTSAM does not.
+
+    Raises:
+        CovarianceError: not finite, not symmetric or not positive definite.
+    """
+    problem = covariance_problem(cov)
+    if problem:
+        raise CovarianceError(f"{problem}: {cov.tolist()}; a measurement like this has to be rejected by the gate")
+    return gtsam.noiseModel.Gaussian.Covariance(cov)
+
+
+def robust(noise: gtsam.noiseModel.Base, cauchy_k: float | None) -> gtsam.noiseModel.Base:
+    """Wrap a noise model in a Cauchy kernel (k in units of sigma); None leaves it Gaussian."""
+    if cauchy_k is None:
+        return noise
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_k), noise)
+
+
+def whitening_of(cov: FloatArray) -> FloatArray:
+    """W with ``Wᵀ W`` the inverse of a covariance.
+
+    Raises:
+        CovarianceError: it is none.
+    """
+    try:
+        if not np.isfinite(cov).all():
+            raise np.linalg.LinAlgError("not finite")
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+    except np.linalg.LinAlgError as error:
+        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
+
+
+def sighting_whitening(cov: FloatArray) -> FloatArray:
+    """W with ``Wᵀ W`` the inverse of a covariance that is no less than the identity.
+
+    Of a corner hardly in front of the camera it is so large that the identity is lost to rounding.
+
+    Raises:
+        CovarianceError: it is not finite.
+    """
+    if not np.isfinite(cov).all():
+        raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: not finite")
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(cov)
+        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
+
+
+def covariance_problem(cov: FloatArray) -> str:
+    """What is wrong with a covariance; "" if nothing.
+
+    Sylvester's criterion in plain floats, because this runs for every factor of every step.
+    """
+    if cov.shape == (3, 3):
+        (a, b, c), (d, e, f), (g, h, i) = cov.tolist()
+        minors: tuple[float, ...] = a, a * e - b * d, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        skew = abs(b - d) + abs(c - g) + abs(f - h)
+        size = abs(a) + abs(e) + abs(i)
+    elif cov.shape == (2, 2):
+        (a, b), (d, e) = cov.tolist()
+        minors = (a, a * e - b * d)
+        skew, size = abs(b - d), abs(a) + abs(e)
+    else:
+        return f"covariance of shape {cov.shape}, expected (2, 2) or (3, 3)"
+    if not math.isfinite(size + skew):
+        return "covariance with NaN or Inf"
+    if skew > 1e-9 * size:
+        return "asymmetric covariance"
+    return "" if min(minors) > 0.0 else "covariance is not positive definite"
+
+
+def _symmetric(m: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (m + m.T))
