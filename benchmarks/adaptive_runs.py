@@ -91,6 +91,10 @@ CASES: dict[str, Case] = {
         "unequal_radii",
         lambda recorded: [{"kind": "kidnap", "when": {"intervals": [carried_interval(recorded)]}}],
     ),
+    "lifted": Case(
+        "unequal_radii",
+        lambda recorded: [{"kind": "lift", "when": {"intervals": [carried_interval(recorded)]}}],
+    ),
 }
 
 

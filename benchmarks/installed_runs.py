@@ -41,6 +41,7 @@ from benchmarks.installed_scores import (
 )
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.ablation.failures.kidnap import Kidnap
+from fgloc.ablation.failures.lift import Lift
 from fgloc.atomic import atomic_file
 from fgloc.config import Config
 from fgloc.errors import FglocError
@@ -153,7 +154,7 @@ def run_cell(cell: Cell) -> Scores:
 
 
 def _scores(recorded: Recorded, config: Config, made: Replayed, times: Sequence[float], plain: bool) -> Scores:
-    lifted = [f.when.intervals[0][0] for f in made.chain if isinstance(f, Kidnap)]
+    lifted = [f.when.intervals[0][0] for f in made.chain if isinstance(f, Kidnap | Lift)]
     unknown = carried(made.given, recorded.start_ns + round(lifted[0] * 1e9)) if lifted else None
     online, batch = made.online, made.batch
     found = None if batch is None or recorded.installed is None else found_by(batch)

@@ -13,7 +13,8 @@ Every adaptive mechanism of fgloc (`benchmarks.mechanisms_off`) is taken away by
 - ``motion.*``: slips on the floors of ``none``, ``slip`` and ``mu01``; recall is of slips of 3 cm and more.
 - ``landmark.named``: share of landmarks moved by 0.3, 0.7 and 1.5 m that are named; ``.false``: others that are named,
   per run, in these runs and with 10, 30 and 50 % of the ids misread.
-- ``kidnap.nees_while_lifted``: NEES/3 from when a robot is carried away until the first marker that it sees again.
+- ``kidnap.nees_while_lifted``, ``lifted.nees_while_lifted``: NEES/3 from when a robot is carried away until the first
+  marker that it sees again; the recording without that time, and with it.
 
 Settings are chosen on the validation split; the rows are of the test split. Finished cells are kept, so that an
 interrupted run goes on; ``--jobs`` processes share the work.

@@ -18,6 +18,7 @@ from benchmarks.mechanisms_robots import robot, robot_chain
 from benchmarks.mechanisms_switch import watched
 from fgloc.ablation.failures import Failure
 from fgloc.ablation.failures.kidnap import Kidnap
+from fgloc.ablation.failures.lift import Lift
 from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.evaluation.consistency import nees
@@ -121,7 +122,7 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
 
 def _scored(cell: Cell, recorded: Recorded, chain: Sequence[Failure], made: Replayed, acted: dict[str, int]) -> Outcome:
     config, online, batch = recorded.config, made.online, made.batch
-    lifted = [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap)]
+    lifted = [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap | Lift)]
     unknown = carried(made.given, recorded.start_ns + round(lifted[0] * 1e9)) if lifted else None
     figures = score(recorded, 0, config, online, None, chain, made.given)
     reasons = {d.reason for d in online.decisions if d.kind == "wheels"} & _NAMED_KINDS

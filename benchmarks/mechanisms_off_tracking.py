@@ -53,6 +53,14 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         batch=True,
     ),
     Mechanism(
+        "lift",
+        "A robot that rises, or turns though it stands, is carried: no source knows its motion.",
+        ("robust/lift.py", "localizer.py"),
+        (Switch("fgloc.robust.lift:LiftMonitor.observe", Returns([])),),
+        Probe("fgloc.robust.lift:LiftMonitor.observe", something),
+        batch=True,
+    ),
+    Mechanism(
         "given_pose_held",
         "A given first pose holds against sightings that contradict it from the start.",
         ("relocalization/tracking_state.py", "localizer.py"),

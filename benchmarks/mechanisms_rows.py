@@ -90,8 +90,8 @@ def wanted(scope: Scope) -> Iterator[Wanted]:
         yield Wanted(f"{prefix}named", moved, _named(moved))
         yield Wanted(f"{prefix}false", of_all, _false_names(of_all))
     if "kidnap" in scope.cases:
-        lifted = scope.cells("kidnap")
-        yield Wanted("kidnap.nees_while_lifted", lifted, lambda name, found: _lifted(name, [found[c] for c in lifted]))
+        for case in ("kidnap", "lifted"):
+            yield Wanted(f"{case}.nees_while_lifted", scope.cells(case), _lifted(scope.cells(case)))
 
 
 def of_one(scope: Scope, mechanism: Mechanism, case: str, label: str = "") -> Iterator[Wanted]:
@@ -154,10 +154,16 @@ def _false_names(cells: Sequence[Cell]) -> Callable[[str, Outcomes], Row]:
     return row
 
 
-def _lifted(name: str, outcomes: Sequence[Outcome]) -> Row:
-    values = [o.lifted_nees for o in outcomes if o.lifted_nees is not None]
-    row = mean(name, values)
-    return row if values else Row(name, None, n=0, reason="a marker was in view at once in every run")
+def _lifted(cells: Sequence[Cell]) -> Callable[[str, Outcomes], Row]:
+    """NEES/3 from the lift to the first marker."""
+
+    def row(name: str, found: Outcomes) -> Row:
+        values = [nees for c in cells if (nees := found[c].lifted_nees) is not None]
+        return (
+            mean(name, values) if values else Row(name, None, n=0, reason="a marker was in view at once in every run")
+        )
+
+    return row
 
 
 def over_before(name: str, row: Row, before: Mapping[str, float | None]) -> Row:

@@ -31,6 +31,7 @@ from fgloc.robust.decision_log import (
     segment_decision,
 )
 from fgloc.robust.landmark_modes import ALARM
+from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.robust.motion_noise import with_noise
@@ -105,11 +106,13 @@ class Localizer:
         self.stopwatch = Stopwatch()
         self.sources = MotionFusion(config, wheels, learned, joint, gyro, self.factors)
         self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
+        self._lift = LiftMonitor()
         self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
         self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
+        self._lifted: list[Decision] = []  # likewise
         self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
         self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
 
@@ -124,6 +127,7 @@ class Localizer:
         # 1. Measure: one call per sensor; a silent sensor yields nothing
         with self.stopwatch("motion"):
             readings = self.sources.read(step, blind_s)
+            self._lifted = self._lift.observe(self.estimator.k + 1, step, readings)
         with self.stopwatch("sightings"):
             offset_s = self.factors.installation.time_offset(self.factors.believed)
             sightings = self._compensation.measure(step, offset_s)
@@ -152,6 +156,7 @@ class Localizer:
         self._segment = step.segment
         self.sources.begin_segment()
         self.motion_faults.begin(step)
+        self._lift.reset()
         self.association.begin_segment()
         known, self._restart = self._restart, None
         self._prior = self._tracking.begin_segment(self.estimator.belief, known)
@@ -164,7 +169,7 @@ class Localizer:
             prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
             self._tracking.start_known()
             return self._start(step, prior, sightings)
-        motions = self.sources.combine(readings) or [self.sources.unknown(step, readings)]
+        motions = self._motions(step, readings, FaultVerdict())
         started = self._tracking.collect(step, motions, sightings, readings)
         if started is None:
             return self._advance(step, readings, ()) if self._tracking.lost else self._unconfirmed(step)
@@ -186,6 +191,7 @@ class Localizer:
     def _replay(self, started: InitialPose) -> list[Estimate]:
         """Run the collected steps through the estimator."""
         first, *rest = started.steps
+        self._lift.reset()  # these steps are earlier ones
         self.sources.begin_segment()
         estimates = [self._start(first.step, started.first, first.sightings)]
         estimates += [self._advance(later.step, later.readings, later.sightings) for later in rest]
@@ -227,6 +233,7 @@ class Localizer:
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
         self._tracking.record_fix(bool(believed))
+        self._lift.fix()
         return self._estimate(step, belief, decisions)
 
     def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
@@ -236,9 +243,11 @@ class Localizer:
         with self.stopwatch("weigh"):
             trust = self.motion_faults.judge(step, readings)
             decisions = self._revise(k, trust)
-            motions = self.sources.combine(readings, trust.off, trust.scale)
-            if not motions:
-                motions = [self.sources.unknown(step, readings)]
+            motions = self._motions(step, readings, trust)
+            carried = self._lift.carried
+            if carried:
+                readings = MotionReadings()  # nor does the smoother take them
+            elif motions[0].source == "unknown":
                 self.rejections["motion.silent"] += 1
             predicted = self.estimator.predict(motions)
             believed, refused, weighed = self._associate(k, step, sightings, predicted)
@@ -277,13 +286,21 @@ class Localizer:
         self._count_landmarks(weighed)
         if believed:
             self._tracking.record_fix()
+            self._lift.fix()
         fix = belief if believed else None
         self.sources.commit(readings, fix)
         moved = self._judge_landmarks(step, motions, predicted, believed, kept)
         frame = self.estimator.log.keyframes[k]
-        frame.readings, frame.off, frame.scale, frame.extra_cov = readings, trust.off, trust.scale, extra_cov
+        off = dict.fromkeys(("wheels", "learned"), "carried") if carried else trust.off
+        frame.readings, frame.off, frame.scale, frame.extra_cov = readings, off, trust.scale, extra_cov
         decisions += motion_decisions(k, motions, readings, trust.off, OVERRULED if fit is not None else "", trust)
         return self._estimate(step, frame.belief, [*decisions, *weighed, *moved])
+
+    def _motions(self, step: Step, readings: MotionReadings, trust: FaultVerdict) -> list[MotionMeasurement]:
+        """Factors of the step: of the sources, or of a robot that is carried, or of one whose motion nothing tells."""
+        if self._lift.carried:
+            return [self._lift.motion(step, readings)]
+        return self.sources.combine(readings, trust.off, trust.scale) or [self.sources.unknown(step, readings)]
 
     def _associate(
         self, k: int, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
@@ -359,13 +376,16 @@ class Localizer:
     def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._tracking.mode
+        if self._lift.carried and frame.mode is Mode.OK and not frame.sightings:
+            frame.mode = Mode.DEAD_RECKONING
         frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + self._tracking.lost_cov(belief)
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         after_s = self.config.estimator.dead_reckoning_after_s
         modes = mode_decisions(self.estimator.k, step.stamp_ns, frame.mode, self._tracking.blind_s, after_s)
-        jumps, self._clock_jumps = self._clock_jumps, []
+        jumps, self._clock_jumps = [*self._clock_jumps, *self._lifted], []
+        self._lifted = []
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*jumps, *decisions, *modes))
 
     def _by_clock(self, step: Step) -> FloatArray:

@@ -72,6 +72,7 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "initial_pose_contradicted": _held,
     "outage": _travelled,
     "lost": _travelled,
+    "lifted": _travelled,
     "unconfirmed": _travelled,
     "clock_jump": _clock,
 }

@@ -19,6 +19,7 @@ Kind = Literal[
     "lost",
     "initial_pose_contradicted",
     "relocated",
+    "lifted",
     "clock_jump",
     "landmark_moved",
     "installation",
@@ -26,7 +27,6 @@ Kind = Literal[
     "motion_overruled",
     "outage",
     "motion_faulty",
-    "start_outlier",
     "misread",
     "solver",
     "rejected",
@@ -39,6 +39,7 @@ _TITLES: Mapping[str, str] = {
     "lost": "robot lost",
     "initial_pose_contradicted": "given first pose contradicted",
     "relocated": "pose contradicted, robot relocated",
+    "lifted": "robot lifted or pushed",
     "clock_jump": "clock jumped",
     "landmark_moved": "moved",
     "installation": "contradicts the given value",
@@ -46,7 +47,6 @@ _TITLES: Mapping[str, str] = {
     "motion_overruled": "motion contradicted by sightings",
     "outage": "no accepted sightings: dead reckoning",
     "motion_faulty": "faulty",
-    "start_outlier": "sightings contradict the first pose",
     "misread": "markers misread",
     "solver": "solver failed, window rebuilt",
     "rejected": "sightings rejected",
@@ -56,7 +56,6 @@ _OF_SIGHTINGS: Mapping[str, Kind] = {
     "gate": "rejected",
     "behind_camera": "rejected",
     "contradicts_others": "rejected",
-    "contradicts_start": "start_outlier",
     "contradicts initial_pose": "initial_pose_contradicted",
     "misread": "misread",
     "quarantined": "landmark_moved",
@@ -71,7 +70,7 @@ _OF_PLACES: Mapping[str, Kind] = {
 _OF_MODES: Mapping[str, Kind] = {"dead_reckoning": "outage", "lost": "lost", "unconfirmed": "unconfirmed"}
 _MOTIONS = ("wheels", "learned", "gyro")
 _JOIN_NS = 1_000_000_000  # rows of one kind and subject further apart than this are two episodes ...
-_LASTING = ("landmark_moved", "misread", "start_outlier", "initial_pose_contradicted")  # ... but for these
+_LASTING = ("landmark_moved", "misread", "initial_pose_contradicted")  # ... but for these
 _FEW = 2  # sightings rejected: as few of a landmark in a row are outliers, and all outliers one judgement
 _NAMED = 6  # landmarks in one judgement
 
@@ -178,6 +177,8 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
         return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
     if d.kind == "mode":
         return _OF_MODES[d.reason], "pose"
+    if d.kind == "lift":
+        return "lifted", "pose"
     if d.kind == "clock":
         return "clock_jump", "clock"
     if d.kind == "place":
@@ -232,7 +233,7 @@ def _reasons(kind: Kind, rows: Sequence[Decision]) -> str:
     """The most frequent reason, of a fault of motion; the landmarks, where there may be several."""
     if kind == "motion_faulty":
         return f": {Counter(d.reason for d in rows).most_common(1)[0][0].replace('_', ' ')}"
-    if kind in ("misread", "outlier", "start_outlier"):
+    if kind in ("misread", "outlier"):
         ids = sorted({d.landmark_id for d in rows})
         more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
         return f" (landmarks {', '.join(map(str, ids[:_NAMED]))}{more})"
@@ -250,6 +251,7 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
     if not math.isfinite(statistic) or statistic == 0.0:
         return count
     names = {"wheels": "GLR", "learned": "NIS", "gyro": "NIS", "place": "NIS"}
+    names |= {"lift": f"{worst.reason.replace('_', ' ')}: NIS"}
     name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
     bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""
     return f"{name} {'up to ' if len(rows) > 1 else ''}{_number(statistic)}{bound}; {count}"

@@ -11,6 +11,7 @@ from pydantic import Field
 from fgloc.ablation.failures.base import Failure, Scene
 from fgloc.ablation.failures.camera import Darkness, FrameRate, MirroredImage
 from fgloc.ablation.failures.kidnap import Kidnap
+from fgloc.ablation.failures.lift import Lift
 from fgloc.ablation.failures.messages import (
     EncoderFrozen,
     EncoderRollover,
@@ -39,6 +40,7 @@ AnyFailure = Annotated[
     | DuplicatedMessages
     | Truncated
     | Kidnap
+    | Lift
     | WheelSlip
     | EncoderDead
     | EncoderFrozen

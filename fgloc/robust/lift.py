@@ -1,0 +1,182 @@
+"""Whether the robot was lifted or pushed: signs of it in accelerometer, gyro and wheels, and what then is known.
+
+Wheels that hang in the air or stand still say nothing of where the robot is carried. Two tests look for it; each has at
+most one false alarm an hour where its errors are normal (Bonferroni over steps and windows):
+
+- *vertical velocity*: the magnitude of the specific force, less what is usual, summed over windows of up to a second.
+  It does not depend on the tilt. A robot on the floor cannot rise; its standard deviation is that of the run itself.
+- *turned at rest*: the gyro turns although the wheels stand and no command moves them.
+
+A wheel that spins while gyro and accelerometer show rest may as well slip; `MotionFaultMonitor` tells that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from fgloc.stats import chi2_bound
+from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
+
+_FALSE_PER_S = 1.0 / 3600.0  # of each test
+_WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
+_PARTS = 10  # windows that are looked at in each step: these tenths of it
+_LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
+_MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
+_LEARN_S = 2.0  # before the first test
+_LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
+_STANDS_NS = 1_000_000_000  # how long no command has moved the robot before its turn is not its own
+_STANDS_M, _STANDS_RAD = 1e-3, 1e-3  # motion of standing wheels in a second: quantization
+_LEAST_TURN = 0.05  # rad: less is a shaken floor
+_CARRIED_SPEED = 0.7  # m/s: sigma of each axis; a person walks at 1 m/s
+_CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro tells the turn
+_ONSET_S = 0.5  # from the start of a lift to its alarm
+_SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
+_LONGEST_S = 10.0  # ... and without sightings it has been set down by then
+
+
+class LiftMonitor:
+    """Watches for a robot that is carried.
+
+    Attributes:
+        carried: the robot may be in the air, or was set down a short time ago.
+    """
+
+    def __init__(self) -> None:
+        self.carried = False
+        self._rise = _RiseTest()
+        self._turn = _TurnTest()
+        self._since_fix_s = 0.0  # time in the air since a sighting has told the pose
+        self._quiet_s = 0.0  # since the last sign
+
+    def observe(self, k: int, step: Step, readings: MotionReadings) -> list[Decision]:
+        """Take in a step; rows of ``steps.csv`` while the robot is carried.
+
+        Args:
+            k: keyframe of the step.
+            step: with the messages of IMU and commands.
+            readings: what the motion sources measured.
+        """
+        self._quiet_s += step.dt
+        signs = [
+            ("vertical_velocity", *self._rise.test(step, self.carried)),
+            ("turned_at_rest", *self._turn.test(step, readings)),
+        ]
+        told = [
+            Decision(k, step.stamp_ns, "lift", -1, math.sqrt(nis), nis, 1, 0.0, reason, bound)
+            for reason, nis, bound in signs
+            if nis > bound
+        ]
+        if told:
+            self._quiet_s = 0.0
+            if not self.carried:
+                self.carried, self._since_fix_s = True, _ONSET_S
+        elif self.carried and self._quiet_s > _LONGEST_S:
+            self.carried = False
+        if self.carried and not told:
+            told = [Decision(k, step.stamp_ns, "lift", -1, math.nan, math.nan, 0, 0.0, "carried")]
+        return told
+
+    def motion(self, step: Step, readings: MotionReadings) -> MotionMeasurement:
+        """What is known of the motion of a carried robot: that a person is not fast, and the turn if there is a gyro.
+
+        Its way goes on in one direction, so that sigma grows with the time since the last fix.
+        """
+        before, self._since_fix_s = self._since_fix_s, self._since_fix_s + step.dt
+        cov: FloatArray = np.diag(np.square([_CARRIED_SPEED, _CARRIED_SPEED, _CARRIED_TURN]))
+        cov = cov * (self._since_fix_s**2 - before**2)
+        motion, gyro = np.zeros(3), readings.gyro
+        if gyro is not None:
+            motion[2], cov[2, 2] = gyro.motion[2], gyro.cov[2, 2]
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
+
+    def fix(self) -> None:
+        """Sightings have told the pose."""
+        self._since_fix_s = 0.0
+        if self._quiet_s > _SETTLED_S:
+            self.carried = False
+
+    def reset(self) -> None:
+        """The clock jumped: nothing connects what comes with what was."""
+        self.carried = False
+        self._rise = _RiseTest()
+        self._turn = _TurnTest()
+
+
+class _RiseTest:
+    """The vertical velocity that windows of the specific force give, against what is usual in this run."""
+
+    def __init__(self) -> None:
+        self._level = math.nan  # m/s²: of the magnitude at rest, with the sensor's bias
+        self._variance = _LEAST_SIGMA**2  # of a window of full length
+        self._learned_s = 0.0
+        self._newest_ns = 0
+        self._samples: deque[tuple[float, float]] = deque()  # seconds it stands for, magnitude
+        self._length_s = 0.0
+
+    def test(self, step: Step, carried: bool) -> tuple[float, float]:
+        """Squared ratio of rise and standard deviation of the least likely window, and its bound."""
+        new = [e for e in step.imu if max(self._newest_ns, step.start_ns) < e.stamp_ns <= step.stamp_ns]
+        forces = [float(np.linalg.norm(e.linear_acceleration)) for e in new]
+        if not new or not all(map(math.isfinite, forces)) or max(forces) == 0.0:  # 0: there is no accelerometer
+            self._samples.clear()
+            self._length_s, self._newest_ns = 0.0, step.stamp_ns
+            return 0.0, math.inf
+        each, self._newest_ns = step.dt / len(new), new[-1].stamp_ns
+        for force in forces:
+            self._samples.append((each, force))
+            self._length_s += each
+        while self._length_s - self._samples[0][0] > _WINDOW_S:
+            self._length_s -= self._samples.popleft()[0]
+        return self._judge(step.dt, float(np.mean(forces)), carried)
+
+    def _judge(self, dt: float, mean: float, carried: bool) -> tuple[float, float]:
+        seconds, forces = np.array(self._samples).T
+        if math.isnan(self._level):
+            self._level = mean
+        rises = np.cumsum(((forces - self._level) * seconds)[::-1])
+        spans = np.cumsum(seconds[::-1])
+        ends = np.searchsorted(spans, np.linspace(1.0 / _PARTS, 1.0, _PARTS) * spans[-1] - 1e-9)
+        sigmas = np.sqrt(np.maximum(self._variance * spans[ends] / _WINDOW_S, _LEAST_SIGMA**2))
+        nis = np.where(np.abs(rises[ends]) > _LEAST_RISE, (rises[ends] / sigmas) ** 2, 0.0)
+        bound = chi2_bound(1.0 - _FALSE_PER_S * dt / _PARTS, 1)
+        if not carried and nis.max() <= bound:
+            self._learned_s += dt
+            share = dt / min(self._learned_s, _MEMORY_S)
+            self._level += share * (mean - self._level)
+            self._variance += share * (rises[-1] ** 2 * _WINDOW_S / spans[-1] - self._variance)
+        return (float(nis.max()), bound) if self._learned_s > _LEARN_S else (0.0, bound)
+
+
+class _TurnTest:
+    """The turn of a robot whose wheels stand and that was told to stand."""
+
+    def __init__(self) -> None:
+        self._turned = self._variance = 0.0
+        self._steps = 0
+
+    def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
+        """Squared ratio of turn and standard deviation since the robot stands, and its bound."""
+        bound = chi2_bound(1.0 - _FALSE_PER_S * max(step.dt, 1e-3), 1)
+        wheels, gyro = readings.wheels, readings.gyro
+        if wheels is None or gyro is None or not _told_to_stand(step) or not _stand(wheels.motion, step.dt):
+            self._turned = self._variance = 0.0
+            return 0.0, bound
+        self._turned += float(gyro.motion[2])
+        self._variance += float(gyro.cov[2, 2] + wheels.cov[2, 2])
+        if abs(self._turned) < _LEAST_TURN:
+            return 0.0, bound
+        return self._turned**2 / self._variance, bound
+
+
+def _told_to_stand(step: Step) -> bool:
+    """Whether all commands of the last second are zero, and there are some."""
+    recent = [c for c in step.commands if c.stamp_ns >= step.start_ns - _STANDS_NS]
+    return bool(recent) and all(c.v == 0.0 and c.omega == 0.0 for c in recent)
+
+
+def _stand(motion: FloatArray, dt: float) -> bool:
+    x, y, yaw = motion
+    return math.hypot(x, y) < _STANDS_M * max(dt, 0.1) and abs(yaw) < _STANDS_RAD * max(dt, 0.1)
