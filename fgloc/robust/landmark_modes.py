@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.factors import LandmarkFactors, sighting_whitening
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.joint import innovation, joint_cov, transition
+from fgloc.graph.linearized import Linearized
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.observation import Linearized, Observations
+from fgloc.graph.noise_models import sighting_whitening
+from fgloc.graph.observation import Observations
 from fgloc.stats import chi2_bound
 from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement
 
