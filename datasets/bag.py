@@ -249,6 +249,34 @@ class BagWriter:
         content = dict(illuminance=lux, variance=0.0)
         self._write(topic, "sensor_msgs/msg/Illuminance", stamp_ns, received_ns, frame_id, content)
 
+    def range_reading(
+        self, topic: str, stamp_ns: int, range_m: float, frame_id: str, received_ns: int | None = None
+    ) -> None:
+        """``sensor_msgs/Range`` of a radio, of 0.1 to 100 m."""
+        content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m)
+        self._write(topic, "sensor_msgs/msg/Range", stamp_ns, received_ns, frame_id, content)
+
+    def satellite_fix(
+        self,
+        topic: str,
+        stamp_ns: int,
+        place: Sequence[float],
+        variances: Sequence[float],
+        received_ns: int | None = None,
+        frame_id: str = "gnss_link",
+    ) -> None:
+        """``sensor_msgs/NavSatFix``: latitude, longitude [degrees], altitude [m]; variances east, north, up [m²]."""
+        latitude, longitude, altitude = place
+        content = dict(
+            status=self._make("sensor_msgs/msg/NavSatStatus", status=2, service=1),
+            latitude=float(latitude),
+            longitude=float(longitude),
+            altitude=float(altitude),
+            position_covariance=np.diag(np.asarray(variances, dtype=float)).ravel(),
+            position_covariance_type=2,
+        )
+        self._write(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, received_ns, frame_id, content)
+
     def range_bearing(
         self,
         topic: str,

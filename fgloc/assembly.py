@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,8 @@ from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
+from fgloc.sensors import registry
+from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -59,6 +61,7 @@ class Assembly:
     landmarks: LandmarkSensor
     camera: Camera | None
     learned: LearnedMotion | None
+    sensors: tuple[Sensor, ...]
     localizer: Localizer
     diagnosis: Diagnosis
     notes: tuple[str, ...]
@@ -79,8 +82,13 @@ class Assembly:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What the user should know of the parts so far."""
-        parts = (self.gate, self.detections, self.stepper, self.wheels, self.localizer)
-        return (*self.notes, *(note for part in parts for note in part.notes))
+        parts = (self.gate, self.detections, self.stepper, self.wheels)
+        return (
+            *self.notes,
+            *(note for part in parts for note in part.notes),
+            *(note for sensor in self.sensors for note in sensor.notes),
+            *self.localizer.notes,
+        )
 
 
 def assemble(
@@ -132,6 +140,9 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     camera = _camera(facts, config) if "image" in facts.roles or CornersEvent in first else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(facts, config, notes)
+    sensors = _sensors(facts, config, landmark_map)
+    if sensors and landmark_map is None:
+        landmark_map = _no_landmarks(facts, sensors)
     if landmark_map is None and {"image", "sightings"} & set(facts.roles):
         config = resolved(config, landmark_map)
         notes.append(
@@ -157,21 +168,56 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
     seen_by: Role = "sightings" if detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
+    streams = [stream for sensor in sensors for stream in sensor.streams]
     return Assembly(
         config=config,
         landmark_map=landmark_map,
-        gate=EventValidator(config.gate, known_ids),
+        gate=EventValidator(config.gate, known_ids, streams),
         detector=detector,
         detections=EventValidator(config.gate, known_ids),
-        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s),
+        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams),
         wheels=wheels,
         landmarks=landmarks,
         camera=camera,
         learned=learned,
-        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro),
+        sensors=sensors,
+        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro, sensors),
         diagnosis=Diagnosis(config, landmark_map, camera, T_base_sensor, seen_by, imu_up),
         notes=tuple(notes),
     )
+
+
+def _sensors(facts: StreamFacts, config: Config, landmark_map: LandmarkMap | None) -> tuple[Sensor, ...]:
+    """Those registered sensors that have settings and a topic in this stream."""
+
+    def frame(name: str) -> FloatArray | None:
+        base = base_frame(facts, config, facts.first)
+        if name.lstrip("/") == base.lstrip("/"):
+            return np.eye(4)
+        return facts.frames.lookup(base, name) if name in facts.frames and base in facts.frames else None
+
+    contexts = {
+        sensor.name: Context(config, getattr(config, sensor.name), facts.roles, landmark_map, frame)
+        for sensor in registry.sensors()
+        if hasattr(config, sensor.name) and any(stream.role in facts.roles for stream in sensor.streams)
+    }
+    return registry.build(contexts)
+
+
+def _no_landmarks(facts: StreamFacts, sensors: Sequence[Sensor]) -> LandmarkMap:
+    """The map of a run that has the map's frame from registered sensors alone.
+
+    Raises:
+        ConfigError: there are sightings, whose landmarks would make a frame of their own.
+    """
+    seen = [role for role in ("image", "sightings") if role in facts.roles]
+    if seen:
+        names = ", ".join(sensor.name for sensor in sensors)
+        raise ConfigError(
+            f"{facts.name}: {names} measures in the frame of a map, and {' and '.join(seen)} without a map would make "
+            f"another one; give --map, or set recording.topics.{seen[0]}: none"
+        )
+    return LandmarkMap({})
 
 
 def resolved(config: Config, given_map: Path | LandmarkMap | None) -> Config:

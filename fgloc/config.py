@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, create_model, model_validator
 
+from fgloc.errors import ConfigError
+from fgloc.extensions import outside_sensors
 from fgloc.settings_file import Settings
 
 
@@ -21,7 +24,32 @@ class Section(BaseModel):
 _Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
 _Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
 _Sigma = Annotated[float, Field(ge=1e-6, le=1e4)]  # m or rad
-Role = Literal["odometry", "command", "joints", "imu", "image", "camera_info", "sightings", "truth"]
+Role = str
+"""Of a topic: a built-in one, or one that a sensor of another package brings."""
+BUILT_IN_ROLES: tuple[Role, ...] = (
+    "odometry",
+    "command",
+    "joints",
+    "imu",
+    "image",
+    "camera_info",
+    "sightings",
+    "truth",
+)
+
+
+def role_names() -> tuple[Role, ...]:
+    """All roles, the built-in ones first."""
+    return (*BUILT_IN_ROLES, *(stream.role for sensor in outside_sensors() for stream in sensor.streams))
+
+
+def _known_role(role: str) -> str:
+    if role not in role_names():
+        raise ValueError(f"expected one of {', '.join(role_names())}")
+    return role
+
+
+_KnownRole = Annotated[str, AfterValidator(_known_role)]
 
 
 class TopicsConfig(Section):
@@ -36,19 +64,25 @@ class TopicsConfig(Section):
     sightings: str | None = None
     truth: str | None = None
 
+    def given(self, role: Role) -> str | None:
+        """What is given for a role."""
+        return getattr(self, role, None)
+
 
 class RecordingConfig(Section):
     """How to read a recording."""
 
     topics: TopicsConfig = TopicsConfig()
-    received_stamps: tuple[Role, ...] = Field((), description="roles whose header stamps are wrong: use receive times")
+    received_stamps: tuple[_KnownRole, ...] = Field(
+        (), description="roles whose header stamps are wrong: use receive times"
+    )
     clock_sigma_s: float = Field(
         0.003,
         ge=0,
         le=1.0,
         description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
     )
-    stamp_offset_s: dict[Role, Annotated[float, Field(ge=-4e9, le=4e9)]] = Field(
+    stamp_offset_s: dict[_KnownRole, Annotated[float, Field(ge=-4e9, le=4e9)]] = Field(
         {}, description="added to a role's stamps [s]: a known clock offset"
     )
     base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
@@ -387,6 +421,44 @@ class Config(Section):
     batch: BatchConfig = BatchConfig()
     truth: TruthConfig = TruthConfig()
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """With sections of other packages, its class has no name to be found by in another process."""
+        if type(self) is Config:
+            return super().__reduce_ex__(protocol)
+        return config_of, (self.model_dump(exclude_unset=True),)
+
+
+def config_type() -> type[Config]:
+    """`Config` with a section for each sensor of another package, under its name."""
+    return _with_sensors(outside_sensors())
+
+
+@cache
+def _with_sensors(sensors: tuple[type[Any], ...]) -> type[Config]:
+    if not sensors:
+        return Config
+    for sensor in sensors:
+        if sensor.name in Config.model_fields:
+            raise ConfigError(f"sensor '{sensor.name}': {sensor.name} is a key of robot.yaml already; rename it")
+    roles: dict[str, Any] = {s.role: (str | None, None) for sensor in sensors for s in sensor.streams}
+    topics = create_model("TopicsConfig", __base__=TopicsConfig, __doc__=TopicsConfig.__doc__, **roles)
+    recording = create_model(
+        "RecordingConfig", __base__=RecordingConfig, __doc__=RecordingConfig.__doc__, topics=(topics, topics())
+    )
+    sections: dict[str, Any] = {sensor.name: (sensor.Config, sensor.Config()) for sensor in sensors}
+    return create_model(
+        "Config", __base__=Config, __doc__=Config.__doc__, recording=(recording, recording()), **sections
+    )
+
+
+def config_of(content: Any) -> Config:
+    """Settings as `load_config` has them, from what a file would say.
+
+    Raises:
+        pydantic.ValidationError: a key or a value is wrong.
+    """
+    return config_type().model_validate(content)
+
 
 _PATH_KEYS = (("camera", "file"), ("motion", "model"))
 _SHIPPED = "shipped:"
@@ -417,4 +489,4 @@ def load_config(path: Path) -> Config:
         part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(_SHIPPED):
             settings.content[section] = part | {key: path.parent / part[key]}
-    return settings.validated(Config)
+    return settings.validated(config_type())

@@ -35,6 +35,7 @@ from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.robust.motion_noise import with_noise
+from fgloc.sensors.base import Sensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration
@@ -78,6 +79,7 @@ class Localizer:
         joint: JointCalibration | None = None,
         keep_all: bool = False,
         gyro: Gyro | None = None,
+        sensors: Sequence[Sensor] = (),
     ) -> None:
         """Put the parts together.
 
@@ -90,6 +92,7 @@ class Localizer:
             joint: its correlation with the wheels; None: the two are taken as independent.
             keep_all: keep the measurement log of the whole run, for the batch smoother.
             gyro: the gyro, if any.
+            sensors: registered ones, whose measurements are judged and fused as sightings are.
         """
         self.config = config
         self.factors = LandmarkFactors(
@@ -107,7 +110,7 @@ class Localizer:
         self.sources = MotionFusion(config, wheels, learned, joint, gyro, self.factors)
         self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
         self._lift = LiftMonitor()
-        self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s)
+        self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s, sensors)
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
@@ -376,7 +379,7 @@ class Localizer:
     def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
         frame = self.estimator.log.keyframes[self.estimator.k]
         frame.step, frame.mode = step, self._tracking.mode
-        if self._lift.carried and frame.mode is Mode.OK and not frame.sightings:
+        if self._lift.carried and frame.mode is Mode.OK and self._tracking.blind_s > 0.0:
             frame.mode = Mode.DEAD_RECKONING
         frame.added_cov = self._by_clock(step) + self._tracking.kidnapped_cov(self.association.contradicting, belief)
         if frame.mode is Mode.LOST:

@@ -38,6 +38,7 @@ from fgloc.types import (
     ImageEvent,
     InstallationFound,
     RunResult,
+    SensorEvent,
     SightingsEvent,
     Step,
     TopicTimes,
@@ -356,7 +357,7 @@ class _Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
-            self.blind = self.blind and not isinstance(event, ImageEvent | SightingsEvent)
+            self.blind = self.blind and not isinstance(event, ImageEvent | SightingsEvent | SensorEvent)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)

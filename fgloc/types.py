@@ -8,7 +8,8 @@ else is SI. Arrays are float64 and are not to be written to.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -171,6 +172,11 @@ class RangeBearingEvent(Event):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SensorEvent(Event):
+    """One message of a registered sensor (`fgloc.sensors.base`); a subclass says what is in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TruthEvent(Event):
     """Pose from an external positioning system. Never reaches the estimator."""
 
@@ -269,6 +275,7 @@ class Step:
     joints: tuple[JointsEvent, ...] = ()
     imu: tuple[ImuEvent, ...] = ()
     sightings: tuple[SightingsEvent, ...] = ()
+    sensed: tuple[SensorEvent, ...] = ()  # of registered sensors, at their own stamps like late sightings
 
     @property
     def dt(self) -> float:
@@ -346,7 +353,55 @@ class MarkerPoseMeasurement:
     offset_s: float = 0.0
 
 
-LandmarkMeasurement = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseMeasurement(ABC):
+    """What a registered sensor measured, as a function of the robot's pose; each kind of it is a subclass.
+
+    A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
+    the first pose are made of that.
+    """
+
+    source: str  # in steps.csv and in the counts
+    stamp_ns: int
+    cov: FloatArray  # (d, d) of the residual
+    target: int = -1  # which anchor or beacon was measured, in the sensor's own numbering; -1: none
+    cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
+    T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
+    motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
+
+    @abstractmethod
+    def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted minus measured ``(d,)`` for ``T_map_base`` ``(3,)`` at the stamp, with its Jacobian.
+
+        Returns:
+            The residual, in the units of `cov`, and its derivative ``(d, 3)`` by the right perturbation of the pose.
+        """
+
+    def places(self) -> Iterable[FloatArray]:
+        """Where in the map ``(2,)`` the robot may be, roughly: where the search for its first pose begins."""
+        return ()
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[PoseMeasurement]:
+        """What else the reading may mean, likeliest first: tried in turn where the chi-square gate refuses this one.
+
+        Args:
+            predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.
+        """
+        return ()
+
+    @property
+    def landmark_id(self) -> int:
+        """A number that no landmark of the map has."""
+        return -2 - self.target
+
+    def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `residual_at`, by the pose at the keyframe."""
+        residual, J = self.residual_at(se2.compose(pose, self.T_keyframe_then))
+        return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
+
+
+LandmarkSighting = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
+LandmarkMeasurement = LandmarkSighting | PoseMeasurement
 
 
 # --- Results ----------------------------------------------------------------------------------------------------------
@@ -367,7 +422,7 @@ class Decision:
 
     step: int
     stamp_ns: int
-    kind: str  # "wheels", "learned", "gyro", "corners", "range_bearing", "marker_pose", "place", "mode", "clock"
+    kind: str  # a motion source, "corners", "range_bearing", "marker_pose", "place", "mode", "clock" or a sensor
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float

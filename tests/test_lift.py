@@ -159,5 +159,7 @@ def test_a_lifted_robot_says_that_it_may_be_elsewhere_until_it_sees_a_marker():
         assert e.mode is not Mode.OK
     assert math.sqrt(carried[-1].cov[0, 0]) > 1.0
     assert any(d.kind == "lift" for e in carried for d in e.decisions)
+    found = next(e for e in estimates if any(d.reason == "jump" for d in e.decisions))
+    assert found.mode is Mode.OK
     assert estimates[-1].mode is Mode.OK
     assert np.hypot(*(estimates[-1].pose - world.truth(estimates[-1].stamp_ns))[:2]) < 0.05

@@ -17,6 +17,7 @@ from datasets.convert import write_robot
 from datasets.sim.installed import INSTALLED, write_installed
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import make_scene, simulate
+from datasets.sim.positioning import gnss_settings, uwb_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import streams
 from fgloc.atomic import atomic_folder
@@ -74,9 +75,14 @@ def describe(scenario: Scenario, seed: int, camera: bool) -> str:
         "camera": camera,
         "mujoco": mujoco.__version__,
         "fgloc": version("fgloc"),
-        "scenario": scenario.model_dump(mode="json"),
+        "scenario": scenario.model_dump(mode="json", exclude=_unused(scenario)),
     }
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+
+
+def _unused(scenario: Scenario) -> set[str]:
+    """Options that were added later, where they are not used: older recordings stay what they are."""
+    return {name for name in ("uwb", "gnss") if getattr(scenario, name) is None}
 
 
 def robot_settings(scenario: Scenario) -> dict[str, Any]:
@@ -103,6 +109,10 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
     markers = {"sigma_px": 0.1}
     topics = {"command": "/cmd_vel", "odometry": "/odom", "truth": "/truth"}
     settings: dict[str, Any] = {"recording": {"topics": topics}, "wheels": wheels, "markers": markers}
+    if scenario.uwb is not None:
+        settings["uwb"] = uwb_settings(scenario, scenario.uwb)
+    if scenario.gnss is not None:
+        settings["gnss"] = gnss_settings(scenario.gnss)
     if robot.kind == "diff_drive":
         # Radii may be 1 % off. On validation recordings with 60 s of darkness the error falls from 10 to 6 cm by it.
         wheels |= {"scale_sigma": 0.01, "turn_scale_sigma": 0.01, "yaw_per_m_sigma": 0.05}

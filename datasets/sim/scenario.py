@@ -111,6 +111,32 @@ class Camera(Section):
     oversampling: Positive = 1.5  # rendered pixels per image pixel and axis
 
 
+class Uwb(Section):
+    """Ultra-wideband ranges from a tag to anchors along the walls, one anchor after the other."""
+
+    rate_hz: Positive = 20.0  # ranges, of all anchors together
+    anchors: int = Field(6, gt=0, le=100)
+    heights_m: Vector2 = (1.6, 2.4)  # of the anchors, in turns
+    tag: Vector3 = (-0.05, 0.0, 0.30)  # in the base frame
+    sigma_m: Positive = 0.1
+    nlos_share: float = Field(0.0, ge=0, lt=1)  # of an anchor's time, without line of sight ...
+    nlos_s: Positive = 2.0  # ... for so long at a time, on average ...
+    nlos_mean_m: Positive = 1.0  # ... and all ranges of that time too long by one draw
+
+
+class Gnss(Section):
+    """Positions of a receiver with carrier-phase corrections from a base station."""
+
+    rate_hz: Positive = 5.0
+    origin: Vector3 = (48.137154, 11.576124, 519.0)  # of the map: latitude, longitude [degrees], altitude [m]
+    yaw_rad: float = 0.3  # of the map's x axis from east
+    antenna: Vector3 = (0.05, 0.0, 0.35)  # in the base frame
+    sigma_m: Positive = 0.02  # east and north
+    multipath_share: float = Field(0.0, ge=0, lt=1)  # of the time ...
+    multipath_s: Positive = 1.0  # ... for so long at a time, on average ...
+    multipath_mean_m: Positive = 2.0  # ... and all positions of that time off by one draw
+
+
 class Rates(Section):
     """How often each channel speaks [Hz]."""
 
@@ -128,6 +154,8 @@ class Latency(Section):
     imu: Vector2 = (0.001, 0.0005)
     camera: Vector2 = (0.030, 0.004)
     truth: Vector2 = (0.004, 0.001)
+    uwb: Vector2 = (0.005, 0.002)
+    gnss: Vector2 = (0.060, 0.010)
 
 
 # --- World ------------------------------------------------------------------------------------------------------------
@@ -263,6 +291,8 @@ class Scenario(Section):
     world: World = World()
     imu: Imu = Imu()
     camera: Camera | None = Camera()
+    uwb: Uwb | None = None
+    gnss: Gnss | None = None
     rates: Rates = Rates()
     latency: Latency = Latency()
     control: Control = Control()

@@ -15,7 +15,8 @@ from datasets.sim.camera import frames, light_level
 from datasets.sim.installed import camera_jitter_s
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
-from datasets.sim.scenario import Robot
+from datasets.sim.positioning import gnss_places, uwb_ranges
+from datasets.sim.scenario import Gnss, Robot, Uwb
 from datasets.sim.section import channel_rng
 from fgloc import se2
 from fgloc.frames import quaternion_matrix, rpy_matrix
@@ -37,6 +38,10 @@ def streams(scene: Scene, log: Log, bag: BagWriter, camera: bool) -> list[Iterat
         _truth(scene, log, bag),
         _light(scene, log, bag),
     ]
+    if scene.scenario.uwb is not None:
+        channels.append(_ranges(scene, scene.scenario.uwb, log, bag))
+    if scene.scenario.gnss is not None:
+        channels.append(_fixes(scene, scene.scenario.gnss, log, bag))
     if camera and scene.scenario.camera is not None:
         channels += [_mounting(scene, bag), _images(scene, log, bag)]
     return channels
@@ -144,6 +149,20 @@ def _light(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     for i, received in enumerate(_received(scene, "truth", stamps)):
         lux = FULL_LIGHT_LUX * light_level(scene.scenario.world.light, seconds[i])
         yield _message(bag.illuminance, received, "/truth/light", stamps[i], lux)
+
+
+def _ranges(scene: Scene, uwb: Uwb, log: Log, bag: BagWriter) -> Iterator[Message]:
+    numbers, seconds, readings = uwb_ranges(scene.scenario, uwb, log, scene.seed)
+    stamps = _stamps(seconds)
+    for i, received in enumerate(_received(scene, "uwb", stamps)):
+        yield _message(bag.range_reading, received, "/uwb/range", stamps[i], readings[i], f"anchor_{numbers[i]}")
+
+
+def _fixes(scene: Scene, gnss: Gnss, log: Log, bag: BagWriter) -> Iterator[Message]:
+    seconds, places = gnss_places(gnss, log, scene.seed)
+    stamps, variances = _stamps(seconds), (gnss.sigma_m**2, gnss.sigma_m**2, 4.0 * gnss.sigma_m**2)
+    for i, received in enumerate(_received(scene, "gnss", stamps)):
+        yield _message(bag.satellite_fix, received, "/gnss/fix", stamps[i], places[i], variances)
 
 
 def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:

@@ -170,7 +170,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
     if cell.start == "truth":
-        config = _start_at_truth(cell.bag, config)
+        config = start_at_truth(cell.bag, config)
     plain = job.folder is not None and not cell.chain  # in a sweep all runs of a recording have one set-up
     with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
         map_file = cell.map
@@ -223,7 +223,7 @@ def _track(result: RunResult, config: Config) -> Track | None:
     return Track(estimate=estimate.tolist(), truth=truth.tolist())
 
 
-def _start_at_truth(bag: Path, config: Config) -> Config:
+def start_at_truth(bag: Path, config: Config) -> Config:
     """The configuration with the truth's first pose as the initial one.
 
     Raises:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import reduce
 from itertools import product
+from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from fgloc.ablation.failures import AnyFailure
-from fgloc.config import Config, Section, load_config
+from fgloc.ablation.failures import BuiltInFailure, Failure
+from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.runner import RunMode, find_beside
+from fgloc.sensors.registry import sensors
 from fgloc.settings_file import Settings, sentences
 
+if TYPE_CHECKING:
+    AnyFailure = Failure
+else:  # whoever installs a sensor may name its failures
+    AnyFailure = Annotated[
+        reduce(or_, (failure for sensor in sensors() for failure in sensor.failures), BuiltInFailure),
+        Field(discriminator="kind"),
+    ]
 _MOST_RUNS = 1_000_000
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Severity = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -156,7 +166,7 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
             raise ConfigError(f"{bag}: recording '{entry.name}' is missing; make it, or take it out of the suite")
         map_file = folder / entry.map if entry.map is not None else find_beside(bag, "map.yaml")
         config_file = folder / entry.config if entry.config is not None else find_beside(bag, "robot.yaml")
-        base = Config() if config_file is None else load_config(config_file)
+        base = config_of({}) if config_file is None else load_config(config_file)
         common = dict(
             recording=entry.name,
             variant=variant.name,
@@ -181,9 +191,9 @@ def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path)
         if isinstance(part, dict) and isinstance(part.get(key), str):  # of the suite; the base's are paths already
             content[section] = part | {key: folder / part[key]}
     try:
-        return Config.model_validate(content)
+        return config_of(content)
     except ValidationError as error:
-        lines = [f"  {text}" for text in sentences(error, Config)]
+        lines = [f"  {text}" for text in sentences(error, config_type())]
         raise ConfigError(
             f"variant '{variant.name}' of recording '{entry.name}': wrong configuration\n" + "\n".join(lines)
         ) from error

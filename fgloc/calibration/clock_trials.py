@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import cast
 
 from fgloc.calibration.contradictions import contradicted
-from fgloc.config import Config, Role
+from fgloc.config import Config
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
@@ -98,7 +97,7 @@ def _late(s: Setting) -> bool:
 
 
 def _with(config: Config, trial: Trial) -> Config:
-    offsets = config.recording.stamp_offset_s | {cast(Role, trial.role): trial.offset_s}
+    offsets = config.recording.stamp_offset_s | {trial.role: trial.offset_s}
     return config.model_copy(update={"recording": config.recording.model_copy(update={"stamp_offset_s": offsets})})
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from pydantic import ValidationError
 
-from fgloc.config import Config, MotionConfig, load_config
+from fgloc.config import Config, MotionConfig, config_of, load_config
 from fgloc.errors import ConfigError
 
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
@@ -49,7 +49,7 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     from fgloc.runner import find_beside
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
-    config = Config() if file is None else load_config(file)
+    config = config_of({}) if file is None else load_config(file)
     if model is None:
         return config
     try:

@@ -16,9 +16,9 @@ h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--
 p.sub, figcaption, td.why { color: var(--soft); }
 code, pre { font: 13px/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 pre { background: var(--tint); padding: .8rem 1rem; overflow-x: auto; border-radius: 6px; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(7rem, 1fr)); gap: .7rem; margin: 1.2rem 0; }
-.tile { background: var(--tint); border-radius: 8px; padding: .7rem .9rem; }
-.tile b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(5.6rem, 1fr)); gap: .7rem; margin: 1.2rem 0; }
+.tile { background: var(--tint); border-radius: 8px; padding: .7rem .8rem; }
+.tile b { display: block; font-size: 1.15rem; white-space: nowrap; font-variant-numeric: tabular-nums; }
 .tile span { color: var(--soft); font-size: .85rem; }
 figure { margin: 1rem 0 1.6rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { font-size: .9rem; margin-top: .3rem; }

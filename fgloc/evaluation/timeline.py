@@ -35,6 +35,7 @@ from fgloc.evaluation.style import (
 from fgloc.types import Decision, FloatArray, IntArray, RunResult
 
 _SOURCES = ("wheels", "learned", "gyro", "unknown")
+_NOT_SEEN = (*_SOURCES, "place", "prior", "mode", "clock")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20
 _ROW_IN = 0.24  # inches
@@ -54,7 +55,7 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
         slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator recorded them.
     """
     motions = [d for d in result.decisions if d.kind in _SOURCES]
-    sightings = [d for d in result.decisions if d.landmark_id >= 0]
+    sightings = [d for d in result.decisions if d.landmark_id >= 0 or d.kind not in _NOT_SEEN]
     flags = _flags(result, result.decisions)
     known = [d for d in sightings if math.isfinite(d.nis) and d.dof > 0]
     panels: list[Panel] = []
@@ -68,7 +69,7 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     if known:
         panels.append((5.0, lambda axes: _fit(axes, result, known)))
     if sightings:
-        rows = min(len({d.landmark_id for d in sightings}), _MAX_LANDMARKS)
+        rows = min(len({_row_of(d) for d in sightings}), _MAX_LANDMARKS)
         panels.append((0.8 * rows, lambda axes: _landmarks(axes, result, sightings)))
     if matched is not None:
         panels += [(4.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in (False, True)]  # type: ignore[misc]
@@ -188,17 +189,22 @@ def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
 
 
 def _landmarks(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
-    """A row for each landmark: when its sightings were accepted, and when not."""
-    seen = Counter(d.landmark_id for d in decisions)
-    ids = sorted(i for i, _ in seen.most_common(_MAX_LANDMARKS))
+    """A row for each landmark, and for what else a sensor measured: when it was accepted, and when not."""
+    seen = Counter(map(_row_of, decisions))
+    shown = sorted(row for row, _ in seen.most_common(_MAX_LANDMARKS))
     span = max(float(np.ptp(_poses(result))), 1.0)
-    for row, landmark_id in enumerate(ids):
+    for row, what in enumerate(shown):
         for accepted, color in ((True, BLUE), (False, RED)):
-            stamps = [d.stamp_ns for d in decisions if d.landmark_id == landmark_id and (d.weight > 0.0) == accepted]
+            stamps = [d.stamp_ns for d in decisions if _row_of(d) == what and (d.weight > 0.0) == accepted]
             bars = _bars(np.unique(seconds(result, stamps)), span, bridge=False)
             axes.broken_barh(bars, (row - 0.35, 0.7), color=color, lw=0)
-    _rows(axes, "landmark", [str(i) for i in ids])
+    _rows(axes, "landmark", [kind or str(i) for i, kind in shown])
     axes.tick_params(axis="y", labelsize=7)
+
+
+def _row_of(decision: Decision) -> tuple[int, str]:
+    """Id of a landmark; without one, the kind."""
+    return decision.landmark_id, "" if decision.landmark_id >= 0 else decision.kind
 
 
 def _error(axes: Axes, result: RunResult, matched: Matched, yaw: bool) -> None:

@@ -29,6 +29,7 @@ from fgloc.types import (
     LandmarkMeasurement,
     MarkerPoseMeasurement,
     MotionMeasurement,
+    PoseMeasurement,
     RangeBearingMeasurement,
 )
 
@@ -192,7 +193,7 @@ class LandmarkFactors:
         """
         if self._known is None:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
-        if m.landmark_id not in self._known:
+        if not isinstance(m, PoseMeasurement) and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
         if not isinstance(m, CornerMeasurement) and (problem := covariance_problem(m.cov)):
             raise CovarianceError(

@@ -77,8 +77,11 @@ def covariance_problem(cov: FloatArray) -> str:
         (a, b), (d, e) = cov.tolist()
         minors = (a, a * e - b * d)
         skew, size = abs(b - d), abs(a) + abs(e)
+    elif cov.ndim == 2 and cov.shape[0] == cov.shape[1] > 0:
+        minors = tuple(float(np.linalg.det(cov[:i, :i])) for i in range(1, len(cov) + 1))
+        skew, size = float(np.abs(cov - cov.T).max()), float(np.abs(np.diag(cov)).sum())
     else:
-        return f"covariance of shape {cov.shape}, expected (2, 2) or (3, 3)"
+        return f"covariance of shape {cov.shape}, expected a square matrix"
     if not math.isfinite(size + skew):
         return "covariance with NaN or Inf"
     if skew > 1e-9 * size:

@@ -10,11 +10,13 @@ from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Linearized
 from fgloc.graph.planar_batch import PlanarBatch
+from fgloc.graph.pose_batch import PoseBatch
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,
     Landmark,
     LandmarkMeasurement,
+    PoseMeasurement,
 )
 
 
@@ -33,14 +35,17 @@ class Observations:
         """
         self._count = len(measurements)
         corners = [i for i, m in enumerate(measurements) if isinstance(m, CornerMeasurement)]
-        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement)]
-        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch]] = []
+        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement | PoseMeasurement)]
+        by_pose = [i for i, m in enumerate(measurements) if isinstance(m, PoseMeasurement)]
+        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch | PoseBatch]] = []
         if corners:
             seen = [m for m in measurements if isinstance(m, CornerMeasurement)]
             self.batches.append((corners, CornerBatch(seen, landmarks, installation)))
         if planar:
-            rest = [m for m in measurements if not isinstance(m, CornerMeasurement)]
+            rest = [m for m in measurements if not isinstance(m, CornerMeasurement | PoseMeasurement)]
             self.batches.append((planar, PlanarBatch(rest, landmarks, installation)))
+        if by_pose:
+            self.batches.append((by_pose, PoseBatch([m for m in measurements if isinstance(m, PoseMeasurement)])))
 
     def __len__(self) -> int:
         return self._count

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
+from collections.abc import Iterable
 
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
 from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
+from fgloc.sensors.base import Stream
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -18,6 +20,7 @@ from fgloc.types import (
     MarkerPosesEvent,
     OdometryEvent,
     RangeBearingEvent,
+    SensorEvent,
     SightingsEvent,
     Step,
 )
@@ -27,6 +30,7 @@ _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
 _NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
 _SIGHTINGS = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
+_USED_LATE = (*_SIGHTINGS, SensorEvent)
 _NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
 
 
@@ -46,13 +50,14 @@ class KeyframeBuilder:
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
     """
 
-    def __init__(self, config: KeyframesConfig, gate: GateConfig, lag_s: float) -> None:
+    def __init__(self, config: KeyframesConfig, gate: GateConfig, lag_s: float, streams: Iterable[Stream] = ()) -> None:
         """Set up.
 
         Args:
             config: when keyframes are made.
             gate: what counts as a jump of the clock.
             lag_s: how late sightings may be and still be fused.
+            streams: of registered sensors; their events go with the steps as sightings do.
         """
         self.rejections: Counter[str] = Counter()
         self._min_ns = max(int(config.min_interval_s * 1e9), 1)
@@ -61,6 +66,7 @@ class KeyframeBuilder:
         self._history_ns = int(config.history_s * 1e9)
         self._lag_ns = int(lag_s * 1e9)
         self._clock = ClockGuard(gate)
+        self._streams = {stream.event: stream for stream in streams}
         self._jumps: list[str] = []  # the first few ...
         self._jump_count = 0  # ... of so many
         self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
@@ -88,7 +94,8 @@ class KeyframeBuilder:
         self._received_ns = 0  # when the last event was received
         self._reached: deque[tuple[int, int]] = deque(maxlen=_MOST_REACHED)  # newest stamps of late, and when they came
         self._sources: dict[str, Punctuality] = {}
-        self._pending: list[SightingsEvent] = []  # by stamp
+        self._pending: list[SightingsEvent | SensorEvent] = []  # that get a keyframe, by stamp
+        self._carried: list[SensorEvent] = []  # that get none, by stamp
         self._seen: set[tuple[int, str]] = set()  # sightings of the lag
         self._seen_order: deque[tuple[int, str]] = deque()
 
@@ -120,7 +127,7 @@ class KeyframeBuilder:
 
     def push(self, event: Event) -> list[Step]:
         """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
-        if not isinstance(event, (*MOTION_EVENTS, *_SIGHTINGS)):
+        if not isinstance(event, (*MOTION_EVENTS, *_SIGHTINGS)) and type(event) not in self._streams:
             return []
         return self._take(self._clock.judge(event))
 
@@ -158,10 +165,10 @@ class KeyframeBuilder:
         source.disorder_ns.add(min(source.newest_ns - stamp, self._reorder_ns), self._newest_ns)
         late = self._last_ns is not None and stamp < self._last_ns
         late_ns = self._newest_ns - stamp if late else 0
-        hopeless = late_ns > MAX_PATIENCE_NS and isinstance(event, _SIGHTINGS)  # they are used at whatever time
+        hopeless = late_ns > MAX_PATIENCE_NS and isinstance(event, _USED_LATE)  # they are used at whatever time
         source.late_ns.add(0 if hopeless else late_ns, self._newest_ns)
-        if isinstance(event, _SIGHTINGS):
-            self._insert_sightings(event)
+        if isinstance(event, _USED_LATE):
+            self._insert_late(event)
             return
         name = _NAMES[type(event)]
         if late:
@@ -169,31 +176,40 @@ class KeyframeBuilder:
         elif not self._motion[type(event)].insert(event):
             self.rejections[f"{name}.duplicate"] += 1
 
-    def _insert_sightings(self, event: SightingsEvent) -> None:
-        if not event.sightings:
+    def _insert_late(self, event: SightingsEvent | SensorEvent) -> None:
+        """Keep what may be used after its keyframe."""
+        if not isinstance(event, SensorEvent) and not event.sightings:
             return
         stamp, key = event.stamp_ns, (event.stamp_ns, event.topic)
         oldest = self._newest_ns - self._lag_ns
         while self._seen_order and self._seen_order[0][0] < oldest:
             self._seen.discard(self._seen_order.popleft())
         if stamp < oldest or (self._last_ns is not None and stamp < self._first_ns):
-            self.rejections["sightings.late"] += 1
+            self.rejections[f"{self._name(event)}.late"] += 1
         elif key in self._seen:
-            self.rejections["sightings.duplicate"] += 1
+            self.rejections[f"{self._name(event)}.duplicate"] += 1
         else:
             self._seen.add(key)
             self._seen_order.append(key)
-            insort(self._pending, event, key=lambda e: e.stamp_ns)
+            if isinstance(event, SensorEvent) and not self._streams[type(event)].keyframe:
+                insort(self._carried, event, key=lambda e: e.stamp_ns)
+            else:
+                insort(self._pending, event, key=lambda e: e.stamp_ns)
+
+    def _name(self, event: Event) -> str:
+        """Of an event's role, for the rejections."""
+        stream = self._streams.get(type(event))  # type: ignore[arg-type]
+        return _NAMES.get(type(event), "sightings") if stream is None else stream.role
 
     def _stray(self, event: Event) -> None:
         """An event far off the clock: a sighting may just be very late, the rest is lost."""
         ahead = event.stamp_ns - self._newest_ns
         if ahead > 0:
-            self.rejections[f"{_NAMES.get(type(event), 'sightings')}.future"] += 1
+            self.rejections[f"{self._name(event)}.future"] += 1
             count, _ = self._offsets.get(event.topic, (0, 0))
             self._offsets[event.topic] = [count + 1, ahead]
-        elif isinstance(event, _SIGHTINGS):
-            self._insert_sightings(event)
+        elif isinstance(event, _USED_LATE):
+            self._insert_late(event)
         else:
             self.rejections[f"{_NAMES[type(event)]}.late"] += 1
 
@@ -201,7 +217,7 @@ class KeyframeBuilder:
         """End the segment; one that has not begun (its first stamps were wrong) is forgotten."""
         steps: list[Step] = []
         if self._last_ns is None:
-            lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending)
+            lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending) + len(self._carried)
             self._tell_jump(f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped")
         else:
             jump_s = (event.stamp_ns - self._newest_ns) * 1e-9
@@ -264,6 +280,7 @@ class KeyframeBuilder:
         """Close the keyframe at this time."""
         start = stamp_ns if self._last_ns is None else self._last_ns
         handed = bisect_right(self._pending, stamp_ns, key=lambda e: e.stamp_ns)
+        carried = bisect_right(self._carried, stamp_ns, key=lambda e: e.stamp_ns)
         step = Step(
             index=self._index,
             segment=self._segment,
@@ -273,9 +290,13 @@ class KeyframeBuilder:
             commands=self._commands.window(start - self._history_ns, stamp_ns),
             joints=self._joints.window(start, stamp_ns),
             imu=self._imu.window(start, stamp_ns),
-            sightings=tuple(self._pending[:handed]),
+            sightings=tuple(e for e in self._pending[:handed] if not isinstance(e, SensorEvent)),
+            sensed=(
+                *(e for e in self._pending[:handed] if isinstance(e, SensorEvent)),
+                *self._carried[:carried],
+            ),
         )
-        del self._pending[:handed]
+        del self._pending[:handed], self._carried[:carried]
         if self._last_ns is None:
             self._first_ns = stamp_ns
         self._last_ns = stamp_ns

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from fgloc.config import GateConfig
 from fgloc.intake.field_checks import PLANAR, Changes, FieldChecks
 from fgloc.intake.sighting_validation import EMPTIED, SightingsValidator
+from fgloc.sensors.base import Check, Stream
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -24,6 +26,7 @@ from fgloc.types import (
     MarkerPosesEvent,
     OdometryEvent,
     RangeBearingEvent,
+    SensorEvent,
     TransformEvent,
     TruthEvent,
 )
@@ -69,12 +72,15 @@ class EventValidator:
     Camera information passes unseen: whoever makes a camera of it validates it. Transforms may have stamp 0.
     """
 
-    def __init__(self, config: GateConfig, known_ids: Collection[int] | None = None) -> None:
+    def __init__(
+        self, config: GateConfig, known_ids: Collection[int] | None = None, streams: Iterable[Stream] = ()
+    ) -> None:
         """Set up.
 
         Args:
             config: bounds.
             known_ids: ids of the map; None if no map is given: then every id passes.
+            streams: of registered sensors, which bring their own checks.
         """
         self.rejections: Counter[str] = Counter()
         self._config = config
@@ -94,6 +100,8 @@ class EventValidator:
             MarkerPosesEvent: ("sightings", self._sightings.marker_poses),
             RangeBearingEvent: ("sightings", self._sightings.range_bearings),
         }
+        for stream in streams:
+            self._checks[stream.event] = stream.role, partial(_by_stream, stream.check, config)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -289,3 +297,7 @@ class EventValidator:
 
     def _note(self, text: str) -> None:
         self._notes.setdefault(text)
+
+
+def _by_stream(check: Check, config: GateConfig, event: SensorEvent) -> Event | str:
+    return check(event, config)

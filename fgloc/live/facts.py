@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import get_args
 
 import numpy as np
 
 from fgloc.assembly import base_frame, given_pose
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, role_names
 from fgloc.recording.transforms import FrameTree
+from fgloc.sensors import registry
 from fgloc.sensors.images import ImageError, decode
 from fgloc.types import (
     Camera,
@@ -23,6 +23,7 @@ from fgloc.types import (
     MarkerPosesEvent,
     OdometryEvent,
     RangeBearingEvent,
+    SensorEvent,
     TransformEvent,
     TruthEvent,
 )
@@ -39,6 +40,13 @@ ROLE_OF: Mapping[type[Event], Role] = {
     RangeBearingEvent: "sightings",
     TruthEvent: "truth",
 }
+
+
+def role_of(event: Event) -> Role | None:
+    """Role of an event's topic; None if it needs none."""
+    return ROLE_OF.get(type(event)) or (registry.role_of_event(event) if isinstance(event, SensorEvent) else None)
+
+
 _MOTION: frozenset[Role] = frozenset({"odometry", "joints", "command", "imu"})
 _WITH_CAMERA: frozenset[Role] = frozenset({"image", "sightings"})
 _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
@@ -71,7 +79,7 @@ class LiveFacts:
 
     def topic_is_used(self, event: Event) -> bool:
         """Whether the event is of the one topic that plays its role: the configured one, else the first."""
-        role = ROLE_OF.get(type(event))
+        role = role_of(event)
         if role is None:
             return True
         given: str | None = getattr(self._config.recording.topics, role)
@@ -81,7 +89,7 @@ class LiveFacts:
 
     def is_configured(self, event: Event) -> bool:
         """Whether the configuration names the topic that plays the event's role, or none."""
-        role = ROLE_OF.get(type(event))
+        role = role_of(event)
         return role is not None and getattr(self._config.recording.topics, role) is not None
 
     @property
@@ -91,7 +99,7 @@ class LiveFacts:
 
     def is_there(self, event: Event) -> bool:
         """Whether all is known that is needed to use an event."""
-        role = ROLE_OF.get(type(event))
+        role = role_of(event)
         return role is None or role in _NOT_BUILT_FROM or role in self.roles
 
     def is_news(self, event: Event) -> bool:
@@ -120,7 +128,7 @@ class LiveFacts:
     def waiting_for(self) -> tuple[str, ...]:
         """What is missing, a phrase each."""
         missing = []
-        for role in get_args(Role):
+        for role in role_names():
             if role in self.roles or role in _NOT_BUILT_FROM:
                 continue
             if role in self._topics:

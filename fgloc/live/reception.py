@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
-from fgloc.live.facts import ROLE_OF
+from fgloc.live.facts import role_of as known_role
 from fgloc.live.status import TopicMeter, TopicStatus
 from fgloc.types import Event
 
@@ -82,4 +82,4 @@ class Reception:
 
 def role_of(event: Event) -> str:
     """Role of an event's topic."""
-    return ROLE_OF.get(type(event), "tf")
+    return known_role(event) or "tf"

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from fgloc.config import RecordingConfig, Role
+from fgloc.sensors import registry
 from fgloc.types import (
     CameraInfoEvent,
     CommandEvent,
@@ -84,7 +85,7 @@ def events_of(
     stamp_ns = None if role in config.received_stamps else header_stamp(content)
     stamp_ns = received_ns if stamp_ns is None else stamp_ns
     stamp_ns += round(config.stamp_offset_s.get(role, 0.0) * 1e9)
-    return [CONVERTERS[role][message_type](content, (stamp_ns, received_ns, topic))]
+    return [converters_of(role)[message_type](content, (stamp_ns, received_ns, topic))]
 
 
 # --- One converter for each type --------------------------------------------------------------------------------------
@@ -202,6 +203,11 @@ CONVERTERS: dict[Role, dict[str, Callable[[Any, When], Event]]] = {
         "nav_msgs/msg/Odometry": _covariance_truth,
     },
 }
+
+
+def converters_of(role: Role) -> Mapping[str, Callable[[Any, When], Event]]:
+    """Converters of any role, by message type."""
+    return CONVERTERS[role] if role in CONVERTERS else registry.converters(role)
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------

@@ -10,16 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc.config import Config, Role
+from fgloc.config import BUILT_IN_ROLES, Config, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.checks import CHECKS
+from fgloc.recording.checks import CHECKS, OtherChecks
 from fgloc.recording.checks_base import Collector
 from fgloc.recording.checks_camera import CameraInfoChecks, ImageChecks, SightingsChecks
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
+
+_NO_PLACE = frozenset(BUILT_IN_ROLES) - {"image", "sightings"}  # roles that do not tell where in the map a robot is
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
     with Recording(path, config.recording) as recording:
         times = {topic.name: Times() for topic in recording.topics}
         role_of = {topic: role for role, topic in recording.roles.items()}
-        checks: dict[str, Collector] = {topic: CHECKS[role]() for topic, role in role_of.items()}
+        checks: dict[str, Collector] = {topic: CHECKS.get(role, OtherChecks)() for topic, role in role_of.items()}
         child_frame = ""
         for message in recording.messages():
             topic, _, received_ns, _ = message
@@ -95,7 +97,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         found.append("No odometry, joint states or commands: nothing tells how the robot moves.")
-    if not unsettled and not {"image", "sightings"} & roles.keys():
+    if not unsettled and not roles.keys() - _NO_PLACE:
         found.append("No images and no marker sightings: nothing bounds the drift.")
     images = next((c for c in checks.values() if isinstance(c, ImageChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)

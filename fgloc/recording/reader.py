@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
-from fgloc.config import RecordingConfig, Role
+from fgloc.config import RecordingConfig, Role, role_names
 from fgloc.errors import RecordingError
-from fgloc.recording.decode import CONVERTERS, TF_TYPES, events_of
+from fgloc.recording.decode import TF_TYPES, converters_of, events_of
 from fgloc.recording.definitions import Decoder
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.recording.storage import RawMessage, Storage
@@ -68,7 +68,7 @@ class Recording:
         self.problems = selection.problems
         role_of: dict[str, Role] = {topic: role for role, topic in selection.roles.items()}
         self.topics = tuple(replace(topic, role=role_of.get(topic.name)) for topic in found.values())
-        known_types = TF_TYPES.union(*CONVERTERS.values())
+        known_types = TF_TYPES.union(*map(converters_of, role_names()))
         self._decoder = Decoder(
             self.kind == "ros1",
             [(c.message_type, c.definition) for c in channels if c.message_type in known_types and c.count],

@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import get_args
 
-from fgloc.config import Role, TopicsConfig
-from fgloc.recording.decode import CONVERTERS
-
-ROLES: tuple[Role, ...] = get_args(Role)
+from fgloc.config import BUILT_IN_ROLES, Role, TopicsConfig, role_names
+from fgloc.recording.decode import CONVERTERS, converters_of
+from fgloc.sensors import registry
 
 # Of several candidates for a role, the only one with such a name (alone or below a namespace) is taken.
 CONVENTIONAL_NAMES: Mapping[Role, tuple[str, ...]] = {
@@ -66,8 +64,8 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
     notes: list[str] = []
     roles, problems = _given_roles(topics, config)
     filled = [topic for topic in topics if topic.count > 0]
-    for role in sorted(ROLES, key=_by_dependence):
-        if getattr(config, role) is not None:
+    for role in sorted(role_names(), key=_by_dependence):
+        if config.given(role) is not None:
             continue
         candidates = [topic.name for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
         chosen, why = _choose(role, candidates, roles.get("image"))
@@ -75,6 +73,10 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
             roles[role] = chosen
             if why:
                 notes.append(f"{chosen} is taken as {role}: {why}.")
+        elif candidates and role not in BUILT_IN_ROLES:  # nobody may have asked for the sensor
+            notes.append(
+                f"No {role}: {', '.join(candidates)} could be it; choose one with recording.topics.{role}, or none."
+            )
         elif candidates:
             problems.append(
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
@@ -83,7 +85,7 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
         else:
             notes.append(_unnamed(role, filled))
     notes.append(_one_of_images_and_sightings(roles, config))
-    notes += [_empty(role, topics) for role in ROLES if role not in roles and getattr(config, role) is None]
+    notes += [_empty(role, topics) for role in role_names() if role not in roles and config.given(role) is None]
     return Selection(roles, tuple(note for note in notes if note), tuple(problems))
 
 
@@ -91,8 +93,8 @@ def _given_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> tuple[dic
     """Roles that the user gave, and what is wrong with them."""
     roles: dict[Role, str] = {}
     problems: list[str] = []
-    for role in ROLES:
-        given: str | None = getattr(config, role)
+    for role in role_names():
+        given = config.given(role)
         if given is None or given == "none":
             continue
         if problem := _misfit(role, given, topics):
@@ -148,7 +150,7 @@ def _by_dependence(role: Role) -> int:
 
 
 def _fits(role: Role, topic: TopicInfo) -> bool:
-    if topic.message_type not in CONVERTERS[role]:
+    if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
         odometry = topic.message_type in CONVERTERS["odometry"]
@@ -186,7 +188,7 @@ def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str |
 
 def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
     """What is wrong with a configured topic; empty if nothing."""
-    types = CONVERTERS[role]
+    types = converters_of(role)
     found = next((topic for topic in topics if topic.name == given), None)
     fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
     remedy = f"choose {' or '.join(fitting)}" if fitting else f"the recording has no topic for the {role}: use none"
@@ -210,7 +212,9 @@ def _says_truth(topic: str) -> bool:
 
 
 def _conventional(role: Role, topic: str) -> bool:
-    return any(topic.strip("/") == name or topic.endswith(f"/{name}") for name in CONVENTIONAL_NAMES[role])
+    stream = registry.streams().get(role)
+    names = CONVENTIONAL_NAMES[role] if stream is None else stream.usual_names
+    return any(topic.strip("/") == name or topic.endswith(f"/{name}") for name in names)
 
 
 def _camera(topic: str) -> str:

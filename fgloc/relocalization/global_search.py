@@ -27,6 +27,7 @@ from fgloc.types import (
     MarkerPoseMeasurement,
     MotionMeasurement,
     MotionReadings,
+    PoseMeasurement,
     RangeBearingMeasurement,
     Step,
 )
@@ -47,6 +48,9 @@ _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
 _UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
 _ITERATIONS, _ROUGH_ITERATIONS = 16, 4
+_LASTING = 0.8  # of the time that is collected
+_POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
+_YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_NS = 800_000_000
 
@@ -69,11 +73,13 @@ class InitialPose:
         steps: what was collected, oldest first; the first one's motions are to be ignored.
         first: weak prior for the oldest step, to be followed by all its sightings.
         newest: pose at the newest step with the covariance that the sightings give.
+        by_sensors: told by registered sensors alone.
     """
 
     steps: tuple[SearchStep, ...]
     first: PoseWithCovariance
     newest: PoseWithCovariance
+    by_sensors: bool = False
 
 
 class GlobalSearch:
@@ -90,6 +96,7 @@ class GlobalSearch:
         """Take the parts; ``keep_all``: steps that the search has forgotten are kept for the replay from the start."""
         self._config = config
         self._keep_all = keep_all
+        self._window_ns = round(config.estimator.initialise_s * 1e9)
         self._map = landmark_map
         self._factors = factors
         self._steps: deque[SearchStep] = deque()
@@ -137,7 +144,7 @@ class GlobalSearch:
                 agree: some wrong ids agree with some place always.
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
-        horizon = step.stamp_ns - round(self._config.estimator.initialise_s * 1e9)
+        horizon = step.stamp_ns - self._window_ns
         while self._steps[0].step.stamp_ns < horizon or len(self._steps) > _MAX_STEPS:
             forgotten = self._steps.popleft()
             if self._keep_all and self._first:
@@ -149,7 +156,8 @@ class GlobalSearch:
         best = self._solve(known) if sightings and self._due(step.stamp_ns) else None
         if best is None:
             return None
-        return self._start(PoseWithCovariance(best.fit.pose, best.fit.cov))
+        start = self._start(PoseWithCovariance(best.fit.pose, best.fit.cov))
+        return dataclasses.replace(start, by_sensors=best.by_sensors)
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
@@ -182,7 +190,7 @@ class GlobalSearch:
 
     def _solve(self, known: bool) -> PoseConsensus | None:
         here = _spread(list(self._carried()), _MAX_FITTED)
-        if known and len({m.landmark_id for m in here}) < 2:
+        if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
         fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
         candidates = sorted(
@@ -246,7 +254,7 @@ class GlobalSearch:
         contributing = {
             i for i, information in information_of.items() if information > _LEAST_SHARE * max(information_of.values())
         }
-        residuals = {m.landmark_id: _RESIDUALS[type(m)] for m in agreeing if m.landmark_id in contributing}
+        residuals = {m.landmark_id: _residuals(m) for m in agreeing if m.landmark_id in contributing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         outliers = [m for m in sightings if not any(m is other for other in agreeing)]
@@ -258,6 +266,8 @@ class GlobalSearch:
             frozenset(information_of),
             frozenset(m.landmark_id for m in outliers) - frozenset(information_of),
             frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
+            all(isinstance(m, PoseMeasurement) for m in agreeing),
+            _lasting(agreeing, self._window_ns),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
@@ -272,6 +282,10 @@ class GlobalSearch:
         if self._map is None:
             return
         points = []
+        by_pose = [m for m in sightings if isinstance(m, PoseMeasurement)]
+        for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
+            yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
+        sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
         whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
         for m in [*seeds, *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
@@ -312,6 +326,17 @@ def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[Lan
     if len(sightings) <= most:
         return sightings
     return sorted(sightings, key=lambda m: m.landmark_id)[:: -(-len(sightings) // most)]
+
+
+def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
+    """Whether registered sensors alone have told of a place for most of a time."""
+    stamps = [m.stamp_ns for m in sightings]
+    by_sensors = all(isinstance(m, PoseMeasurement) for m in sightings)
+    return bool(stamps) and by_sensors and max(stamps) - min(stamps) > _LASTING * window_ns
+
+
+def _residuals(m: LandmarkMeasurement) -> int:
+    return len(m.cov) if isinstance(m, PoseMeasurement) else _RESIDUALS[type(m)]
 
 
 def _information(m: LandmarkMeasurement) -> float:

@@ -22,6 +22,9 @@ _LEAST_SHARE_OF_MANY = 0.52  # ... and of three or more: the rest have wrong ids
 _WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to be known better:
 _PARTIAL_COST_PER_DOF = 1.5
 _PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
+# Positions and ranges tell the yaw by the motion alone: over a short way their fit has several minima, and the sigma of
+# one of them says little. At 0.1 rad the way is ten times as long as the positions are uncertain.
+_SENSORS_SIGMA = np.array([1.0, 1.0, 0.1])  # m, m, rad
 REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 
 SightingKey = tuple[int, int]
@@ -43,6 +46,8 @@ class PoseConsensus:
     agreeing: frozenset[int]  # landmarks that it explains ...
     outlier_landmarks: frozenset[int]  # ... and those that it does not
     outliers: frozenset[SightingKey]  # sightings that it does not
+    by_sensors: bool = False  # told by registered sensors alone ...
+    lasting: bool = False  # ... over as long as is collected
 
     @property
     def certain(self) -> bool:
@@ -53,6 +58,8 @@ class PoseConsensus:
         if (self.outlier_landmarks or not whole) and self.redundancy < REDUNDANT:
             return False
         cost, sigma = (MAX_COST_PER_DOF, MAX_SIGMA) if whole else (_PARTIAL_COST_PER_DOF, _PARTIAL_SIGMA)
+        if self.by_sensors:
+            sigma = np.minimum(sigma, _SENSORS_SIGMA)
         return bool(self.fit.cost <= cost * self.fit.dof and (np.sqrt(np.diag(self.fit.cov)) <= sigma).all())
 
     @property
@@ -64,7 +71,8 @@ class PoseConsensus:
     def overrides_prior(self) -> bool:
         """Whether it is evidence that the robot is not where it was estimated to be."""
         known = bool((np.sqrt(np.diag(self.fit.cov)) <= _PARTIAL_SIGMA).all())
-        return known and self.share >= _WHOLE_SHARE and self.landmarks > 1 and self.fit.redundancy >= 2 * REDUNDANT
+        checked = self.landmarks > 1 or self.lasting
+        return known and self.share >= _WHOLE_SHARE and checked and self.fit.redundancy >= 2 * REDUNDANT
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:

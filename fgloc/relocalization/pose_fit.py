@@ -15,8 +15,9 @@ from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.linearized import Stacked
 from fgloc.graph.planar_batch import PlanarBatch
+from fgloc.graph.pose_batch import PoseBatch
 from fgloc.stats import chi2_bound
-from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement
+from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement, PoseMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
@@ -97,7 +98,7 @@ class PoseFit:
             dofs[rows] = d
         return costs, dofs
 
-    def _whiten(self, batch: CornerBatch | PlanarBatch, stack: Stacked) -> FloatArray:
+    def _whiten(self, batch: CornerBatch | PlanarBatch | PoseBatch, stack: Stacked) -> FloatArray:
         """What is not known of the installation, of the stamps and of the motion in between counts as noise."""
         n, d = stack.residual.shape
         cov = np.broadcast_to(np.eye(d), (n, d, d))
@@ -133,6 +134,8 @@ def sighting_costs(
 
 def cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
     """Cauchy constant of a sighting of this kind, in units of its sigma."""
+    if isinstance(m, PoseMeasurement):
+        return m.cauchy_k
     return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
 
 

@@ -251,6 +251,8 @@ class Tracking:
         started = self._search.collect(step, motions, outliers, readings, known=True)
         if started is None or self.keeps_initial_pose:
             return None if started is None else started.newest
+        if started.by_sensors:  # no consensus is sought nearby: each of them may need all of the collected time
+            return started.newest
         x, y, yaw = se2.between(predicted.pose, started.newest.pose)
         return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
 

@@ -14,16 +14,15 @@ from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
 from fgloc.robust.landmark_modes import LandmarkModes
+from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
     Decision,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PoseMeasurement,
 )
 
-KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -42,6 +41,7 @@ class Association:
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
         self._contradicting: set[int] = set()
+        self._sensors = SensorMeasurements(config, factors)
         self.modes = LandmarkModes(config, factors)
 
     def judge(
@@ -58,21 +58,21 @@ class Association:
         because after dead reckoning the linear one is far too large.
         """
         accepted, rejected, decisions = [], [], []
+        judged = self._judge(measurements, predicted)
+        measurements, judged = self._sensors.revise(measurements, judged, predicted, self._judge)
         shared = [self._share_information(m) for m in measurements]
-        for alone, (m, weight), (nis, dof, gate) in zip(
-            measurements, shared, self._judge(measurements, predicted), strict=True
-        ):
+        for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
             reason = "quarantined" if self.modes.excludes(m.landmark_id) else gate
             if reason:
                 rejected.append(sighting)
-                self.rejections[f"sightings.{reason}"] += 1
+                self.rejections[f"{source_of(m)}.{reason}"] += 1
             else:
                 accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
             used = 0.0 if reason else weight
             decisions.append(
-                Decision(k, stamp_ns, KINDS[type(m)], m.landmark_id, nis**0.5, nis, dof, used, reason, self._gate(dof))
+                Decision(k, stamp_ns, kind_of(m), row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
         if accepted:
             self._contradicting.clear()
@@ -81,7 +81,11 @@ class Association:
                 accepted.append(sighting)
                 decisions.append(decision)
         if not accepted:
-            self._contradicting.update(d.landmark_id for d in decisions if d.reason != "quarantined")
+            self._contradicting.update(
+                s.measurement.landmark_id
+                for s, d in zip(rejected, decisions, strict=True)
+                if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
+            )
         return accepted, rejected, decisions
 
     def _reassociate(
@@ -151,7 +155,9 @@ class Association:
         x, y, yaw = se2.between(predicted.pose, fit.pose)
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
             return None
-        self.rejections.subtract(f"sightings.{d.reason}" for d in decisions)
+        self.rejections.subtract(
+            f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(refused, decisions, strict=True)
+        )
         self.rejections += Counter()  # drops the zeros
         return fit
 
@@ -250,7 +256,7 @@ class Association:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
         correlation_s = self._config.landmarks.repeat_s
         last = self._last_used_ns.get(m.landmark_id)
-        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement):
+        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement | PoseMeasurement):
             return m, 1.0
         apart = max((m.stamp_ns - last) * 1e-9, 0.01)
         scale = max(1.0, correlation_s / apart)
@@ -264,6 +270,7 @@ class Association:
     def forget_contradictions(self) -> None:
         """The pose was set anew: `contradicting` starts from 0."""
         self._contradicting.clear()
+        self._sensors.forget()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""

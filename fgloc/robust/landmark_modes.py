@@ -27,7 +27,7 @@ from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
 from fgloc.graph.observation import Observations
 from fgloc.stats import chi2_bound
-from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement
+from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement, PoseMeasurement
 
 _MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
 ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
@@ -105,22 +105,24 @@ class LandmarkModes:
         """
         if not len(self._ids):
             return None
-        for sighting in (*fused, *refused):
-            self._follow(sighting.measurement.landmark_id)
+        seen = [s for s in fused if not isinstance(s.alone, PoseMeasurement)]
+        against = [s for s in refused if not isinstance(s.alone, PoseMeasurement)]
+        for s in (*seen, *against):
+            self._follow(s.alone.landmark_id)
         if motions:
             A, D = transition(motions, self._factors.installation)
             self._M[:, :3] = A @ self._M[:, :3] + D @ self._M[:, 3:]
         if fused:
             self._take(predicted, belief, [s.measurement for s in fused])
-            self._in_place.update(s.measurement.landmark_id for s in fused)
+            self._in_place.update(s.alone.landmark_id for s in seen)
             self._fused_ns = fused[0].measurement.stamp_ns
-        P = joint_cov(belief, self._known(belief)) if refused else np.zeros((0, 0))
-        for m in (s.alone for s in refused):
+        P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
+        for m in (s.alone for s in against):
             if m.stamp_ns - self._fused_ns < _STILL_RIGHT_NS and not self.excludes(m.landmark_id):
                 self._contradicted(P, belief, m)
-        self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*fused, *refused)})
+        self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*seen, *against)})
         self._reset(self._evidence.sum(1) < -0.5 * ALARM)  # it was in place; it may be moved from now on
-        return self._certain() if fused or refused else None
+        return self._certain() if seen or against else None
 
     def exclude(self, landmark_id: int, belief: PoseWithCovariance) -> tuple[PoseWithCovariance, float]:
         """Leave a moved landmark out from now on.
@@ -171,12 +173,14 @@ class LandmarkModes:
         G, parts, row = -(found.H @ self._M), [], 0
         for m, one in zip(seen, lines, strict=True):
             parts.append(slice(row, row + len(one.residual)))
-            G[self._rows[m.landmark_id], parts[-1]] -= _by_displacement(one, belief.pose)
+            if not isinstance(m, PoseMeasurement):
+                G[self._rows[m.landmark_id], parts[-1]] -= _by_displacement(one, belief.pose)
             row = parts[-1].stop
         W = sighting_whitening(found.cov)  # lower triangular: each sighting given those before it
         w, G = W @ (found.residual - found.H @ there), W @ G
         for m, part in zip(seen, parts, strict=True):
-            self._weigh(self._rows[m.landmark_id], w[part], G[:, part])
+            if not isinstance(m, PoseMeasurement):
+                self._weigh(self._rows[m.landmark_id], w[part], G[:, part])
         self._M += (P @ found.H.T @ W.T) @ G
 
     def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:

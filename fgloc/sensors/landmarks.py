@@ -22,7 +22,7 @@ from fgloc.types import (
     FloatArray,
     Landmark,
     LandmarkMap,
-    LandmarkMeasurement,
+    LandmarkSighting,
     MarkerCorners,
     MarkerPose,
     MarkerPoseMeasurement,
@@ -76,7 +76,7 @@ class LandmarkSensor:
         """Whether sightings are corners in images."""
         return self._camera is not None
 
-    def measure(self, event: SightingsEvent) -> tuple[LandmarkMeasurement, ...]:
+    def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
         """What one message says of the landmarks.
 
         Raises:
@@ -109,7 +109,7 @@ class LandmarkSensor:
 
     # --- corners ---
 
-    def _corners(self, event: CornersEvent) -> Iterator[LandmarkMeasurement]:
+    def _corners(self, event: CornersEvent) -> Iterator[LandmarkSighting]:
         if self._camera is None or self._pinhole is None:
             raise CameraError(
                 f"{event.topic}: marker corners, but no calibration; record sensor_msgs/CameraInfo or set camera.file"
@@ -142,7 +142,7 @@ class LandmarkSensor:
 
     def _single_view(
         self, event: CornersEvent, seen: MarkerCorners, camera: Camera, landmark: Landmark | None
-    ) -> LandmarkMeasurement | None:
+    ) -> LandmarkSighting | None:
         """What one view of a marker with no known place says, with the covariance that its corners give."""
         size = self._config.markers.default_size_m
         if size is None and landmark is None:
@@ -194,7 +194,7 @@ class LandmarkSensor:
         cov = R @ J @ self._range_bearing_cov(distance) @ J.T @ R.T
         return self._polar(stamp_ns, seen.landmark_id, R @ point + t, cov)
 
-    def _marker_pose(self, stamp_ns: int, seen: MarkerPose) -> LandmarkMeasurement | None:
+    def _marker_pose(self, stamp_ns: int, seen: MarkerPose) -> LandmarkSighting | None:
         section = self._config.landmarks
         arm = self._T_base_sensor[:3, :3] @ seen.position  # from the sensor, in the base's axes
         distance = section.range_scale * (math.hypot(arm[0], arm[1]) - section.range_bias_m)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from fgloc import se2
+from fgloc.sensors.base import Sensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels import WheelMotion
@@ -16,6 +18,7 @@ from fgloc.types import (
     FloatArray,
     LandmarkMeasurement,
     MarkerPoseMeasurement,
+    PoseMeasurement,
     Step,
 )
 
@@ -30,6 +33,10 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
         cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
     """
+    if isinstance(m, PoseMeasurement):
+        known = np.zeros((3, 3)) if m.motion_cov is None else m.motion_cov
+        moved = se2.compose_cov(cov, m.T_keyframe_then, known)
+        return dataclasses.replace(m, T_keyframe_then=se2.compose(motion, m.T_keyframe_then), motion_cov=moved)
     ad = se2.adjoint(motion)
     if isinstance(m, CornerMeasurement):
         x, y, yaw = motion
@@ -63,9 +70,17 @@ def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r
 class MotionCompensation:
     """Moves sightings from their exposure to the keyframe, by the wheels and, where it is heard, the gyro's turn."""
 
-    def __init__(self, landmarks: LandmarkSensor, wheels: WheelMotion, gyro: Gyro | None, jitter_s: float) -> None:
+    def __init__(
+        self,
+        landmarks: LandmarkSensor,
+        wheels: WheelMotion,
+        gyro: Gyro | None,
+        jitter_s: float,
+        sensors: Sequence[Sensor] = (),
+    ) -> None:
         """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
         self._landmarks, self._wheels, self._gyro, self._jitter_s = landmarks, wheels, gyro, jitter_s
+        self._sensor_of = {stream.event: sensor for sensor in sensors for stream in sensor.streams}
 
     def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
         """All sightings of a step as if made at its end.
@@ -82,7 +97,7 @@ class MotionCompensation:
                 continue
             exposure_ns = event.stamp_ns - round(offset_s * 1e9)
             twist = self.twist(step, exposure_ns)
-            late = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
+            late: list[LandmarkMeasurement] = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
             late = [
                 dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, CornerMeasurement) else m for m in late
             ]
@@ -92,7 +107,21 @@ class MotionCompensation:
                     motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
                 late = [carry(m, motion, cov) for m in late]
             measured.extend(late)
+        for sensed in step.sensed:
+            now: list[LandmarkMeasurement] = list(self._sensor_of[type(sensed)].measure(sensed))
+            if now and sensed.stamp_ns != step.stamp_ns:
+                motion, cov = self._motion_to(step, sensed.stamp_ns)
+                now = [carry(m, motion, cov) for m in now]
+            measured.extend(now)
         return measured
+
+    def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
+        """``T_keyframe_then`` for another time, with its covariance."""
+        motion, cov = self._wheels.carry(step, step.stamp_ns, at_ns)
+        if self._gyro is not None and step.imu and abs(at_ns - step.stamp_ns) < _SHORT_NS:
+            turned = self._gyro.rates_at(step.imu, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
+            motion = np.array([*motion[:2], turned])
+        return motion, cov
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Of the base at a time near the step's end."""

@@ -25,7 +25,7 @@ from fgloc.ablation.failures.timing import ClockOffset, Dropout, DuplicatedMessa
 from fgloc.ablation.failures.wheels import EncoderDead, EncoderQuantized, WheelScaleDrift, WheelSlip
 from fgloc.types import Event
 
-AnyFailure = Annotated[
+BuiltInFailure = (
     Dropout
     | Darkness
     | FrameRate
@@ -50,10 +50,10 @@ AnyFailure = Annotated[
     | OdometryReset
     | WheelNan
     | WrongCovariance
-    | ImuBias,
-    Field(discriminator="kind"),
-]
-"""Any failure, as a suite names it by its ``kind``."""
+    | ImuBias
+)
+AnyFailure = Annotated[BuiltInFailure, Field(discriminator="kind")]
+"""Any failure of a built-in sensor, by its ``kind``; a suite knows those of other packages' sensors too."""
 
 
 def corrupt(
@@ -81,4 +81,4 @@ def generators(count: int, seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng([seed, index]) for index in range(count)]
 
 
-__all__ = ["AnyFailure", "Failure", "Scene", "corrupt", "generators"]
+__all__ = ["AnyFailure", "BuiltInFailure", "Failure", "Scene", "corrupt", "generators"]

@@ -8,12 +8,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fgloc.config import Config, Section
+from fgloc.extensions import outside_sensors
 from fgloc.types import (
     CommandEvent,
     CornersEvent,
@@ -27,13 +28,32 @@ from fgloc.types import (
     RangeBearingEvent,
 )
 
-Sensor = Literal["camera", "wheels", "command", "imu"]
 EVENTS: dict[str, tuple[type[Event], ...]] = {
     "camera": (ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent),
     "wheels": (OdometryEvent, JointsEvent),
     "command": (CommandEvent,),
     "imu": (ImuEvent,),
 }
+
+
+def _known_sensor(name: str) -> str:
+    events_of(name)
+    return name
+
+
+Sensor = Annotated[str, AfterValidator(_known_sensor)]
+
+
+def events_of(sensor: str) -> tuple[type[Event], ...]:
+    """Kinds of events of a built-in sensor, or of one that another package brings.
+
+    Raises:
+        ValueError: there is no sensor of this name.
+    """
+    outside = {s.name: tuple(stream.event for stream in s.streams) for s in outside_sensors()}
+    if sensor not in EVENTS | outside:
+        raise ValueError(f"expected one of {', '.join(EVENTS | outside)}")
+    return EVENTS[sensor] if sensor in EVENTS else outside[sensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

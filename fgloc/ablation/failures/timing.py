@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene, Sensor, by_receipt
+from fgloc.ablation.failures.base import Change, EventFailure, Failure, Scene, Sensor, by_receipt, events_of
 from fgloc.types import Event
 
 
@@ -20,7 +20,7 @@ class Dropout(EventFailure):
 
     def targets(self) -> tuple[type[Event], ...]:
         """Messages of the sensor."""
-        return EVENTS[self.sensor]
+        return events_of(self.sensor)
 
     def begin(self, scene: Scene) -> Change:
         """Drop."""
@@ -37,7 +37,7 @@ class ClockOffset(EventFailure):
 
     def targets(self) -> tuple[type[Event], ...]:
         """Messages of the sensor."""
-        return EVENTS[self.sensor]
+        return events_of(self.sensor)
 
     def begin(self, scene: Scene) -> Change:
         """Move the stamp."""
@@ -70,7 +70,7 @@ class Latency(Failure):
         def delayed() -> Iterator[tuple[int, Event]]:
             for event in events:
                 now_ns = event.received_ns
-                if isinstance(event, EVENTS[self.sensor]) and schedule.hits(event):
+                if isinstance(event, events_of(self.sensor)) and schedule.hits(event):
                     late_ns = round((self.delay_s + self.jitter_s * scene.rng.uniform()) * 1e9)
                     if late_ns:
                         self.touch(scene)
@@ -95,7 +95,7 @@ class DuplicatedMessages(Failure):
         def doubled() -> Iterator[tuple[int, Event]]:
             for event in events:
                 yield event.received_ns, event
-                if isinstance(event, EVENTS[self.sensor]) and schedule.hits(event):
+                if isinstance(event, events_of(self.sensor)) and schedule.hits(event):
                     self.touch(scene)
                     yield event.received_ns, replace(event, received_ns=event.received_ns + round(self.after_s * 1e9))
 

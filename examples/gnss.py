@@ -1,0 +1,239 @@
+"""A sensor from outside in one file: positions of a GNSS receiver, in a plane about a surveyed origin.
+
+Reads `sensor_msgs/NavSatFix`. The map's frame is a plane that touches the earth at ``origin``; its x axis is turned by
+``yaw_rad`` from east, counter-clockwise. The settings::
+
+    gnss:
+      origin: [48.137154, 11.576124, 519.0]     # latitude, longitude [degrees], altitude above the ellipsoid [m]
+      yaw_rad: 0.0
+
+A position that multipath has moved is refused by the chi-square gate, against the prediction.
+
+Source of the transformation: NIMA TR8350.2, Department of Defense World Geodetic System 1984, third edition.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from fgloc.ablation.failures.base import Change, EventFailure, Scene
+from fgloc.config import GateConfig, Section
+from fgloc.sensors.base import Context, Stream, When
+from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
+
+_SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84
+_ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
+_NO_FIX, _COVARIANCE_UNKNOWN = -1, 0  # of NavSatStatus and NavSatFix
+_FARTHEST_M = 20_000.0  # from the origin: beyond, the plane is 30 m off the ground
+_Metres = Annotated[float, Field(ge=-100, le=100)]
+
+
+# --- Settings ---------------------------------------------------------------------------------------------------------
+
+
+class GnssConfig(Section):
+    """Positions of a GNSS receiver."""
+
+    origin: (
+        tuple[
+            Annotated[float, Field(ge=-90, le=90)],
+            Annotated[float, Field(ge=-360, le=360)],
+            Annotated[float, Field(ge=-1e4, le=1e5)],
+        ]
+        | None
+    ) = Field(None, description="of the map: latitude, longitude [degrees], altitude above the ellipsoid [m]")
+    yaw_rad: float = Field(0.0, ge=-7, le=7, description="of the map's x axis from east, counter-clockwise")
+    antenna: tuple[_Metres, _Metres] | None = Field(
+        None, description="in the base frame: x y [m]; None: by tf and the message's frame_id, else at the base"
+    )
+    sigma_m: float = Field(1.5, ge=1e-3, le=1e3, description="horizontal, where the message gives no covariance")
+    sigma_scale: float = Field(1.0, ge=0.01, le=100, description="true sigma over the message's")
+
+
+def east_north(latitude: float, longitude: float, altitude: float, origin: tuple[float, float, float]) -> FloatArray:
+    """Position ``(2,)`` [m] in the plane that touches the ellipsoid at an origin; degrees and metres."""
+    off = _earth_centered(latitude, longitude, altitude) - _earth_centered(*origin)
+    phi, lam = math.radians(origin[0]), math.radians(origin[1])
+    east = -math.sin(lam) * off[0] + math.cos(lam) * off[1]
+    outward = math.cos(lam) * off[0] + math.sin(lam) * off[1]
+    return np.array([east, -math.sin(phi) * outward + math.cos(phi) * off[2]])
+
+
+def _earth_centered(latitude: float, longitude: float, altitude: float) -> FloatArray:
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    normal = _SEMI_MAJOR_M / math.sqrt(1.0 - _ECCENTRICITY_2 * math.sin(phi) ** 2)
+    across = (normal + altitude) * math.cos(phi)
+    along = (normal * (1.0 - _ECCENTRICITY_2) + altitude) * math.sin(phi)
+    return np.array([across * math.cos(lam), across * math.sin(lam), along])
+
+
+# --- Events -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GnssEvent(SensorEvent):
+    """One position."""
+
+    frame_id: str
+    latitude: float  # degrees
+    longitude: float
+    altitude: float  # m above the ellipsoid; NaN if the receiver gives none
+    cov: FloatArray  # (2, 2) m², east and north; zeros if the message gives none
+    fixed: bool
+
+
+def from_fix(message: Any, when: When) -> SensorEvent:
+    """From `sensor_msgs/NavSatFix`."""
+    cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
+    if message.position_covariance_type == _COVARIANCE_UNKNOWN:
+        cov = np.zeros((2, 2))
+    return GnssEvent(
+        *when,
+        message.header.frame_id,
+        float(message.latitude),
+        float(message.longitude),
+        float(message.altitude),
+        cov,
+        message.status.status != _NO_FIX,
+    )
+
+
+def check(event: GnssEvent, gate: GateConfig) -> GnssEvent | str:
+    """The event, or why it cannot be used."""
+    if not event.fixed:
+        return "no_fix"
+    if not math.isfinite(event.latitude + event.longitude) or not np.isfinite(event.cov).all():
+        return "non_finite"
+    if abs(event.latitude) > 90.0 or abs(event.longitude) > 360.0:
+        return "position_bound"
+    if event.cov.any():
+        if np.linalg.eigvalsh(0.5 * (event.cov + event.cov.T))[0] <= 0.0:
+            return "indefinite_cov"
+        if np.trace(event.cov) > gate.max_variance:
+            return replace(event, cov=np.zeros((2, 2)))
+    return event
+
+
+# --- Measurements -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GnssPosition(PoseMeasurement):
+    """One position as a function of the robot's pose."""
+
+    position: FloatArray  # (2,) of the antenna in the map
+    antenna: FloatArray  # (2,) in the base frame
+
+    def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted minus measured place of the antenna ``(2,)``, and its derivative ``(2, 3)`` by the pose."""
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        R = np.array([[c, -s], [s, c]])
+        ax, ay = self.antenna
+        J = np.column_stack([R, R @ np.array([-ay, ax])])
+        return pose[:2] + R @ self.antenna - self.position, J
+
+    def places(self) -> Iterable[FloatArray]:
+        """There."""
+        return (self.position,)
+
+
+# --- Failure for `fgloc ablate` ---------------------------------------------------------------------------------------
+
+
+class Multipath(EventFailure):
+    """Reflections move positions, each by a draw of its own: in any direction, exponentially far."""
+
+    kind: Literal["gnss_multipath"] = "gnss_multipath"
+    mean_m: float = Field(3.0, gt=0, description="mean distance, exponentially distributed [m]")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Positions."""
+        return (GnssEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Move one."""
+
+        def move(event: Event) -> Event:
+            assert isinstance(event, GnssEvent)
+            distance, direction = scene.rng.exponential(self.mean_m), scene.rng.uniform(-math.pi, math.pi)
+            north = math.degrees(distance * math.sin(direction) / _SEMI_MAJOR_M)
+            meridian = _SEMI_MAJOR_M * math.cos(math.radians(event.latitude))
+            east = math.degrees(distance * math.cos(direction) / max(meridian, 1.0))
+            return replace(event, latitude=event.latitude + north, longitude=event.longitude + east)
+
+        return move
+
+
+# --- The sensor -------------------------------------------------------------------------------------------------------
+
+
+class Gnss:
+    """Positions of a GNSS receiver."""
+
+    name: ClassVar[str] = "gnss"
+    Config: ClassVar[type[Section]] = GnssConfig
+    streams: ClassVar[tuple[Stream, ...]] = (
+        Stream(
+            "gnss", GnssEvent, {"sensor_msgs/msg/NavSatFix": from_fix}, ("fix", "gnss/fix", "gps/fix"), False, check
+        ),
+    )
+    failures: ClassVar[tuple[type[Section], ...]] = (Multipath,)
+
+    def __init__(self, context: Context) -> None:
+        self._config: GnssConfig = context.section
+        self._frame = context.frame
+        self._antennas: dict[str, FloatArray] = {}
+        c, s = math.cos(self._config.yaw_rad), math.sin(self._config.yaw_rad)
+        self._R_map_enu = np.array([[c, s], [-s, c]])
+        self._far = 0
+        self._notes: dict[str, None] = {}  # an ordered set
+
+    @classmethod
+    def build(cls, context: Context) -> Gnss | None:
+        """The sensor of one run; None if no origin is given."""
+        return None if context.section.origin is None else cls(context)
+
+    def measure(self, event: GnssEvent) -> Iterable[PoseMeasurement]:
+        """One position, if it is not far from the origin."""
+        config = self._config
+        assert config.origin is not None
+        altitude = event.altitude if math.isfinite(event.altitude) else config.origin[2]
+        local = east_north(event.latitude, event.longitude, altitude, config.origin)
+        if math.hypot(*local) > _FARTHEST_M:
+            self._far += 1
+            return
+        cov = config.sigma_scale**2 * event.cov if event.cov.any() else np.eye(2) * config.sigma_m**2
+        yield GnssPosition(
+            source="gnss",
+            stamp_ns=event.stamp_ns,
+            cov=self._R_map_enu @ (0.5 * (cov + cov.T)) @ self._R_map_enu.T,
+            position=self._R_map_enu @ local,
+            antenna=self._antenna(event.frame_id),
+        )
+
+    def _antenna(self, frame_id: str) -> FloatArray:
+        if self._config.antenna is not None:
+            return np.array(self._config.antenna)
+        if frame_id not in self._antennas:
+            T = self._frame(frame_id)
+            if T is None:
+                self._notes.setdefault(
+                    f"No transform to the GNSS antenna's frame {frame_id!r}: taken to be at the base; set gnss.antenna."
+                )
+            self._antennas[frame_id] = np.zeros(2) if T is None else T[:2, 3]
+        return self._antennas[frame_id]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is missing or out of reach."""
+        far = (
+            f"{self._far} GNSS position(s) lie more than {_FARTHEST_M / 1e3:g} km from gnss.origin and are not used; "
+            "correct it."
+        )
+        return (*self._notes, *((far,) if self._far else ()))

@@ -1,0 +1,214 @@
+"""A sensor from outside in one file: ultra-wideband ranges from a tag on the robot to anchors at known places.
+
+A reading is a `sensor_msgs/Range` whose ``frame_id`` ends in the anchor's number ("anchor_3"). A driver with a message
+of its own needs one more converter. The settings::
+
+    uwb:
+      anchors: {1: [0.0, 0.0, 2.1], 2: [6.0, 0.0, 2.1], 3: [6.0, 5.0, 2.3]}
+      tag: [0.0, 0.0, 0.3]
+
+Where something stands between anchor and tag, the pulse arrives late and the range is too long, by decimeters to
+meters. Such a range is told by the chi-square gate, against the prediction. With ``non_line_of_sight: mixture`` it is
+then taken as what it says at least: too long by ``nlos_bias_m``, give or take ``nlos_sigma_m``. With ``reject`` it is
+dropped.
+
+Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from fgloc.ablation.failures.base import Change, EventFailure, Scene
+from fgloc.config import GateConfig, Section
+from fgloc.errors import ConfigError
+from fgloc.sensors.base import Context, Stream, When
+from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
+
+_NUMBER = re.compile(r"(\d+)$")
+_LEAST_ANCHORS = 3  # that tell a place in the plane
+_AROUND = np.linspace(-math.pi, math.pi, 12, endpoint=False)  # of an anchor: where the search for the first pose begins
+_Metres = Annotated[float, Field(ge=-1e5, le=1e5)]
+
+
+# --- Settings ---------------------------------------------------------------------------------------------------------
+
+
+class UwbConfig(Section):
+    """Ultra-wideband ranges to anchors."""
+
+    anchors: dict[int, tuple[_Metres, _Metres, _Metres]] = Field(
+        {}, max_length=1000, description="place of each anchor by its number: x y z [m] in the map"
+    )
+    tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
+    sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
+    bias_m: float = Field(0.0, ge=-10, le=10, description="subtracted from every range: the delay of the antennas")
+    non_line_of_sight: Literal["mixture", "reject"] = Field(
+        "mixture", description="what becomes of a range that the gate refuses because it is too long"
+    )
+    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="mixture: by how much such a range is too long ...")
+    nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... give or take; holds for one stretch of them")
+
+
+# --- Events -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UwbEvent(SensorEvent):
+    """Distance of the tag from one anchor."""
+
+    anchor: int
+    range_m: float
+
+
+def from_range(message: Any, when: When) -> SensorEvent:
+    """From `sensor_msgs/Range`."""
+    number = _NUMBER.search(message.header.frame_id.strip())
+    if number is None:
+        raise ValueError(f"frame_id {message.header.frame_id!r} does not end in an anchor's number")
+    return UwbEvent(*when, int(number.group(1)), float(message.range))
+
+
+def check(event: UwbEvent, gate: GateConfig) -> UwbEvent | str:
+    """The event, or why it cannot be used."""
+    if not math.isfinite(event.range_m):
+        return "non_finite"
+    return event if gate.min_range <= event.range_m <= gate.max_range else "range_bound"
+
+
+# --- Measurements -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class UwbRange(PoseMeasurement):
+    """One range as a function of the robot's pose."""
+
+    range_m: float
+    anchor: FloatArray  # (3,) in the map
+    tag: FloatArray  # (3,) in the base frame
+    behind_obstacle: PoseMeasurement | None = None  # the same range, if it is too long
+
+    def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted minus measured range ``(1,)``, and its derivative ``(1, 3)`` by the pose."""
+        x, y, yaw = pose
+        c, s = math.cos(yaw), math.sin(yaw)
+        tag_x, tag_y, tag_z = self.tag
+        dx = x + c * tag_x - s * tag_y - self.anchor[0]
+        dy = y + s * tag_x + c * tag_y - self.anchor[1]
+        distance = max(math.hypot(dx, dy, tag_z - self.anchor[2]), 1e-6)
+        forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance  # unit vector in the base's axes
+        J = np.array([[forward, left, left * tag_x - forward * tag_y]])
+        return np.array([distance - self.range_m]), J
+
+    def places(self) -> Iterable[FloatArray]:
+        """On the circle about the anchor."""
+        height = self.anchor[2] - self.tag[2]
+        radius = math.sqrt(max(self.range_m**2 - height**2, 0.0))
+        return (self.anchor[:2] + radius * np.array([math.cos(a), math.sin(a)]) for a in _AROUND)
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[PoseMeasurement]:
+        """That something stands between, which never makes a range too short."""
+        too_long = self.residual_at_keyframe(predicted)[0][0] < 0.0
+        return (self.behind_obstacle,) if too_long and self.behind_obstacle is not None else ()
+
+
+# --- Failure for `fgloc ablate` ---------------------------------------------------------------------------------------
+
+
+class NonLineOfSight(EventFailure):
+    """Ranges are too long, each by a draw of its own, exponentially distributed."""
+
+    kind: Literal["uwb_non_line_of_sight"] = "uwb_non_line_of_sight"
+    mean_m: float = Field(1.0, gt=0, description="mean excess of a range [m]")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Ranges."""
+        return (UwbEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Lengthen one."""
+
+        def lengthen(event: Event) -> Event:
+            assert isinstance(event, UwbEvent)
+            return replace(event, range_m=event.range_m + scene.rng.exponential(self.mean_m))
+
+        return lengthen
+
+
+# --- The sensor -------------------------------------------------------------------------------------------------------
+
+
+class Uwb:
+    """Ultra-wideband ranges to anchors."""
+
+    name: ClassVar[str] = "uwb"
+    Config: ClassVar[type[Section]] = UwbConfig
+    streams: ClassVar[tuple[Stream, ...]] = (
+        Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),
+    )
+    failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
+
+    def __init__(self, config: UwbConfig) -> None:
+        self._config = config
+        self._anchors: Mapping[int, FloatArray] = {i: np.array(place) for i, place in config.anchors.items()}
+        self._tag = np.array(config.tag)
+        self._unknown: set[int] = set()
+
+    @classmethod
+    def build(cls, context: Context) -> Uwb | None:
+        """The sensor of one run; None if no anchors are given.
+
+        Raises:
+            ConfigError: fewer anchors than tell a place.
+        """
+        config = context.section
+        if not config.anchors:
+            return None
+        if len(config.anchors) < _LEAST_ANCHORS and context.landmark_map is None:
+            raise ConfigError(
+                f"uwb.anchors has {len(config.anchors)} anchor(s), expected at least {_LEAST_ANCHORS} where no map "
+                "says where the robot is; give all that are installed"
+            )
+        return cls(config)
+
+    def measure(self, event: UwbEvent) -> Iterable[PoseMeasurement]:
+        """One range, if its anchor is known."""
+        anchor = self._anchors.get(event.anchor)
+        if anchor is None:
+            if len(self._unknown) < 100:
+                self._unknown.add(event.anchor)
+            return
+        config = self._config
+        line_of_sight = UwbRange(
+            source="uwb",
+            stamp_ns=event.stamp_ns,
+            cov=np.array([[config.sigma_m**2]]),
+            target=event.anchor,
+            range_m=event.range_m - config.bias_m,
+            anchor=anchor,
+            tag=self._tag,
+        )
+        yield (
+            line_of_sight
+            if config.non_line_of_sight == "reject"
+            else replace(line_of_sight, behind_obstacle=self._too_long(line_of_sight))
+        )
+
+    def _too_long(self, m: UwbRange) -> UwbRange:
+        sigma = self._config.nlos_sigma_m
+        return replace(m, source="uwb_nlos", range_m=m.range_m - self._config.nlos_bias_m, cov=np.array([[sigma**2]]))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which anchors are not in the settings."""
+        if not self._unknown:
+            return ()
+        numbers = ", ".join(map(str, sorted(self._unknown)[:12]))
+        return (f"Ranges to anchors that uwb.anchors does not have are not used: {numbers}.",)
