@@ -30,7 +30,7 @@ from fgloc.types import CommandEvent, Event, OdometryEvent, TruthEvent
 
 _ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODELS = _ROOT / "fgloc" / "motion" / "models" / "mrclam"
+_MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
 _LENGTH_S = 200.0
 _SLIPS = [(40.0, 46.0), (80.0, 86.0), (120.0, 126.0), (160.0, 166.0)]
 _DARK = (60.0, 120.0)

@@ -20,7 +20,7 @@ from benchmarks.mechanisms_switch import (
 
 _GATE = "fgloc.robust.association"
 _POSE_FIT = "fgloc.relocalization.pose_fit"
-_VOTES = "fgloc.robust.moved_landmark_votes:LandmarkExclusion"
+_MODES = "fgloc.robust.landmark_modes:LandmarkModes"
 _NO_KERNEL = 1e6  # sigmas
 
 
@@ -119,26 +119,11 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
 
 OF_LANDMARKS: tuple[Mechanism, ...] = (
     Mechanism(
-        "moved_votes",
-        "A landmark whose refused sightings agree on another place is named as moved and left out.",
-        ("robust/moved_landmark_votes.py",),
-        (Switch(f"{_VOTES}.reject", Returns(None)),),
-        Probe(f"{_VOTES}.reject", lambda _, before, quarantine, *args: bool(quarantine.displacements)),
+        "landmark_modes",
+        "A landmark whose displacement explains what is seen much better is named as moved and left out.",
+        ("robust/landmark_modes.py",),
+        (Switch(f"{_MODES}.observe", Returns(None)),),
+        Probe(f"{_MODES}.observe", not_none),
         batch=True,
-    ),
-    Mechanism(
-        "votes_misread_test",
-        "Refused sightings that may be misread sightings of what stands there do not count as a move.",
-        ("robust/moved_landmark_votes.py",),
-        (Switch(f"{_VOTES}._misread", Returns(False)),),
-        Probe(f"{_VOTES}._misread", something),
-        batch=True,
-    ),
-    Mechanism(
-        "moved_beacons",
-        "GLR over one filter for each beacon: names beacons that moved by less than the gate sees.",
-        ("robust/moved_landmark_glr.py", "robust/landmark_faults.py"),
-        (Switch("fgloc.robust.landmark_faults:LandmarkFaultMonitor.observe", Returns([])),),
-        Probe("fgloc.robust.landmark_faults:LandmarkFaultMonitor.observe", something),
     ),
 )

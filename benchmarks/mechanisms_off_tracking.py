@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from benchmarks.mechanisms_switch import (
@@ -22,10 +21,6 @@ _SEARCH = "fgloc.relocalization.global_search"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
-
-
-def _without_contrary(real: Function) -> Function:
-    return lambda self, started: real(self, replace(started, outliers=frozenset()))
 
 
 def _at_prediction(real: Function) -> Function:
@@ -79,14 +74,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         ("relocalization/gaussian_sum.py",),
         (Switch(f"{_WHERE}.unconfirmed", Returns(None)),),
         Probe(f"{_WHERE}.unconfirmed", not_none),
-    ),
-    Mechanism(
-        "start_contrary",
-        "Sightings that contradict the place where the run starts are refused in the replay from there.",
-        ("localizer.py", "relocalization/global_search.py"),
-        (Switch("fgloc.localizer:Localizer._replay", _without_contrary),),
-        Probe("fgloc.localizer:Localizer._replay", lambda _, before, self, started: started.outliers),
-        batch=True,
     ),
     Mechanism(
         "start_leave_one_out",

@@ -376,7 +376,10 @@ class WeightsConfig(Section):
     )
     release_s: float = Field(0.6, gt=0, le=1e4, description="agreement for this long ends it")
     quarantine_after: int = Field(
-        6, gt=0, le=1_000_000, description="refusals in excess of what is believed that quarantine a marker"
+        6,
+        gt=0,
+        le=1_000_000,
+        description="sightings that a displacement has to explain before a landmark is left out as moved",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -29,7 +30,7 @@ from fgloc.robust.decision_log import (
     place_decision,
     segment_decision,
 )
-from fgloc.robust.landmark_faults import LandmarkFaultMonitor
+from fgloc.robust.landmark_modes import ALARM
 from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
@@ -111,7 +112,6 @@ class Localizer:
         self.motion_faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
         self._lift = LiftMonitor()
         self._compensation = MotionCompensation(landmarks, wheels, gyro, config.camera.time_jitter_s, sensors)
-        self._landmark_faults = LandmarkFaultMonitor(config, landmark_map, self.estimator, self.association)
         self._tracking = Tracking(config, landmark_map, self.factors, keep_all)
         self._keep_all = keep_all
         self._segment = -1
@@ -195,7 +195,6 @@ class Localizer:
     def _replay(self, started: InitialPose) -> list[Estimate]:
         """Run the collected steps through the estimator."""
         first, *rest = started.steps
-        self.association.outliers = started.outliers
         self._lift.reset()  # these steps are earlier ones
         self.sources.begin_segment()
         estimates = [self._start(first.step, started.first, first.sightings)]
@@ -232,8 +231,9 @@ class Localizer:
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         k = self.estimator.k + 1
         believed, _, decisions = self._associate(k, step, sightings, prior)
-        self._landmark_faults.start(prior, believed)
         belief = self.estimator.start(step.stamp_ns, prior, believed)
+        self.association.modes.restart()
+        self.association.modes.observe((), prior, belief, believed)
         self.counts["prior"] += 1
         self._count_landmarks(decisions)
         self._tracking.record_fix(bool(believed))
@@ -258,7 +258,7 @@ class Localizer:
             place = None
             if not believed:
                 outliers = [
-                    s.measurement for s in refused if not self.association.exclusion.excludes(s.measurement.landmark_id)
+                    s.measurement for s in refused if not self.association.modes.excludes(s.measurement.landmark_id)
                 ]
                 place = self._tracking.search(step, motions, outliers, readings, predicted)
             if place is not None:
@@ -286,7 +286,6 @@ class Localizer:
             self.rejections["estimator.window_rebuilt"] += 1
             believed = []
             weighed = [dataclasses.replace(d, weight=0.0, reason=d.reason or "window_rebuilt") for d in weighed]
-        accused = self._landmark_faults.observe(k, step.stamp_ns, motions, believed, kept)
         self.counts.update(m.source for m in motions)
         self._count_landmarks(weighed)
         if believed:
@@ -295,14 +294,12 @@ class Localizer:
         fix = belief if believed else None
         tells_yaw = any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.tells_yaw for s in believed)
         self.sources.commit(readings, fix, tells_yaw)
-        if accused:  # the pose was corrected: no motion leads from where it was thought to be
-            self.sources.begin_segment()
-            self.motion_faults.reset()
+        moved = self._judge_landmarks(step, motions, predicted, believed, kept)
         frame = self.estimator.log.keyframes[k]
         off = dict.fromkeys(("wheels", "learned"), "carried") if carried else trust.off
         frame.readings, frame.off, frame.scale, frame.extra_cov = readings, off, trust.scale, extra_cov
         decisions += motion_decisions(k, motions, readings, trust.off, OVERRULED if fit is not None else "", trust)
-        return self._estimate(step, frame.belief, [*decisions, *weighed, *accused])
+        return self._estimate(step, frame.belief, [*decisions, *weighed, *moved])
 
     def _motions(self, step: Step, readings: MotionReadings, trust: FaultVerdict) -> list[MotionMeasurement]:
         """Factors of the step: of the sources, or of a robot that is carried, or of one whose motion nothing tells."""
@@ -319,8 +316,29 @@ class Localizer:
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self.rejections["sightings.contradict_initial_pose"] += held
         if self._tracking.keeps_initial_pose:
-            self.association.exclusion.forget()  # they all seem moved from there
+            self.association.modes.forget()  # they all seem moved from there
         return believed, refused, decisions
+
+    def _judge_landmarks(
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        predicted: PoseWithCovariance,
+        fused: Sequence[LandmarkFactor],
+        refused: Sequence[LandmarkFactor],
+    ) -> list[Decision]:
+        """Leave out a landmark that was moved; take back what it did to the pose."""
+        modes, belief = self.association.modes, self.estimator.log.keyframes[self.estimator.k].belief
+        moved = modes.observe(motions, predicted, belief, fused, refused)
+        if moved is None:
+            return []
+        without, evidence = modes.exclude(moved, belief)
+        if without is not belief:
+            self.estimator.correct(without, moved)
+            self.sources.begin_segment()  # no motion leads from where it was thought to be
+            self.motion_faults.reset()
+        nis, k = evidence, self.estimator.k
+        return [Decision(k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", ALARM)]
 
     def _revise(self, k: int, trust: FaultVerdict) -> list[Decision]:
         """Weigh the motion of the steps before this one anew, back to where the disagreement began.
@@ -357,7 +375,7 @@ class Localizer:
         return dataclasses.replace(estimate, decisions=(*decisions, *estimate.decisions))
 
     def _get_lost(self) -> None:
-        self.association.exclusion.forget()
+        self.association.modes.forget()
         self._tracking.get_lost()
 
     def _estimate(self, step: Step, belief: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
@@ -385,7 +403,7 @@ class Localizer:
         """What the user should know so far, one sentence each."""
         return (
             *self._tracking.notes,
-            *moved_notes(self.association.exclusion.displacements),
+            *moved_notes(self.association.modes.displacements),
             *flag_notes(self.motion_faults.flags),
         )
 

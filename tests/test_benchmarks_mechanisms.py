@@ -111,12 +111,12 @@ def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():
     world = moved_world()
     with watched(MECHANISMS) as counts:
         assert "gate" in refusals(world)
-    assert counts["moved_votes"] > 0
+    assert counts["landmark_modes"] > 0
     assert counts["misread_ids"] == 0
     with BY_NAME["gate"].off():
         assert "gate" not in refusals(world)
-    with BY_NAME["moved_votes"].off():
-        assert set(refusals(world)) == {"gate", "contradicts_start"}
+    with BY_NAME["landmark_modes"].off():
+        assert set(refusals(world)) == {"gate", "contradicts_others"}
 
 
 def test_what_is_returned_may_be_changed_by_the_caller():

@@ -407,7 +407,7 @@ def test_a_marker_that_hangs_elsewhere_by_centimetres_is_found():
     for name, truth in (("map.7.x_m", 0.012), ("map.7.y_m", -0.01)):
         pairs, prior, chain, _ = found_in(world, settings, name, gyro=False)
         check_found(pairs, truth, prior)
-    assert not chain.localizer.association.exclusion.displacements
+    assert not chain.localizer.association.modes.displacements
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -251,13 +251,13 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     moved = dict(room().landmarks)
     moved[2] = shift(moved[2], 0.0, 0.4)
     world, chain, estimates = drive("corners", exact(), seconds=40.0, shown=LandmarkMap(moved))
-    refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.landmark_id >= 0]
+    refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.kind == "corners"]
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
     counts = chain.localizer.association.rejections
-    assert sum(counts[f"sightings.{why}"] for why in ("gate", "quarantined", "contradicts_start")) == len(refused)
+    assert sum(counts[f"sightings.{why}"] for why in ("gate", "contradicts_others", "quarantined")) == len(refused)
     assert counts["sightings.quarantined"] > 40
-    moved_by = chain.localizer.association.exclusion.displacements
+    moved_by = chain.localizer.association.modes.displacements
     assert list(moved_by) == [2]
     assert np.allclose(moved_by[2], (0.0, 0.4), atol=0.05)
     assert any("marker 2 does not stand where" in note for note in chain.localizer.notes)

@@ -27,7 +27,6 @@ Kind = Literal[
     "motion_overruled",
     "outage",
     "motion_faulty",
-    "start_outlier",
     "misread",
     "solver",
     "rejected",
@@ -48,7 +47,6 @@ _TITLES: Mapping[str, str] = {
     "motion_overruled": "motion contradicted by sightings",
     "outage": "no accepted sightings: dead reckoning",
     "motion_faulty": "faulty",
-    "start_outlier": "sightings contradict the first pose",
     "misread": "markers misread",
     "solver": "solver failed, window rebuilt",
     "rejected": "sightings rejected",
@@ -58,7 +56,6 @@ _OF_SIGHTINGS: Mapping[str, Kind] = {
     "gate": "rejected",
     "behind_camera": "rejected",
     "contradicts_others": "rejected",
-    "contradicts_start": "start_outlier",
     "contradicts initial_pose": "initial_pose_contradicted",
     "misread": "misread",
     "quarantined": "landmark_moved",
@@ -73,7 +70,7 @@ _OF_PLACES: Mapping[str, Kind] = {
 _OF_MODES: Mapping[str, Kind] = {"dead_reckoning": "outage", "lost": "lost", "unconfirmed": "unconfirmed"}
 _MOTIONS = ("wheels", "learned", "gyro")
 _JOIN_NS = 1_000_000_000  # rows of one kind and subject further apart than this are two episodes ...
-_LASTING = ("landmark_moved", "misread", "start_outlier", "initial_pose_contradicted")  # ... but for these
+_LASTING = ("landmark_moved", "misread", "initial_pose_contradicted")  # ... but for these
 _FEW = 2  # sightings rejected: as few of a landmark in a row are outliers, and all outliers one judgement
 _NAMED = 6  # landmarks in one judgement
 
@@ -236,7 +233,7 @@ def _reasons(kind: Kind, rows: Sequence[Decision]) -> str:
     """The most frequent reason, of a fault of motion; the landmarks, where there may be several."""
     if kind == "motion_faulty":
         return f": {Counter(d.reason for d in rows).most_common(1)[0][0].replace('_', ' ')}"
-    if kind in ("misread", "outlier", "start_outlier"):
+    if kind in ("misread", "outlier"):
         ids = sorted({d.landmark_id for d in rows})
         more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
         return f" (landmarks {', '.join(map(str, ids[:_NAMED]))}{more})"

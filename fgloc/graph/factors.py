@@ -177,6 +177,11 @@ class LandmarkFactors:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None
 
+    @property
+    def landmarks(self) -> Mapping[int, Landmark]:
+        """Of the known map, by id; none of an unknown one."""
+        return self._known or {}
+
     def sighting(
         self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, alone: LandmarkMeasurement | None = None
     ) -> LandmarkFactor:
@@ -218,20 +223,6 @@ class LandmarkFactors:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""
         cov = one.noise() + one.H @ self.believed.cov[np.ix_(one.columns, one.columns)] @ one.H.T
         return sighting_whitening(cov)
-
-    def near(self, landmark_id: int, displacement: FloatArray, within_m: float) -> list[int]:
-        """Other known landmarks this near to where one would stand if it were displaced so ``(2,)`` in the map."""
-        known = self._known or {}
-        place = known[landmark_id].position[:2] + displacement
-        near = (i for i, other in known.items() if math.hypot(*(other.position[:2] - place)) <= within_m)
-        return [i for i in near if i != landmark_id]
-
-    def distance(self, landmark_id: int, pose: FloatArray) -> float:
-        """How far [m] a known landmark is from the base at this pose, in the plane."""
-        if self._known is None:
-            raise EstimatorError("the distance of a landmark needs a known map")
-        x, y = self._known[landmark_id].position[:2] - pose[:2]
-        return math.hypot(x, y)
 
     def depth(self, m: CornerMeasurement, pose: FloatArray) -> float:
         """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""

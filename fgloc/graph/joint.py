@@ -55,6 +55,16 @@ def fuse_installed(
     return se2.compose(first.motion, se2.exp(pull)), cov, depends
 
 
+def transition(motions: Sequence[MotionMeasurement], installation: Installation) -> tuple[FloatArray, FloatArray]:
+    """Derivatives ``(3, 3)`` and ``(3, n)`` of the pose after these motions by the pose before and the installation."""
+    motion, _, depends = fuse_installed(motions)
+    D = np.zeros((3, len(installation)))
+    for name, (derivative, _) in depends.items():
+        if name in installation.index:
+            D[:, installation.index[name]] = derivative
+    return se2.adjoint(se2.inverse(motion)), D
+
+
 def predict(
     belief: PoseWithCovariance,
     known: InstallationBelief,

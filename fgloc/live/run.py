@@ -167,7 +167,7 @@ class OnlineRun:
         if gyro is not None and state.gyro is not None:
             gyro.resume(state.gyro.bias, state.gyro.bias_variance)
         for landmark_id, displacement in state.excluded.items():
-            localizer.association.exclusion.exclude(landmark_id, np.array(displacement))
+            localizer.association.modes.displacements[landmark_id] = np.array(displacement)
         self._fastest = state.fastest
 
     def snapshot(self) -> RunState | None:
@@ -182,7 +182,7 @@ class OnlineRun:
             max(self._fastest[1], abs(float(twist[2]))),
         )
         installed = localizer.estimator.installed
-        moved = localizer.association.exclusion.displacements
+        moved = localizer.association.modes.displacements
         return RunState(
             map_fingerprint=self._fingerprint,
             saved_ns=time.time_ns(),

@@ -15,7 +15,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import GaussianSum
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, SightingKey, apart
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -73,14 +73,12 @@ class InitialPose:
         steps: what was collected, oldest first; the first one's motions are to be ignored.
         first: weak prior for the oldest step, to be followed by all its sightings.
         newest: pose at the newest step with the covariance that the sightings give.
-        outliers: sightings that contradict the place, by stamp and landmark: the weak prior could not refuse them.
         by_sensors: told by registered sensors alone.
     """
 
     steps: tuple[SearchStep, ...]
     first: PoseWithCovariance
     newest: PoseWithCovariance
-    outliers: frozenset[SightingKey]
     by_sensors: bool = False
 
 
@@ -158,7 +156,7 @@ class GlobalSearch:
         best = self._solve(known) if sightings and self._due(step.stamp_ns) else None
         if best is None:
             return None
-        start = self._start(PoseWithCovariance(best.fit.pose, best.fit.cov), best.outliers)
+        start = self._start(PoseWithCovariance(best.fit.pose, best.fit.cov))
         return dataclasses.replace(start, by_sensors=best.by_sensors)
 
     def _due(self, stamp_ns: int) -> bool:
@@ -179,16 +177,16 @@ class GlobalSearch:
             return None
         likeliest = self.hypotheses.likeliest()
         if likeliest is not None:
-            return self._start(likeliest, frozenset())
+            return self._start(likeliest)
         origin = PoseWithCovariance(np.zeros(3), ORIGIN.copy())
-        return dataclasses.replace(self._start(origin, frozenset()), first=origin)
+        return dataclasses.replace(self._start(origin), first=origin)
 
-    def _start(self, newest: PoseWithCovariance, outliers: frozenset[SightingKey]) -> InitialPose:
+    def _start(self, newest: PoseWithCovariance) -> InitialPose:
         self.waiting = False
         steps = (*self._earlier, *self._steps)
         first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
         self.forget()
-        return InitialPose(steps, first, newest, outliers)
+        return InitialPose(steps, first, newest)
 
     def _solve(self, known: bool) -> PoseConsensus | None:
         here = _spread(list(self._carried()), _MAX_FITTED)

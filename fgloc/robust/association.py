@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
-from fgloc.robust.moved_landmark_votes import LandmarkExclusion
+from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
@@ -23,7 +23,6 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-_STILL_RIGHT_NS = 1_000_000_000  # after something was believed, a prediction can be held against other sightings
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
@@ -33,7 +32,6 @@ class Association:
 
     Attributes:
         rejections: refused sightings by reason.
-        contrary: sightings, by stamp and landmark, that contradict the place where the run starts: not to be believed.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
@@ -42,11 +40,9 @@ class Association:
         self._last_used_ns: dict[int, int] = {}
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
-        self.outliers: frozenset[tuple[int, int]] = frozenset()
         self._contradicting: set[int] = set()
-        self._accepted_ns = 0  # the newest keyframe at which something was believed
         self._sensors = SensorMeasurements(config, factors)
-        self.exclusion = LandmarkExclusion(config.weights.quarantine_after)
+        self.modes = LandmarkModes(config, factors)
 
     def judge(
         self,
@@ -62,17 +58,12 @@ class Association:
         because after dead reckoning the linear one is far too large.
         """
         accepted, rejected, decisions = [], [], []
-        fitting, gated = [], []
         judged = self._judge(measurements, predicted)
         measurements, judged = self._sensors.revise(measurements, judged, predicted, self._judge)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
-            if not gate:
-                fitting.append(sighting)
-            elif gate == "gate":
-                gated.append(sighting)
-            reason = self._excluded(m) or gate
+            reason = "quarantined" if self.modes.excludes(m.landmark_id) else gate
             if reason:
                 rejected.append(sighting)
                 self.rejections[f"{source_of(m)}.{reason}"] += 1
@@ -84,16 +75,11 @@ class Association:
                 Decision(k, stamp_ns, kind_of(m), row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
         if accepted:
-            self._accepted_ns = stamp_ns
             self._contradicting.clear()
             for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, predicted):
-                gated = [s for s in gated if s is not misread]
                 rejected.remove(misread)
                 accepted.append(sighting)
-                fitting.append(sighting)
                 decisions.append(decision)
-        if stamp_ns - self._accepted_ns < _STILL_RIGHT_NS:
-            self._compare(k, fitting, gated, predicted)
         if not accepted:
             self._contradicting.update(
                 s.measurement.landmark_id
@@ -101,12 +87,6 @@ class Association:
                 if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
             )
         return accepted, rejected, decisions
-
-    def _excluded(self, m: LandmarkMeasurement) -> str:
-        """Why a sighting is rejected whatever its residual; empty if it is not."""
-        if self.exclusion.excludes(m.landmark_id):
-            return "quarantined"
-        return "contradicts_start" if (m.stamp_ns, m.landmark_id) in self.outliers else ""
 
     def _reassociate(
         self,
@@ -132,7 +112,7 @@ class Association:
                 continue
             fits = []
             for other in self._factors.lookalikes(m, predicted.pose):
-                if other in seen or self.exclusion.excludes(other):
+                if other in seen or self.modes.excludes(other):
                     continue
                 again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
@@ -157,20 +137,6 @@ class Association:
             )
         self.rejections += Counter()  # drops the zeros
         return found
-
-    def _compare(
-        self, k: int, fitting: Sequence[LandmarkFactor], gated: Sequence[LandmarkFactor], predicted: PoseWithCovariance
-    ) -> None:
-        """Others were believed, now or just before: what disagrees beside them may have been moved.
-
-        Without them, in the dark say, the prediction is too little known to be held against a landmark.
-        """
-        if not self._config.weights.adaptive or not self._factors.known:
-            return
-        for sighting in fitting:
-            self.exclusion.accept(sighting.measurement.landmark_id)
-        of_landmarks = [s for s in gated if not isinstance(s.measurement, PoseMeasurement)]
-        self.exclusion.reject(of_landmarks, k, predicted.pose, self._factors)
 
     def nearby_consensus(
         self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance

@@ -1,0 +1,296 @@
+"""Landmark modes: in place, moved by δ, or misread. Finds the landmarks that do not stand where the map has them.
+
+If landmark i is displaced by δ, the estimator, which takes it to be in place, errs by ``M δ``; M follows from the
+estimator's own gains. The innovations of all sightings then have a mean linear in δ, and a filter of δ alone, one per
+landmark, tells how much likelier they are than if everything were in place. A sighting that neither of the two explains
+is misread: it costs as much as the gate's quantile, whatever it is.
+
+Sources: Friedland 1969, "Treatment of bias in recursive filtering" (M); Willsky and Jones 1976, "A generalized
+likelihood ratio approach to the detection and estimation of jumps in linear systems" (with a prior on the jump).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.joint import innovation, joint_cov, transition
+from fgloc.graph.linearized import Linearized
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.noise_models import sighting_whitening
+from fgloc.graph.observation import Observations
+from fgloc.stats import chi2_bound
+from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement, PoseMeasurement
+
+_MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
+ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
+_MARGIN = 7.0  # ... and to another landmark's displacement as the cause of the same sightings
+_LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
+_MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
+_PROVEN = 2  # other landmarks that have to be in place
+_STILL_RIGHT_NS = 1_000_000_000  # after a sighting was fused, the prediction can be held against other sightings
+_ITERATIONS = 4
+_MOST = 100  # hypotheses: those of the landmarks seen last
+
+Explained = tuple[FloatArray, FloatArray, FloatArray]
+"""Of each hypothesis: minus twice the log-likelihood ``(L,)``, mean ``(L, 2)`` and covariance ``(L, 2, 2)`` of δ."""
+
+
+class LandmarkModes:
+    """The hypotheses "moved" beside an estimator that takes all landmarks to be in place.
+
+    Attributes:
+        displacements: of the landmarks that were found to be moved ``(2,)`` [m] in the map.
+    """
+
+    def __init__(self, config: Config, factors: LandmarkFactors) -> None:
+        self._factors, self._gate = factors, config.estimator.gate_probability
+        self._least, self._repeat_s = config.weights.quarantine_after, config.landmarks.repeat_s
+        n = min(len(factors.landmarks), _MOST) if config.weights.adaptive else 0
+        self._rows: dict[int, int] = {}  # of landmarks, the one seen last last
+        self._ids, self._places = np.zeros(n, dtype=np.int64), np.full((n, 2), np.inf)
+        self._M = np.zeros((n, 3 + len(factors.installation), 2))
+        self._moved, self._cov = np.zeros((n, 2)), np.zeros((n, 2, 2))  # δ
+        self._evidence = np.zeros((n, n))  # for each hypothesis, by the landmark whose sightings say so
+        self._seen, self._explained = np.zeros((n, n)), np.zeros(n)  # sightings of each; those of itself that fit δ
+        self._last_ns: dict[int, int] = {}
+        self.displacements: dict[int, FloatArray] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """The pose was set anew, and proves nothing yet."""
+        self._reset(np.ones(len(self._ids), dtype=np.bool_))
+        self._in_place: set[int] = set()
+        self._fused_ns = 0
+
+    def forget(self) -> None:
+        """All that was found was found from a wrong pose."""
+        self.displacements.clear()
+        self.restart()
+
+    def excludes(self, landmark_id: int) -> bool:
+        """Whether sightings of this landmark are not to be used."""
+        return landmark_id in self.displacements
+
+    def sensitivity(self, landmark_id: int) -> FloatArray:
+        """Derivative ``(3 + n, 2)`` of the error of pose and installation by a landmark's displacement."""
+        return np.asarray(self._M[self._rows[landmark_id]])
+
+    def observe(
+        self,
+        motions: Sequence[MotionMeasurement],
+        predicted: PoseWithCovariance,
+        belief: PoseWithCovariance,
+        fused: Sequence[LandmarkFactor],
+        refused: Sequence[LandmarkFactor] = (),
+    ) -> int | None:
+        """Follow the estimator through one keyframe.
+
+        Args:
+            motions: that led to it; none at the first one.
+            predicted: before its sightings.
+            belief: after them.
+            fused: sightings that it took.
+            refused: sightings that it did not take.
+
+        Returns:
+            A landmark that is now known to be moved.
+        """
+        if not len(self._ids):
+            return None
+        seen = [s for s in fused if not isinstance(s.alone, PoseMeasurement)]
+        against = [s for s in refused if not isinstance(s.alone, PoseMeasurement)]
+        for s in (*seen, *against):
+            self._follow(s.alone.landmark_id)
+        if motions:
+            A, D = transition(motions, self._factors.installation)
+            self._M[:, :3] = A @ self._M[:, :3] + D @ self._M[:, 3:]
+        if fused:
+            self._take(predicted, belief, [s.measurement for s in fused])
+            self._in_place.update(s.alone.landmark_id for s in seen)
+            self._fused_ns = fused[0].measurement.stamp_ns
+        P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
+        for m in (s.alone for s in against):
+            if m.stamp_ns - self._fused_ns < _STILL_RIGHT_NS and not self.excludes(m.landmark_id):
+                self._contradicted(P, belief, m)
+        self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*seen, *against)})
+        self._reset(self._evidence.sum(1) < -0.5 * ALARM)  # it was in place; it may be moved from now on
+        return self._certain() if seen or against else None
+
+    def exclude(self, landmark_id: int, belief: PoseWithCovariance) -> tuple[PoseWithCovariance, float]:
+        """Leave a moved landmark out from now on.
+
+        Returns:
+            Pose and installation without what its sightings did to them (the belief itself if none were fused), and the
+            evidence.
+        """
+        row, known = self._rows[landmark_id], self._known(belief)
+        evidence, M = float(self._evidence[row].sum()), self._M[row]
+        self.displacements[landmark_id] = self._moved[row].copy()
+        off, P = M @ self._moved[row], joint_cov(belief, known) + M @ self._cov[row] @ M.T
+        self._reset(np.ones(len(self._ids), dtype=np.bool_))
+        if not off.any():
+            return belief, evidence
+        pose = se2.compose(belief.pose, se2.exp(off[:3]))
+        installation = InstallationBelief(known.mean + off[3:], P[3:, 3:])
+        return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation), evidence
+
+    def _follow(self, landmark_id: int) -> None:
+        """Have a hypothesis of this landmark, instead of that of the one not seen for longest if there are too many."""
+        row = self._rows.pop(landmark_id, None)
+        if row is None:
+            row = len(self._rows) if len(self._rows) < len(self._ids) else self._rows.pop(next(iter(self._rows)))
+            self._ids[row], self._places[row] = landmark_id, self._factors.landmarks[landmark_id].position[:2]
+            self._reset(np.arange(len(self._ids)) == row)
+            self._evidence[:, row] = self._seen[:, row] = 0.0
+        self._rows[landmark_id] = row
+
+    def _known(self, belief: PoseWithCovariance) -> InstallationBelief:
+        return belief.installation or self._factors.believed
+
+    def _reset(self, rows: NDArray[np.bool_]) -> None:
+        self._M[rows], self._moved[rows], self._cov[rows] = 0.0, 0.0, _MOVED_M**2 * np.eye(2)
+        self._evidence[rows], self._seen[rows], self._explained[rows] = 0.0, 0.0, 0.0
+
+    def _take(
+        self, predicted: PoseWithCovariance, belief: PoseWithCovariance, seen: Sequence[LandmarkMeasurement]
+    ) -> None:
+        """Sightings that were fused: what they say, linear about the belief after them, and what they do to M."""
+        known, theta = self._known(predicted), self._known(belief).mean
+        lines = self._factors.observe(seen).linearize(belief.pose, theta)
+        if any(one.behind for one in lines):
+            return
+        P = joint_cov(predicted, known)
+        found = innovation(P, lines)
+        there = np.concatenate([se2.log(se2.between(predicted.pose, belief.pose)), theta - known.mean])
+        G, parts, row = -(found.H @ self._M), [], 0
+        for m, one in zip(seen, lines, strict=True):
+            parts.append(slice(row, row + len(one.residual)))
+            if not isinstance(m, PoseMeasurement):
+                G[self._rows[m.landmark_id], parts[-1]] -= _by_displacement(one, belief.pose)
+            row = parts[-1].stop
+        W = sighting_whitening(found.cov)  # lower triangular: each sighting given those before it
+        w, G = W @ (found.residual - found.H @ there), W @ G
+        for m, part in zip(seen, parts, strict=True):
+            if not isinstance(m, PoseMeasurement):
+                self._weigh(self._rows[m.landmark_id], w[part], G[:, part])
+        self._M += (P @ found.H.T @ W.T) @ G
+
+    def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
+        """A sighting that was refused; how its own landmark's displacement explains it may be far from linear."""
+        own, observed, scale = self._rows[m.landmark_id], self._factors.observe([m]), self._shared(m)
+        one = observed.linearize(belief.pose, self._known(belief).mean)[0]
+        if one.behind:
+            return
+        found = innovation(P, [one])
+        W = sighting_whitening(found.cov) / scale
+        misread = chi2_bound(self._gate, len(one.residual))
+        explained = self._explain_own(own, P, belief, observed, scale)
+        if explained[0][0] > misread and self._evidence[own].sum() <= 0.0:
+            self._reset(np.arange(len(self._ids)) == own)  # it was in place; it may be moved from now on
+            explained = self._explain_own(own, P, belief, observed, scale)
+        self._weigh(own, W @ found.residual, -W @ found.H @ self._M, explained)
+
+    def _explain_own(
+        self, row: int, P: FloatArray, belief: PoseWithCovariance, observed: Observations, scale: float
+    ) -> Explained:
+        """One refused sighting under the hypothesis that its landmark was moved: iterated Kalman update."""
+        theta, moved = self._known(belief).mean, self._moved[row]
+        rows = self._factors.installation.landmarks.get(int(self._ids[row]), (0, 0))
+        explained = np.array([np.inf]), self._moved[row, None], self._cov[row, None]
+        for _ in range(_ITERATIONS):
+            x, y = belief.pose[:2] - moved  # moving the landmark one way is moving the robot the other
+            one = observed.linearize(np.array([x, y, belief.pose[2]]), theta)[0]
+            if one.behind:
+                break
+            found, by_displacement = innovation(P, [one]), _by_displacement(one, belief.pose)
+            W = sighting_whitening(found.cov + _turned(one, rows)) / scale
+            G = -W @ (by_displacement + found.H @ self._M[row])
+            w = W @ (found.residual - by_displacement @ moved)
+            explained = _explain(w, G[None], self._moved[row, None], self._cov[row, None])
+            moved = explained[1][0]
+        return explained
+
+    def _weigh(self, row: int, w: FloatArray, G: FloatArray, own: Explained | None = None) -> None:
+        """Take in the evidence of one sighting.
+
+        Args:
+            row: of its landmark.
+            w: ``(d,)`` its white innovation if all are in place.
+            G: ``(L, d, 2)`` derivative of that one's mean by each landmark's displacement.
+            own: how its own landmark's displacement explains it, if that is not linear.
+        """
+        misread = chi2_bound(self._gate, len(w))
+        cost, moved, cov = _explain(w, G, self._moved, self._cov)
+        if own is not None:
+            cost[row], moved[row], cov[row] = own[0][0], own[1][0], own[2][0]
+        explains = cost < misread
+        self._moved[explains], self._cov[explains] = moved[explains], cov[explains]
+        self._evidence[:, row] += min(float(w @ w), misread) - np.minimum(cost, misread)
+        self._seen[:, row] += 1.0
+        self._explained[row] += explains[row]
+
+    def _shared(self, m: LandmarkMeasurement) -> float:
+        """Scale on the sigma of a refused sighting, as errors of one landmark are correlated for some time."""
+        last = self._last_ns.get(m.landmark_id)
+        if last is None or isinstance(m, CornerMeasurement):
+            return 1.0
+        return math.sqrt(max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 1e-3)))
+
+    def _certain(self) -> int | None:
+        """A landmark that was moved, with no doubt that it was this one."""
+        evidence = self._evidence.sum(1)
+        for row in np.argsort(-evidence):
+            if evidence[row] < ALARM:
+                break
+            margins = ((self._evidence[row] - self._evidence) * (self._evidence[row] > 0.0)).sum(1)
+            margins[row] = np.inf  # the others' are of what this one explains
+            if margins.min() >= _MARGIN and self._plausible(int(row)):
+                return int(self._ids[row])
+        return None
+
+    def _plausible(self, row: int) -> bool:
+        """Whether it is far enough off beside others that are in place, and not these misread."""
+        moved = self._moved[row]
+        if not _LEAST_M < math.hypot(*moved) < _MOST_M:
+            return False
+        near = np.hypot(*(self._places - self._places[row] - moved).T) < _NEAR_M
+        near[row] = False
+        least = max(self._least, 0.5 * self._seen[row, row], _MISREAD_SHARE * self._seen[row, near].sum())
+        return bool(self._explained[row] >= least) and len(self._in_place - {self._ids[row]}) >= _PROVEN
+
+
+def _explain(w: FloatArray, G: FloatArray, mean: FloatArray, cov: FloatArray) -> Explained:
+    """A white innovation ``(d,)`` whose mean is ``G δ`` under each hypothesis, and δ after it."""
+    gap = w - np.einsum("ldi,li->ld", G, mean)
+    information, pull = G.transpose(0, 2, 1) @ G, np.einsum("ldi,ld->li", G, gap)
+    after = np.linalg.inv(np.linalg.inv(cov) + information)
+    after = 0.5 * (after + after.transpose(0, 2, 1))
+    step = np.einsum("lij,lj->li", after, pull)
+    cost = (gap**2).sum(1) - (pull * step).sum(1) + np.linalg.slogdet(np.eye(2) + cov @ information)[1]
+    return cost, mean + step, after
+
+
+def _by_displacement(one: Linearized, pose: FloatArray) -> FloatArray:
+    """Derivative ``(d, 2)`` of a sighting's residual by its landmark's displacement in the map."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.asarray(-one.J[:, :2] @ np.array([[c, s], [-s, c]]))
+
+
+def _turned(one: Linearized, rows: tuple[int, int]) -> FloatArray:
+    """Covariance ``(d, d)`` of a marker's residual if whoever moved it also turned it, and hung it higher or lower.
+
+    Args:
+        one: the sighting.
+        rows: first and number of the rows of its landmark in the installation.
+    """
+    of_it = (one.columns >= rows[0] + 2) & (one.columns < rows[0] + rows[1])
+    H = one.H[:, of_it] * np.array([_MOVED_M, _TURNED_RAD, _TURNED_RAD, _TURNED_RAD])[: of_it.sum()]
+    return np.asarray(H @ H.T)
