@@ -42,10 +42,10 @@ from benchmarks.installed_scores import (
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.ablation.failures.lift import Lift
-from fgloc.atomic import atomic_file
 from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.evaluation.matching import match
+from fgloc.files.atomic import atomic_file
 from fgloc.localizer import Localizer
 from fgloc.types import Estimate, Step, Trajectory
 

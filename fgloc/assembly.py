@@ -14,6 +14,7 @@ from fgloc.diagnosis import Diagnosis
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, rpy_matrix
 from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.intake.stream_facts import HasFrames, RecordingFacts, StreamFacts, first_events
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
@@ -27,7 +28,6 @@ from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers import MarkerDetector
 from fgloc.sensors.wheels import WheelMotion
-from fgloc.stream_facts import HasFrames, RecordingFacts, StreamFacts, first_events
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from fgloc.errors import ConfigError
 from fgloc.extensions import outside_sensors
-from fgloc.settings_file import Settings
+from fgloc.files.settings_file import Settings
 
 
 class Section(BaseModel):

@@ -52,6 +52,7 @@ from fgloc.types import (
     Mode,
     MotionMeasurement,
     MotionReadings,
+    PoseMeasurement,
     Step,
 )
 
@@ -291,7 +292,8 @@ class Localizer:
             self._tracking.record_fix()
             self._lift.fix()
         fix = belief if believed else None
-        self.sources.commit(readings, fix)
+        tells_yaw = any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.tells_yaw for s in believed)
+        self.sources.commit(readings, fix, tells_yaw)
         moved = self._judge_landmarks(step, motions, predicted, believed, kept)
         frame = self.estimator.log.keyframes[k]
         off = dict.fromkeys(("wheels", "learned"), "carried") if carried else trust.off

@@ -29,7 +29,7 @@ from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers import Detector, detect_stream
 from fgloc.sensors.remembered import RememberedDetections
 from fgloc.smoothing import SmoothedRun, smooth_run
-from fgloc.threads import one_blas_thread
+from fgloc.timing import one_blas_thread
 from fgloc.types import (
     CornersEvent,
     Decision,

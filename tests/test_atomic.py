@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fgloc import atomic
-from fgloc.atomic import atomic_file, atomic_folder, check_out
 from fgloc.errors import OutputError
+from fgloc.files import atomic
+from fgloc.files.atomic import atomic_file, atomic_folder, check_out
 
 NAMES = ("a", "b", "c")
 CHANGES = {"os.rename", "os.link", "os.remove", "os.rmdir", "os.mkdir", "shutil.rmtree", "fgloc.exchange"}

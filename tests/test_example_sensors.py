@@ -26,6 +26,7 @@ from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.runner import run
 from fgloc.sensors.base import Context
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import LandmarkMap, OdometryEvent
 
@@ -336,3 +337,13 @@ def test_their_failures_and_the_general_ones_are_ablated(recording, folders, tmp
     assert runs["nlos"]["affected"]["uwb_non_line_of_sight"] > 50
     assert runs["silent"]["affected"]["dropout"] > 50
     assert {run["outcome"] for run in runs.values()} == {"done"}
+
+
+def test_the_gyros_bias_is_not_learned_from_yaws_that_are_its_own(recording, monkeypatch):
+    """Positions tell the yaw along the way only: such a fix says nothing of the bias."""
+    taught, fix = [], Gyro.fix
+    monkeypatch.setattr(Gyro, "fix", lambda gyro, *told: (taught.append(told), fix(gyro, *told)))
+    config = only(load_config(recording / "robot.yaml"), ["gnss"])
+    result = run(recording / "bag", None, config, "online", check=False)
+    assert result.counts["gnss"] > 40
+    assert not taught

@@ -17,7 +17,7 @@ from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
-BASE = {"atomic", "documents", "extensions", "settings_file", "types", "errors", "config", "frames", "se2", "stats"}
+BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
 UPWARD = {("types", "fgloc.evaluation.report")}  # RunResult.write, imported when it is called
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}

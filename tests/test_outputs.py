@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from run_results import START_NS, figure_eight
 
-from fgloc.atomic import atomic_folder
 from fgloc.errors import OutputError, TrajectoryError
+from fgloc.files.atomic import atomic_folder
 from fgloc.recording import outputs
 from fgloc.types import Trajectory
 
@@ -140,7 +140,7 @@ def test_fault_71_kill_9_during_a_write_keeps_the_old_result(tmp_path):
     path = tmp_path / "steps.csv"
     path.write_text("old")
     code = (
-        "import sys, time; from pathlib import Path; from fgloc.atomic import atomic_file\n"
+        "import sys, time; from pathlib import Path; from fgloc.files.atomic import atomic_file\n"
         "with atomic_file(Path(sys.argv[1])) as file:\n"
         "    file.write('half of the new'); file.flush(); print('writing', flush=True); time.sleep(60)"
     )

@@ -8,8 +8,8 @@ import yaml
 
 from fgloc.ablation.suite import load_suite
 from fgloc.config import Config, load_config
-from fgloc.documents import HostileError, parse, plain
 from fgloc.errors import ConfigError, FglocError, MapError, TrajectoryError
+from fgloc.files.documents import HostileError, parse, plain
 from fgloc.recording.outputs import read_tum
 from fgloc.sensors.dictionaries import load_dictionary
 from fgloc.sensors.maps import load_map

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from fgloc.atomic import atomic_file
 from fgloc.errors import ModelError
+from fgloc.files.atomic import atomic_file
 from fgloc.sensors.learned.card import Split
 from training.config import TrainConfig
 from training.data import Run

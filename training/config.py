@@ -7,8 +7,8 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from fgloc.config import Section
+from fgloc.files.settings_file import Settings
 from fgloc.sensors.learned.card import Input, Kind, Split
-from fgloc.settings_file import Settings
 
 
 class DataConfig(Section):

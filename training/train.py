@@ -20,8 +20,8 @@ except ModuleNotFoundError as missing:
     raise SystemExit("error: torch is not installed; in the repository: pip install -e '.[train]'") from missing
 from tqdm import tqdm
 
-from fgloc.atomic import atomic_folder, check_out
 from fgloc.errors import ConfigError, FglocError, RecordingError
+from fgloc.files.atomic import atomic_folder, check_out
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
 from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
 from fgloc.sensors.learned.signals import Signal

@@ -14,8 +14,8 @@ except ModuleNotFoundError as error:
 
 from datasets.sim.record import record as record_run
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
-from fgloc.atomic import check_out
 from fgloc.errors import FglocError
+from fgloc.files.atomic import check_out
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 

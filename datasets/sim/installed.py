@@ -16,8 +16,8 @@ from datasets.sim.installation import Installation
 from datasets.sim.mjcf import intrinsics, optical_rotation
 from datasets.sim.scenario import Camera, Robot, Scenario
 from datasets.sim.section import Section, Vector2, Vector3, channel_rng
+from fgloc.files.settings_file import Settings
 from fgloc.frames import quaternion_matrix, rpy_matrix
-from fgloc.settings_file import Settings
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 INSTALLED = "installed.yaml"

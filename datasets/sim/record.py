@@ -20,7 +20,7 @@ from datasets.sim.physics import make_scene, simulate
 from datasets.sim.positioning import gnss_settings, uwb_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import streams
-from fgloc.atomic import atomic_folder
+from fgloc.files.atomic import atomic_folder
 from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # a folder that holds it is complete

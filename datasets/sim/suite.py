@@ -19,7 +19,7 @@ from datasets.sim.record import is_recorded, record
 from datasets.sim.scenario import Control, Scenario
 from datasets.sim.section import Section
 from fgloc.errors import ConfigError, FglocError
-from fgloc.settings_file import Settings
+from fgloc.files.settings_file import Settings
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
 

@@ -15,10 +15,10 @@ from fgloc.ablation.jobs import Job, code_hash
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Suite
 from fgloc.ablation.tables import ATE, METRICS, Entry, Run, join, matrix, matrix_csv, rows, runs_csv, sentence, worst
-from fgloc.atomic import atomic_folder
 from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.plots import png
+from fgloc.files.atomic import atomic_folder
 from fgloc.recording.outputs import sha256_of, write_json, write_text
 
 

@@ -14,9 +14,9 @@ from pydantic import Field, ValidationError, model_validator
 from fgloc.ablation.failures import BuiltInFailure, Failure
 from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
+from fgloc.files.settings_file import Settings, sentences
 from fgloc.runner import RunMode, find_beside
 from fgloc.sensors.registry import sensors
-from fgloc.settings_file import Settings, sentences
 
 if TYPE_CHECKING:
     AnyFailure = Failure

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import fgloc
-from fgloc.atomic import check_out
 from fgloc.cli.options import (
     Bag,
     Bags,
@@ -25,6 +24,7 @@ from fgloc.cli.options import (
 from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
 from fgloc.errors import ConfigError, RecordingError
+from fgloc.files.atomic import check_out
 from fgloc.types import RunResult
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from fgloc.atomic import check_out
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
 from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar, say
 from fgloc.errors import ConfigError, RecordingError
+from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
     from fgloc.calibration.survey import Survey

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgloc.atomic import check_out
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
 from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, say, typed
+from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
     from fgloc.ablation.records import Record

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgloc.atomic import atomic_folder
 from fgloc.calibration.contradictions import contradicted
 from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
@@ -23,6 +22,7 @@ from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_trajectory, png
 from fgloc.evaluation.timeline import plot_timeline
+from fgloc.files.atomic import atomic_folder
 from fgloc.recording.outputs import (
     write_bytes,
     write_covariance_csv,

@@ -12,7 +12,7 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import Reception, role_of
 from fgloc.live.run import OnlineRun
-from fgloc.threads import one_blas_thread
+from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, ImageEvent, Step
 
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot

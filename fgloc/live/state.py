@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, ValidationError
 
-from fgloc.atomic import atomic_file
 from fgloc.config import Section
-from fgloc.documents import read_text
 from fgloc.errors import FglocError, OutputError
+from fgloc.files.atomic import atomic_file
+from fgloc.files.documents import read_text
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.types import FloatArray, LandmarkMap, Mode
 

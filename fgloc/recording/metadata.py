@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from fgloc.documents import HostileError, parse, plain
 from fgloc.errors import RecordingError
+from fgloc.files.documents import HostileError, parse, plain
 
 _MAX_BYTES = 16 * 1024 * 1024
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.atomic import atomic_file
-from fgloc.documents import read_text
 from fgloc.errors import OutputError, TrajectoryError
+from fgloc.files.atomic import atomic_file
+from fgloc.files.documents import read_text
 from fgloc.frames import quaternion_yaw
 from fgloc.types import Decision, Trajectory
 

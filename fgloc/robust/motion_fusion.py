@@ -82,6 +82,7 @@ class MotionFusion:
         self.joint = joint
         self.gyro = gyro
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
+        self._untold_s = 0.0  # how long fixes have told the yaw along the way only, at most the lag
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
 
     @property
@@ -109,16 +110,24 @@ class MotionFusion:
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
-            turn = self.gyro.measure(step, None if wheels is None or is_commanded_to_move(step) else motion, blind_s)
+            untold_s = max(blind_s, self._untold_s)
+            turn = self.gyro.measure(step, None if wheels is None or is_commanded_to_move(step) else motion, untold_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, turned_by(motion, turn.yaw), cov)
                 gyro = self._installed(gyro, turn)
                 self._turn = turn
-        readings = MotionReadings(wheels, self._measure_learned(step, velocity), gyro)
+        readings = MotionReadings(wheels, self._with_drift(self._measure_learned(step, velocity), step), gyro)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
+
+    def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
+        """The learned motion with the drift of the gyro that it reads, where no fix tells the yaw by itself."""
+        if learned is None or self._turn is None or not self.gyro_is_read or self._untold_s == 0.0:
+            return learned
+        drift = max(self._turn.variance - self._config.gyro.yaw_per_sqrt_s**2 * step.dt, 0.0)
+        return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
 
     def _installed(
         self, m: MotionMeasurement, turn: Turn | None = None, change: FloatArray | None = None
@@ -263,12 +272,14 @@ class MotionFusion:
             motion, cov[2, 2] = turned_by(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
-    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None) -> None:
+    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, tells_yaw: bool = True) -> None:
         """The robot went on by a step.
 
         Args:
             readings: of that step.
             fix: where sightings have it now; None if there were none.
+            tells_yaw: whether they told the yaw by themselves. Positions and ranges tell it along the way: the yaw of a
+                fix is then mostly the gyro's own, and does not teach its bias.
         """
         if fix is not None:
             self._silent_s = 0.0
@@ -278,12 +289,15 @@ class MotionFusion:
             self.gyro.forget_fix()
             return
         turn = readings.gyro
-        self.gyro.turned(float(turn.motion[2]), (turn.stamp_ns - turn.start_ns) * 1e-9)
         if fix is not None:
+            seconds = (turn.stamp_ns - turn.start_ns) * 1e-9
+            self._untold_s = 0.0 if tells_yaw else min(self._untold_s + seconds, self._config.estimator.lag_s)
+        self.gyro.turned(float(turn.motion[2]), (turn.stamp_ns - turn.start_ns) * 1e-9)
+        if fix is not None and tells_yaw:
             self.gyro.fix(float(fix.pose[2]), float(fix.cov[2, 2]))
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
-        self._silent_s = 0.0
+        self._silent_s = self._untold_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()

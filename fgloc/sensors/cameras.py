@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from fgloc.config import CameraConfig
-from fgloc.documents import Item, read_document
 from fgloc.errors import CameraError
+from fgloc.files.documents import Item, read_document
 from fgloc.types import Camera, CameraInfoEvent, FloatArray
 
 # What ROS, OpenCV and Kalibr call the models. The number of coefficients tells plumb_bob and rational_polynomial apart.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import cv2
 
-from fgloc.documents import read_text
 from fgloc.errors import ConfigError
+from fgloc.files.documents import read_text
 
 _FILE_SUFFIXES = {".yml", ".yaml", ".json", ".xml"}
 _MAX_BYTES = 1_000_000  # of a dictionary file; the largest that OpenCV ships has 1000 markers in 120 kB

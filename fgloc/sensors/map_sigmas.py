@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.documents import Item
+from fgloc.files.documents import Item
 from fgloc.types import FloatArray, Landmark
 
 KEYS = ("cov", "sigma_m", "sigma_rad")

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fgloc.atomic import atomic_file
-from fgloc.documents import Item, read_document
 from fgloc.errors import ConfigError, MapError
+from fgloc.files.atomic import atomic_file
+from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.sensors.dictionaries import load_dictionary
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields

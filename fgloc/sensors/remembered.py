@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from fgloc.atomic import atomic_file
+from fgloc.files.atomic import atomic_file
 from fgloc.sensors.markers import Detector
 from fgloc.types import CornersEvent, ImageEvent, MarkerCorners
 

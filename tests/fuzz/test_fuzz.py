@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import fgloc
 from fgloc.config import GateConfig, load_config
-from fgloc.documents import parse, plain
 from fgloc.errors import FglocError, ModelError
+from fgloc.files.documents import parse, plain
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.decode import CONVERTERS
 from fgloc.recording.messages import default_typestore

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from fgloc.atomic import atomic_file
 from fgloc.errors import CovarianceError, ModelError
+from fgloc.files.atomic import atomic_file
 from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard
 from fgloc.sensors.learned.displacement import DisplacementModel
 from fgloc.sensors.learned.forms import MotionModel

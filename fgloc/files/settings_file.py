@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from fgloc.documents import Item, plain, read_document
 from fgloc.errors import ConfigError
+from fgloc.files.documents import Item, plain, read_document
 
 MAX_BYTES = 1_000_000  # of a settings file; PyYAML takes 6 s for it
 _MOST_SHOWN = 20  # wrong values

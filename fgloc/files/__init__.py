@@ -1,0 +1,1 @@
+"""Files of the user: guarded reading of documents and settings; results that are whole, or the old ones."""
