@@ -94,9 +94,9 @@ def test_weights_must_be_finite_and_float32(card: ModelCard, rng: np.random.Gene
 
 def test_no_card_or_no_file(card: ModelCard, rng: np.random.Generator, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    with pytest.raises(ModelError, match="cannot be read"):
+    with pytest.raises(ModelError, match=r"cannot be read|not a regular file"):
         load_model(path)
-    with pytest.raises(ModelError, match="cannot be read"):
+    with pytest.raises(ModelError, match="not a regular file"):
         load_model(tmp_path)
     save_file(make_tensors(card, rng), path)
     with pytest.raises(ModelError, match="no card"):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +39,20 @@ class Done:
         return found
 
 
+_LAUNCHER = """
+import os, resource, subprocess, sys
+code = subprocess.call(sys.argv[2:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+with open(sys.argv[1], "w") as file:
+    file.write(f"{code} {used.ru_utime + used.ru_stime} {used.ru_maxrss}")
+"""
+
+
 def run(arguments: Sequence[str], seconds: float = 20.0) -> Done:
-    """Run ``python ARGUMENTS``; it is killed after this much processor time, or three times as much on the wall."""
+    """Run ``python ARGUMENTS``; it is killed after this much processor time, or three times as much on the wall.
+
+    A small process starts it: the peak memory of a process counts from that of the one which forked it.
+    """
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
@@ -48,37 +60,35 @@ def run(arguments: Sequence[str], seconds: float = 20.0) -> Done:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        ended = Path(folder) / "ended"
         process = subprocess.Popen(
-            [sys.executable, *arguments],
+            [sys.executable, "-S", "-c", _LAUNCHER, str(ended), sys.executable, *arguments],
             stdout=out,
             stderr=err,
             stdin=subprocess.DEVNULL,
             preexec_fn=limit,
             env=environment,
             cwd=tempfile.gettempdir(),
+            start_new_session=True,
         )
-        late = threading.Event()
-
-        def kill() -> None:
-            late.set()
-            process.kill()
-
-        timer = threading.Timer(3.0 * seconds, kill)
-        timer.start()
-        _, status, usage = os.wait4(process.pid, 0)
-        timer.cancel()
-        process.returncode = code = os.waitstatus_to_exitcode(status)
+        try:
+            process.wait(3.0 * seconds)
+            late = False
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            late = True
+        code, used, peak_kb = ended.read_text().split() if ended.exists() else (process.returncode, 0.0, 0.0)
         out.seek(0)
         err.seek(0)
-        used = usage.ru_utime + usage.ru_stime
         return Done(
-            code,
+            int(code),
             out.read().decode(errors="replace"),
             err.read().decode(errors="replace"),
-            used,
-            usage.ru_maxrss / 1024.0,
-            late.is_set() or (code < 0 and used >= seconds),
+            float(used),
+            float(peak_kb) / 1024.0,
+            late or (int(code) < 0 and float(used) >= seconds),
         )
 
 
