@@ -156,7 +156,7 @@ def test_no_paths_of_one_machine():
 def test_constraints_pin_every_dependency():
     text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     pinned = {line.split("==")[0].lower() for line in text.splitlines() if "==" in line}
-    wanted = {re.match(r"[\w-]+", line)[0].lower() for line in requires("fgloc")} - {"fgloc"}
+    wanted = {re.match(r"[\w.-]+", line)[0].lower() for line in requires("fgloc")} - {"fgloc"}
     assert {"gtsam", "torch", "evo", "dask"} <= wanted
     assert wanted <= pinned
     assert "+cpu" not in text  # a wheel for every machine
