@@ -6,7 +6,7 @@ through the waypoints, over the length of the path. Values are means over the se
 a value ``a_over_b`` is the mean of a over the mean of b, its spread that of the single ratios. ``over_truth``: over a
 drive on the same floor with the true pose. ``reached``: share of the waypoints that the robot has come within 10 cm of.
 
-Cases (`benchmarks.follow_runs.CASES`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
+Cases (`datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 8 to 28 s, on ice; onewheel, the left encoder counts nothing in that
 time; moved, a marker is 0.5 m from where the map has it. Finished drives are kept, so that an interrupted run goes on.
 """
