@@ -21,13 +21,13 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers import MarkerDetector
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

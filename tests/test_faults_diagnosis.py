@@ -37,7 +37,7 @@ from fgloc.intake.topic_activity import TopicActivity
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import find_beside, run
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

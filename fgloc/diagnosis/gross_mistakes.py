@@ -19,7 +19,7 @@ from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.sensors.remembered import Detections, RememberedDetections
+from fgloc.sensors.markers.remembered import Detections, RememberedDetections
 from fgloc.types import FloatArray, LandmarkMap
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
