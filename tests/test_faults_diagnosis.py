@@ -34,8 +34,9 @@ from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.topic_activity import TopicActivity
+from fgloc.recording.files import find_beside
 from fgloc.recording.roles import TopicInfo, select_roles
-from fgloc.runner import find_beside, run
+from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.wheels import WheelMotion
 from fgloc.types import (
