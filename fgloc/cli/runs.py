@@ -142,11 +142,11 @@ def _localise(
 ) -> tuple[RunResult, Metrics]:
     """Run one recording and write its results."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.assembly import resolved
     from fgloc.evaluation.report import write_results
     from fgloc.recording.files import find_beside
     from fgloc.recording.outputs import sha256_of
     from fgloc.runner import run
+    from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
