@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pydantic import ValidationError
 
-from fgloc.config import Config, MotionConfig, config_of, load_config
 from fgloc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
 
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
@@ -50,7 +51,10 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     Raises:
         ConfigError: the file is missing or wrong.
     """
-    from fgloc.runner import find_beside
+    from pydantic import ValidationError
+
+    from fgloc.config import MotionConfig, config_of, load_config
+    from fgloc.recording.files import find_beside
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = config_of({}) if file is None else load_config(file)

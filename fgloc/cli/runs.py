@@ -27,11 +27,11 @@ from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
-from fgloc.types import RunResult
 
 if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
+    from fgloc.types import RunResult
 
 _TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
@@ -146,10 +146,11 @@ def _localise(
 ) -> tuple[RunResult, Metrics]:
     """Run one recording and write its results."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.assembly import resolved
     from fgloc.evaluation.report import write_results
+    from fgloc.recording.files import find_beside
     from fgloc.recording.outputs import sha256_of
-    from fgloc.runner import find_beside, run
+    from fgloc.runner import run
+    from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
