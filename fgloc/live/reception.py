@@ -6,7 +6,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fgloc.config import Config
+from fgloc.intake.clock_guard import MOTION_EVENTS
 from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
+from fgloc.intake.validation import EventValidator
+from fgloc.live.facts import LiveFacts
 from fgloc.live.facts import role_of as known_role
 from fgloc.live.status import TopicMeter, TopicStatus
 from fgloc.types import Event
@@ -37,8 +41,10 @@ class Reception:
         dropped: events that are not used whatever they say, by role.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: Config) -> None:
         """Nothing has arrived."""
+        self._selection = LiveFacts(config, None, None)
+        self._gate = EventValidator(config.gate)
         self.dropped: Counter[str] = Counter()
         self._publishers: dict[Source, _Publisher] = {}
         self._meters: dict[str, TopicMeter] = {}
@@ -59,6 +65,12 @@ class Reception:
             self._meters[event.topic] = TopicMeter(role)
         self._meters[event.topic].add(event.stamp_ns, event.received_ns)
         return self._clocks.correct(event)
+
+    def motion(self, event: Event) -> Event | None:
+        """An event that was received, if it is of the motion source to be used, and as the gate lets it through."""
+        if not isinstance(event, MOTION_EVENTS) or not self._selection.topic_is_used(event):
+            return None
+        return self._gate.check(event)
 
     def note(self, text: str) -> None:
         """Remember a sentence for the user."""
