@@ -93,23 +93,29 @@ class Live(EventMaker):
 
     # --- in ---
 
-    def push(self, event: Event, publisher: str = "") -> None:
+    def push(self, event: Event, publisher: str = "") -> tuple[Event, ...]:
         """Take an event, in order of receipt. Never waits for estimation or detection.
 
         Args:
             event: any that a recording has.
             publisher: tells publishers of one topic apart; only the first is used, until it has been silent for 1 s.
 
+        Returns:
+            What is used from now on: mostly the event itself; with a corrected stamp if the topic's clock was reset;
+            nothing if it is of a second publisher, or held back for a moment because its clock may have been reset.
+
         Raises:
             EstimatorError: `close` was called.
             FglocError: the run has failed: what it was fed cannot be used.
         """
         with self._lock:
-            for received in self._reception.receive(event, publisher):
+            used = self._reception.receive(event, publisher)
+            for received in used:
                 motion = self._reception.motion(received)
                 if motion is not None:
                     self._results.poses.add(motion)
                 self._estimation.put(received)
+        return tuple(used)
 
     def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = (0.5, 0.5, 0.26)) -> None:
         """Go on from a pose that somebody tells: x, y [m], yaw [rad] in the map, and their sigmas.

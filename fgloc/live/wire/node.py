@@ -132,15 +132,17 @@ class Node:
         for callback in self._subscribers:
             self.live.subscribe(callback)
 
-    def _push(self, event: Event) -> None:
-        self._odom.add(event)
-        if self.watch is not None:
-            self.watch(event)
+    def _push(self, event: Event, publisher: str) -> None:
         assert self.live is not None  # nothing is read before
         try:
-            self.live.push(event)
+            used = self.live.push(event, publisher)
         except FglocError as error:
             self._failure = error
+            return
+        for one in used:
+            self._odom.add(one)
+            if self.watch is not None:
+                self.watch(one)
 
     def _on_estimate(self, estimate: Estimate) -> None:
         self._outputs.pose(estimate)
