@@ -11,6 +11,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import Config
+from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.gyro import Gyro
@@ -56,6 +57,10 @@ class Outlet(Protocol):
 
     def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
         """A keyframe has been estimated."""
+        ...
+
+    def failed(self, error: FglocError) -> None:
+        """The run cannot go on."""
         ...
 
 

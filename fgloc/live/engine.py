@@ -55,7 +55,7 @@ class Engine:
         self._first_ns: int | None = None
         self._working = False
         self._closing = False
-        self._failed: Exception | None = None
+        self._failed: FglocError | None = None
         self.worker = DetectionWorker(self.changed, image_queue)
         self._thread = threading.Thread(target=self._estimate, name="fgloc-estimation", daemon=True)
         self._thread.start()
@@ -119,10 +119,8 @@ class Engine:
 
     def check_failed(self) -> None:
         """Raises: FglocError: what ended the estimation thread."""
-        if isinstance(self._failed, FglocError):
-            raise self._failed
         if self._failed is not None:
-            raise EstimatorError(f"the live run failed: {self._failed!r}") from self._failed
+            raise self._failed
 
     def _idle(self) -> bool:
         return not (self._inbox or self._working or self._line)
@@ -144,10 +142,13 @@ class Engine:
                 self._use_line()
                 self._report(self._run.finish())
         except Exception as error:  # raised again by the next call from outside
+            failure = error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")
+            failure.__cause__ = error.__cause__ if failure is error else error
             with self.changed:
-                self._failed = error
+                self._failed = failure
                 self._working = False
                 self.changed.notify_all()
+            self._outlet.failed(failure)
 
     def _next_batch(self) -> list[Queued | PoseWithCovariance] | None:
         """What has come in, possibly nothing when only an image is done; None at the end."""

@@ -12,7 +12,7 @@ from types import TracebackType
 import numpy as np
 
 from fgloc.config import Config, Role
-from fgloc.errors import EstimatorError
+from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.estimation import Estimation, Settings
@@ -226,6 +226,9 @@ class _Results:
 
     def built(self, parts: MotionParts) -> None:
         self.poses.begin(parts)
+
+    def failed(self, error: FglocError) -> None:
+        """The next call raises it."""
 
     def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
         self.poses.anchor(anchor)

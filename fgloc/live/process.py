@@ -185,7 +185,9 @@ class EstimationProcess:
             else:
                 number, result = content
                 with self._changed:
-                    answer = self._asked.pop(number)
+                    answer = self._asked.pop(number, None)
+                if answer is None:  # the run has failed meanwhile
+                    continue
                 if isinstance(result, Exception):
                     answer.set_exception(result)
                 else:
@@ -225,13 +227,15 @@ class _Worker:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._sending = threading.Lock()
-        self._failed = False
 
     def built(self, parts: MotionParts) -> None:
         self._tell("built", parts)
 
     def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
         self._tell("estimated", anchor, estimate)
+
+    def failed(self, error: FglocError) -> None:
+        self._tell("failed", error)
 
     def run(self) -> None:
         """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
@@ -247,18 +251,14 @@ class _Worker:
         except (EOFError, OSError):
             os._exit(1)
         except Exception as error:
-            self._tell("failed", _told(error))
+            self._tell("failed", _told(error))  # the settings cannot be used
 
     def _use(self, estimation: Estimation, item: Event | PoseWithCovariance) -> None:
-        try:
+        with suppress(FglocError):  # it has failed, and has told so
             if isinstance(item, PoseWithCovariance):
                 estimation.reset_pose(item)
             else:
                 estimation.put(item)
-        except FglocError as error:
-            if not self._failed:
-                self._tell("failed", error)
-            self._failed = True
 
     def _answer(self, estimation: Estimation, number: int, method: str, arguments: tuple[Any, ...]) -> None:
         try:
