@@ -1,7 +1,7 @@
 """Beside others, on the same steps as installed: ``python -m benchmarks.peers --robot-localization FOLDER [--tune]``.
 
 - ``robot_localization``: its own EKF, built from its sources (branch noetic-devel), fed with wheel twist, gyro and
-  poses from images: of each marker alone (``rl_marker_poses``) or of all markers of an image by RANSAC (``rl_pnp``). The
+  poses from images: of each marker alone (``rl_marker_poses``) or of all of an image by RANSAC (``rl_pnp``). The
   settings were chosen on validation recordings by ``--tune`` (`benchmarks.peers_localizer`).
 - ``marker_poses``, ``corners``, ``corners_rules``: `benchmarks.textbook`.
 - ``wheels``: dead reckoning by the wheels from the first true pose.

@@ -204,7 +204,10 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
         "imu_link": (scene.scenario.imu.position, np.array([0.0, 0.0, 0.0, 1.0])),
     }
     for frame, (position, quaternion) in mounted.items():
-        yield EPOCH_NS, partial(bag.static_transform, EPOCH_NS, "base_link", frame, position, tuple(quaternion), EPOCH_NS)
+        yield (
+            EPOCH_NS,
+            partial(bag.static_transform, EPOCH_NS, "base_link", frame, position, tuple(quaternion), EPOCH_NS),
+        )
 
 
 def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
