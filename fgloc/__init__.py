@@ -35,6 +35,7 @@ from fgloc.errors import (
 
 if TYPE_CHECKING:
     from fgloc.config import Config, load_config
+    from fgloc.evaluation.results import Results, read_results
     from fgloc.live import Live
     from fgloc.runner import run
     from fgloc.sensors.maps import load_map
@@ -56,18 +57,22 @@ __all__ = [
     "ModelError",
     "OutputError",
     "RecordingError",
+    "Results",
     "RunResult",
     "Trajectory",
     "TrajectoryError",
     "WireError",
     "load_config",
     "load_map",
+    "read_results",
     "run",
 ]
 
 _IMPORTED_LATE = {
     "Config": "fgloc.config",
     "load_config": "fgloc.config",
+    "Results": "fgloc.evaluation.results",
+    "read_results": "fgloc.evaluation.results",
     "Live": "fgloc.live",
     "run": "fgloc.runner",
     "load_map": "fgloc.sensors.maps",

@@ -15,11 +15,11 @@ from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.markers import MarkerDetector
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, LandmarkMap
 
 

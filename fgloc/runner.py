@@ -26,8 +26,8 @@ from fgloc.intake.topic_activity import TopicActivity
 from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
-from fgloc.sensors.markers import Detector, detect_stream
-from fgloc.sensors.remembered import RememberedDetections
+from fgloc.sensors.markers.detector import Detector, detect_stream
+from fgloc.sensors.markers.remembered import RememberedDetections
 from fgloc.smoothing import SmoothedRun, smooth_run
 from fgloc.timing import one_blas_thread
 from fgloc.types import (

@@ -18,7 +18,7 @@ from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.learned import LearnedMotion, load_model
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

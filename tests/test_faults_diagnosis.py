@@ -38,7 +38,7 @@ from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import run
 from fgloc.sensor_setup import given_pose
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

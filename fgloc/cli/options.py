@@ -35,6 +35,10 @@ ConfigOption = Annotated[
 RrdOption = Annotated[
     Path | None, typer.Option("--rrd", metavar="FILE", dir_okay=False, help="also write the run for rerun's viewer")
 ]
+McapOption = Annotated[
+    Path | None,
+    typer.Option("--mcap", metavar="FILE", dir_okay=False, help="also write the run as a bag of standard messages"),
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
 SchedulerOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")

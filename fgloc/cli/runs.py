@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import fgloc
+from fgloc.cli.exports import write_for_viewers
 from fgloc.cli.options import (
     Bag,
     Bags,
     ConfigOption,
     MapOption,
+    McapOption,
     ModelOption,
     Out,
     RrdOption,
@@ -81,16 +83,17 @@ def smooth(
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     rrd: RrdOption = None,
+    mcap: McapOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
-        if rrd is not None:
-            raise ConfigError("--rrd: expected one bag; give each its own command")
+        if rrd is not None or mcap is not None:
+            raise ConfigError("--rrd, --mcap: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
     result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
-    _finish(result, metrics, out, rrd)
+    _finish(result, metrics, out, rrd, mcap)
 
 
 def online(
@@ -101,11 +104,12 @@ def online(
     config: ConfigOption = None,
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
+    mcap: McapOption = None,
 ) -> None:
     """Replay the recording as on a live robot; each pose depends only on what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
     result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
-    _finish(result, metrics, out, rrd)
+    _finish(result, metrics, out, rrd, mcap)
 
 
 def calibrate(
@@ -156,14 +160,11 @@ def _localise(
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
-def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
-    """Say what came out, and write it for rerun's viewer."""
+def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mcap: Path | None) -> None:
+    """Say what came out, and write it for the viewers that were asked for."""
     from fgloc.evaluation.judgements import gravest
 
-    if rrd is not None:
-        from fgloc.view.file import write_rrd
-
-        write_rrd(result, rrd)
+    write_for_viewers(result, rrd, mcap)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]

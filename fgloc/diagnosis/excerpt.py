@@ -12,9 +12,9 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
-from fgloc.sensors.images import ImageError
-from fgloc.sensors.markers import Detector
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.markers.detector import Detector
+from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

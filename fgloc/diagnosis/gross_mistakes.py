@@ -19,7 +19,7 @@ from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
-from fgloc.sensors.remembered import Detections, RememberedDetections
+from fgloc.sensors.markers.remembered import Detections, RememberedDetections
 from fgloc.types import FloatArray, LandmarkMap
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong

@@ -25,8 +25,8 @@ from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
-from fgloc.sensors.dictionaries import load_dictionary
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
+from fgloc.sensors.markers.dictionaries import load_dictionary
 from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
 
 _MAX_SIZE_M = 5.0

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.sensors.images import GrayImage
+from fgloc.sensors.markers.images import GrayImage
 from fgloc.types import FloatArray
 
 BoolArray = NDArray[np.bool_]
