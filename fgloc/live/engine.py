@@ -12,6 +12,7 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import Reception, role_of
 from fgloc.live.run import OnlineRun
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, ImageEvent, Step
 
@@ -179,15 +180,19 @@ class Engine:
             return self._refuse(item, event)
         if self._run.parts is not None:
             if facts.is_news(event) and facts.note(event):
-                self.worker.detector = self._run.build().detector
+                self._build()
             return self._admit(item)
         facts.note(event)
         self._held.append(item)
         self._first_ns = event.received_ns if self._first_ns is None else self._first_ns
         if facts.complete((event.received_ns - self._first_ns) * 1e-9, self._startup_s):
-            self.worker.detector = self._run.build().detector
+            self._build()
             while self._held:
                 self._admit(self._held.popleft())
+
+    def _build(self) -> None:
+        detector = self._run.build().detector
+        self.worker.detector = None if detector is None else TrackingDetector(detector)
 
     def _refuse(self, item: Queued, event: Event) -> None:
         """An event of another topic than the one that plays its role."""

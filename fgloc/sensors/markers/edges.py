@@ -18,6 +18,7 @@ _MIN_SIDE_PX = 6.0
 _MAX_HALF_WIDTH_PX = 3.0
 _CELL_SHARE = 0.7  # of a cell that a profile reaches to either side
 _ITERATIONS = 2
+_MOST_AT_ONCE = 128  # markers; OpenCV's remap takes 32767 rows
 _MAX_MOVE_PX = 2.5
 _FLOOR = 0.1  # of a profile's steepest place; what is flatter is noise
 _MIN_CROSSING = 0.2  # sine of the angle in which two edges meet
@@ -51,15 +52,20 @@ def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
 
     Source: the idea is that of AprilTag 3's edge refinement, Krogius et al., IROS 2019; own formulation.
     """
+    if len(corners) > _MOST_AT_ONCE:
+        first = refine_all(image, corners[:_MOST_AT_ONCE], cells)
+        return np.asarray(np.vstack([first, refine_all(image, corners[_MOST_AT_ONCE:], cells)]))
     found = corners.astype(np.float64)
     clear = np.arange(len(corners))  # markers with clear edges so far
     for _ in range(_ITERATIONS):
+        if not len(clear):
+            break
         moved, fits = _meeting_points(image, found[clear], cells)
-        fits &= np.abs(moved - corners[clear]).max(axis=(1, 2), initial=0.0) <= _MAX_MOVE_PX
+        fits &= np.abs(moved - corners[clear]).max(axis=(1, 2)) <= _MAX_MOVE_PX
         found[clear[fits]] = moved[fits]
         found[clear[~fits]] = corners[clear[~fits]]
         clear = clear[fits]
-    return found
+    return np.asarray(found)
 
 
 def _meeting_points(image: GrayImage, corners: FloatArray, cells: int) -> tuple[FloatArray, BoolArray]:
@@ -69,7 +75,7 @@ def _meeting_points(image: GrayImage, corners: FloatArray, cells: int) -> tuple[
     following = corners[:, _WITH_NEXT]
     sides = following - corners
     lengths = np.sqrt((sides * sides).sum(axis=2))
-    clear = lengths.min(axis=1, initial=np.inf) >= _MIN_SIDE_PX
+    clear = lengths.min(axis=1) >= _MIN_SIDE_PX
     lengths = np.where(clear[:, None], lengths, 1.0)
     along = sides / lengths[..., None]
     outward = np.stack([along[..., 1], -along[..., 0]], axis=2)
@@ -84,10 +90,10 @@ def _meeting_points(image: GrayImage, corners: FloatArray, cells: int) -> tuple[
     flat = points.reshape(-1, _ACROSS, 2).astype(np.float32)
     levels = cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     rise = np.maximum(np.diff(np.asarray(levels, dtype=float).reshape(m, 4, 2, _ALONG, _ACROSS), axis=4), 0.0)
-    rise = np.maximum(rise - _FLOOR * rise.max(axis=4, keepdims=True, initial=0.0), 0.0)
+    rise = np.maximum(rise - _FLOOR * rise.max(axis=4, keepdims=True), 0.0)
     weights = rise.sum(axis=4)
     totals = weights.sum(axis=3)
-    clear &= totals.min(axis=(1, 2), initial=np.inf) > 0.0
+    clear &= totals.min(axis=(1, 2)) > 0.0
     offsets = half_width[:, :, None, None] * (rise @ _MIDDLES) / np.maximum(weights, 1e-9)
     edge_points = on_edge + offsets[..., None] * outward[:, :, None, None]
     # 3. A line through each end's edge points: weighted total least squares.
@@ -100,7 +106,7 @@ def _meeting_points(image: GrayImage, corners: FloatArray, cells: int) -> tuple[
     first, second = normals[:, :, 0], normals[:, _WITH_PREVIOUS, 1]
     a, b = distances[:, :, 0], distances[:, _WITH_PREVIOUS, 1]
     crossing = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    clear &= np.abs(crossing).min(axis=1, initial=np.inf) >= _MIN_CROSSING
+    clear &= np.abs(crossing).min(axis=1) >= _MIN_CROSSING
     crossing = np.where(clear[:, None], crossing, 1.0)
     x = (a * second[..., 1] - b * first[..., 1]) / crossing
     y = (b * first[..., 0] - a * second[..., 0]) / crossing

@@ -10,8 +10,8 @@ from collections import Counter, deque
 
 import numpy as np
 
-from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.sensors.markers.detector import Box, MarkerDetector
+from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.types import CornersEvent, FloatArray, ImageEvent, MarkerCorners
 
 Found = list[tuple[int, FloatArray]]
