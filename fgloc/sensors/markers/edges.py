@@ -35,7 +35,7 @@ def refine_corners(image: GrayImage, corners: FloatArray, cells: int) -> FloatAr
 
     As `refine_all`, of one marker.
     """
-    return refine_all(image, corners[None], cells)[0]
+    return np.asarray(refine_all(image, corners[None], cells)[0])
 
 
 def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
@@ -65,7 +65,7 @@ def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
         found[clear[fits]] = moved[fits]
         found[clear[~fits]] = corners[clear[~fits]]
         clear = clear[fits]
-    return np.asarray(found)
+    return found
 
 
 def _meeting_points(image: GrayImage, corners: FloatArray, cells: int) -> tuple[FloatArray, BoolArray]:
