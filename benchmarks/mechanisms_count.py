@@ -25,7 +25,7 @@ DECIDING = (
     "relocalization/*.py",
     "sensors/learned/joint.py",
     "sensors/gyro.py",
-    *(f"graph/{name}.py" for name in ("batch", "isam2", "joint")),
+    *(f"graph/{name}.py" for name in ("batch", "isam2", "joint", "noise_budget")),
 )
 SECTIONS = ("WeightsConfig", "GateConfig", "EstimatorConfig")
 _NOT_COUNTED = (0.0, 0.5, 1.0, 2.0)

@@ -55,7 +55,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "lift",
         "A robot that rises, or turns though it stands, is carried: no source knows its motion.",
-        ("robust/lift.py", "localizer.py"),
+        ("robust/lift.py", "robust/motion_judge.py"),
         (Switch("fgloc.robust.lift:LiftMonitor.observe", Returns([])),),
         Probe("fgloc.robust.lift:LiftMonitor.observe", something),
         batch=True,
@@ -63,7 +63,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "given_pose_held",
         "A given first pose holds against sightings that contradict it from the start.",
-        ("relocalization/tracking_state.py", "localizer.py"),
+        ("relocalization/tracking_state.py", "robust/sighting_judge.py"),
         (Switch(f"{_WHERE}.keeps_initial_pose", _never),),
         Probe(f"{_WHERE}.gate_initial_pose", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,

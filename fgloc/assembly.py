@@ -21,6 +21,7 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model
@@ -69,9 +70,9 @@ class Assembly:
     @property
     def rejections(self) -> Counter[str]:
         """Everything refused by any part so far, by reason."""
-        localizer, gyro = self.localizer, self.localizer.sources.gyro
+        localizer, gyro = self.localizer, self.localizer.motion.sources.gyro
         counters = [self.gate.rejections, self.detections.rejections, self.stepper.rejections, self.wheels.rejections]
-        counters += [self.landmarks.rejections, localizer.rejections, localizer.association.rejections]
+        counters += [self.landmarks.rejections, localizer.rejections]
         counters += [] if self.learned is None else [self.learned.rejections]
         counters += [] if gyro is None else [gyro.rejections]
         total: Counter[str] = Counter()
@@ -181,7 +182,13 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
         camera=camera,
         learned=learned,
         sensors=sensors,
-        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro, sensors),
+        localizer=Localizer(
+            config,
+            landmark_map,
+            MotionSensors(wheels, learned, joint, gyro),
+            PoseSensors(landmarks, sensors),
+            keep_all,
+        ),
         diagnosis=Diagnosis(config, landmark_map, camera, T_base_sensor, seen_by, imu_up),
         notes=tuple(notes),
     )

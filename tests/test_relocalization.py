@@ -13,6 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.localizer import Localizer
 from fgloc.relocalization.global_search import GlobalSearch
 from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.types import (
     Estimate,
     Landmark,
@@ -63,7 +64,7 @@ class Beacons:
 
 def localizer(**estimator) -> Localizer:
     settings = Config.model_validate({"estimator": estimator})
-    return Localizer(settings, MAP, Wheels(), Beacons())
+    return Localizer(settings, MAP, MotionSensors(Wheels()), PoseSensors(Beacons()))
 
 
 def step(index: int, truth, ids: tuple[int, ...], segment: int = 0, shift_ns: int = 0) -> Step:

@@ -6,8 +6,7 @@ import copy
 import threading
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from fgloc import se2
@@ -15,9 +14,11 @@ from fgloc.assembly import Assembly
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.status import LivePose
-from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels import WheelMotion
@@ -53,9 +54,8 @@ class _Anchor:
     known: InstallationBelief
     added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
     mode: Mode
-    blind_s: float
-    off: Mapping[str, str]
-    scale: float
+    since_fix_s: float
+    budget: NoiseBudget
     gyro: Gyro | None
     learned: LearnedMotion | None
     wheels: WheelMotion  # has read the events that were asked for so far
@@ -104,23 +104,23 @@ class Extrapolator:
         localizer = self._parts.localizer
         estimator, installation = localizer.estimator, localizer.factors
         frame = estimator.log.keyframes.get(estimator.k)
-        gyro, learned = localizer.sources.gyro, self._parts.learned
+        gyro, learned = localizer.motion.sources.gyro, self._parts.learned
         body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
         if frame is not None and frame.stamp_ns == estimate.stamp_ns:
             belief = frame.belief
             known = belief.installation or installation.believed
-            off, scale = frame.off, frame.scale
+            budget = replace(frame.budget, overruled_cov=None)  # of that step alone
         else:
-            belief, known, off, scale = PoseWithCovariance(estimate.pose, body), installation.believed, {}, 1.0
+            belief, known = PoseWithCovariance(estimate.pose, body), installation.believed
+            budget = NoiseBudget()
         made = _Anchor(
             stamp_ns=estimate.stamp_ns,
             belief=belief,
             known=known,
             added_cov=body - belief.cov,
             mode=estimate.mode,
-            blind_s=localizer.blind_s,
-            off=off,
-            scale=scale,
+            since_fix_s=localizer.tracking.since_fix_s,
+            budget=budget,
             gyro=None if gyro is None else gyro.fork(),
             wheels=WheelMotion(self._config.wheels),
             learned=None if learned is None or self._model is None else learned.fork(self._model),
@@ -149,8 +149,8 @@ class Extrapolator:
             step = self._step(anchor.stamp_ns, at_ns)
         with self._asked:
             belief, mode = self._carried(anchor, step), anchor.mode
-        blind_s = anchor.blind_s + step.dt
-        if mode is Mode.OK and blind_s > self._config.estimator.dead_reckoning_after_s:
+        since_fix_s = anchor.since_fix_s + step.dt
+        if mode is Mode.OK and since_fix_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
         return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns)
@@ -177,20 +177,19 @@ class Extrapolator:
 
     def _carried(self, anchor: _Anchor, step: Step) -> PoseWithCovariance:
         parts, localizer = self._parts, self._parts.localizer
-        sources = MotionFusion(
-            self._config,
+        sensors = MotionSensors(
             anchor.wheels,
             None if anchor.learned is None else anchor.learned.fork(anchor.learned.model),
-            localizer.sources.joint,
+            localizer.motion.sources.rules.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
-            localizer.factors,
         )
+        sources = MotionSources(self._config, sensors, localizer.factors)
         belief, start_ns = anchor.belief, step.start_ns
         while start_ns < step.stamp_ns:
             end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
             piece = _piece(step, start_ns, end_ns)
-            readings = sources.read(piece, anchor.blind_s + (start_ns - step.start_ns) * 1e-9)
-            motions = sources.combine(readings, anchor.off, anchor.scale) or [sources.unknown(piece, readings)]
+            readings = sources.read(piece, anchor.since_fix_s + (start_ns - step.start_ns) * 1e-9)
+            motions = anchor.budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
             belief = predict(belief, anchor.known, parts.localizer.factors.installation, motions)
             start_ns = end_ns
         return belief
