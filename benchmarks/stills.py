@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
 from fgloc.config import MarkersConfig
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import ImageEvent
 
 _ID = "stills.missed_ids"

@@ -16,7 +16,7 @@ from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     CommandEvent,

@@ -12,7 +12,7 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, posit
 
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Kinematics
 from fgloc.sensors.learned.source import LearnedMotion

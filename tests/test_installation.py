@@ -34,8 +34,8 @@ from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.gyro.rate import Gyro
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

@@ -21,7 +21,7 @@ from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import ImageEvent, ImuEvent, Mode
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"

@@ -13,7 +13,7 @@ from fgloc.robust.glr_test import GlrTest
 from fgloc.robust.motion_faults import MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import MotionMeasurement, MotionReadings, Step
 
 DT = 0.1

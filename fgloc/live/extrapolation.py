@@ -19,9 +19,9 @@ from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     Estimate,

@@ -12,7 +12,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro import Turn
+from fgloc.sensors.gyro.rate import Turn
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgloc.sensors.images import GrayImage
+from fgloc.sensors.markers.images import GrayImage
 from fgloc.types import FloatArray
 
 _ALONG = 12  # profiles on the part of an edge that belongs to a corner

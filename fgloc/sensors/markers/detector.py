@@ -12,9 +12,9 @@ import numpy as np
 from cv2.typing import MatLike
 
 from fgloc.config import MarkersConfig
-from fgloc.sensors.dictionaries import load_dictionary, suggest, turned_by_180
-from fgloc.sensors.edges import refine_corners
-from fgloc.sensors.images import GrayImage, ImageError, decode
+from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
+from fgloc.sensors.markers.edges import refine_corners
+from fgloc.sensors.markers.images import GrayImage, ImageError, decode
 from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent, MarkerCorners
 
 _LOOKAHEAD = 4  # images that may be detected before the consumer asks for them
