@@ -19,7 +19,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parent.parent / "fgloc"
 DECIDING = (
     "localizer.py",
-    "smoothing.py",
+    "replay/smoothing.py",
     "stats.py",
     "robust/*.py",
     "relocalization/*.py",

@@ -120,9 +120,9 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
     Mechanism(
         "batch_learned_again",
         "Batch: the learned motion is evaluated again at the smoothed velocities.",
-        ("smoothing.py",),
-        (Switch("fgloc.smoothing:_measure_again", Returns({})),),
-        Probe("fgloc.smoothing:_measure_again", something),
+        ("replay/smoothing.py",),
+        (Switch("fgloc.replay.smoothing:_measure_again", Returns({})),),
+        Probe("fgloc.replay.smoothing:_measure_again", something),
         batch=True,
     ),
 )

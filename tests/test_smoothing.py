@@ -12,9 +12,9 @@ from fgloc import se2
 from fgloc.assembly import assemble
 from fgloc.config import RecordingConfig
 from fgloc.recording.reader import open_recording
+from fgloc.replay.smoothing import smooth_run, smoothed_velocities
 from fgloc.sensors.learned.load import save_model
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.smoothing import smooth_run, smoothed_velocities
 
 STEP_NS = 100_000_000
 

@@ -15,13 +15,13 @@ from fgloc.diagnosis.image_checks import fitting_dictionary
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.runner import Progress
+from fgloc.replay.options import Progress
+from fgloc.replay.smoothing import smooth_run
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.markers.detector import detect_stream
 from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.smoothing import smooth_run
 from fgloc.types import (
     CornerMeasurement,
     CornersEvent,
