@@ -17,7 +17,7 @@ from benchmarks.mechanisms_switch import (
 )
 
 _GATE = "fgloc.robust.association"
-_SEARCH = "fgloc.relocalization.global_search"
+_SEARCH = "fgloc.relocalization.place_search"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
@@ -39,7 +39,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "place_search",
         "While every sighting is refused, another place that explains them is searched for on the map.",
-        ("relocalization/tracking_state.py", "relocalization/global_search.py"),
+        ("relocalization/tracking_state.py", "relocalization/global_search.py", "relocalization/place_search.py"),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
         batch=True,
@@ -78,14 +78,14 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "start_leave_one_out",
         "A place found from beacons must hold without any one of them.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:GlobalSearch._checked", Returns(True)),),
-        Probe(f"{_SEARCH}:GlobalSearch._checked", lambda checked, *_: not checked),
+        ("relocalization/place_search.py",),
+        (Switch(f"{_SEARCH}:PlaceSearch._checked", Returns(True)),),
+        Probe(f"{_SEARCH}:PlaceSearch._checked", lambda checked, *_: not checked),
     ),
     Mechanism(
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
-        ("relocalization/global_search.py",),
+        ("relocalization/place_search.py",),
         (Switch(f"{_SEARCH}:_TRIMS", Constant(0)),),
     ),
     Mechanism(

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-import fgloc.relocalization.global_search
+import fgloc.relocalization.place_search
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
@@ -117,7 +117,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     config = Config()
     initializer = GlobalSearch(config, standing, LandmarkFactors(standing))
     fits = []
-    search = fgloc.relocalization.global_search
+    search = fgloc.relocalization.place_search
     monkeypatch.setattr(search, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
     for k in range(40):
         at = step(k, np.zeros(3), ())
