@@ -10,10 +10,11 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from datasets.bag import BagWriter
-from fgloc.assembly import assemble, given_pose
+from fgloc.assembly import assemble
 from fgloc.config import Config, RecordingConfig
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
 from fgloc.recording.reader import open_recording
+from fgloc.sensor_setup import given_pose
 from fgloc.sensors.learned.load import save_model
 
 START_NS = 1_700_000_000_000_000_000
@@ -133,14 +134,14 @@ def test_a_sensor_without_transform_is_taken_to_be_at_the_base_and_that_is_said(
 def test_the_learned_model_is_loaded_only_if_it_is_used(tmp_path, motion_model):
     used = build(tmp_path, {"motion": {"model": motion_model}})
     assert used.learned is not None
-    assert used.localizer.sources.joint is not None
+    assert used.localizer.motion.sources.rules.joint is not None
     (tmp_path / "again").mkdir()
     unused = build(tmp_path / "again", {"motion": {"model": motion_model, "use": False}})
     assert unused.learned is None
     (tmp_path / "third").mkdir()
     apart = build(tmp_path / "third", {"motion": {"model": motion_model, "correlation": "independent"}})
     assert apart.learned is not None
-    assert apart.localizer.sources.joint is None
+    assert apart.localizer.motion.sources.rules.joint is None
 
 
 @pytest.fixture
