@@ -4,7 +4,9 @@ A simulated robot, as installed by a careful person (`benchmarks.installed`), dr
 (`datasets.sim.following`). Nothing is told of what is off. ``track_mm``: mean distance of the true path from the curve
 through the waypoints, over the length of the path. Values are means over the seeds, spreads their standard deviations;
 a value ``a_over_b`` is the mean of a over the mean of b, its spread that of the single ratios. ``over_truth``: over a
-drive on the same floor with the true pose. ``reached``: share of the waypoints that the robot has come within 10 cm of.
+drive on the same floor with the true pose. ``no_model_pose``, ``no_model_seconds``: error of the pose that guided the
+robot, and how long it drove, without the learned motion: an uncertain robot slows down and waits. ``reached``: share of
+the waypoints that the robot has come within 10 cm of.
 
 Cases (`datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 8 to 28 s, on ice; onewheel, the left encoder counts nothing in that
@@ -46,12 +48,15 @@ def wanted() -> Iterator[Wanted]:
     for case in ("flat30", "flat20"):
         yield Wanted(f"{case}.track_mm", ((case, "fgloc"),), _mean("track_mm", "mm"))
         yield Wanted(f"{case}.truth.track_mm", ((case, "truth"),), _mean("track_mm", "mm"))
-        yield Wanted(f"{case}.track_over_truth", ((case, "fgloc"), (case, "truth")), _over)
+        yield Wanted(f"{case}.track_over_truth", ((case, "fgloc"), (case, "truth")), _over("track_mm"))
     for case, truth in (("ice", "ice"), ("dark20", "ice"), ("onewheel", "flat30"), ("moved", "flat30")):
         yield Wanted(f"{case}.track_mm", ((case, "fgloc"),), _mean("track_mm", "mm"))
-        yield Wanted(f"{case}.track_over_truth", ((case, "fgloc"), (truth, "truth")), _over)
-    yield Wanted("dark20.no_model_over_model", (("dark20", "fgloc-no-model"), ("dark20", "fgloc")), _over)
-    yield Wanted("ice.wheels_over_fgloc", (("ice", "wheels"), ("ice", "fgloc")), _over)
+        yield Wanted(f"{case}.track_over_truth", ((case, "fgloc"), (truth, "truth")), _over("track_mm"))
+    without = (("dark20", "fgloc-no-model"), ("dark20", "fgloc"))
+    yield Wanted("dark20.no_model_over_model", without, _over("track_mm"))
+    yield Wanted("dark20.no_model_pose_over_model", without, _over("pose_mm"))
+    yield Wanted("dark20.no_model_seconds_over_model", without, _over("seconds"))
+    yield Wanted("ice.wheels_over_fgloc", (("ice", "wheels"), ("ice", "fgloc")), _over("track_mm"))
     for case in ("flat30", "flat20", "ice", "dark20", "onewheel", "moved"):
         yield Wanted(f"{case}.reached", ((case, "fgloc"),), _mean("reached", ""))
 
@@ -90,10 +95,14 @@ def _mean(field: str, unit: str) -> Callable[[str, Sequence[Sequence[Driven]]], 
     return row
 
 
-def _over(row_id: str, drives: Sequence[Sequence[Driven]]) -> Row:
-    """Mean distance from the path over that of other drives."""
-    first, second = (np.array([d.track_mm for d in same]) for same in drives)
-    return Row(row_id, float(first.mean() / second.mean()), float(np.std(first / second)), len(first))
+def _over(field: str) -> Callable[[str, Sequence[Sequence[Driven]]], Row]:
+    """Mean of a figure over that of other drives."""
+
+    def row(row_id: str, drives: Sequence[Sequence[Driven]]) -> Row:
+        first, second = (np.array([float(getattr(d, field)) for d in same]) for same in drives)
+        return Row(row_id, float(first.mean() / second.mean()), float(np.std(first / second)), len(first))
+
+    return row
 
 
 if __name__ == "__main__":
