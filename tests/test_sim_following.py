@@ -73,6 +73,14 @@ def test_a_row_of_waypoints_is_a_straight_line_and_distances_are_from_it() -> No
     np.testing.assert_allclose(curve.distances(np.array([(0.45, 0.02), (1.0, 0.0), (0.1, -0.3)])), (0.02, 0.1, 0.3))
 
 
+def test_waypoints_at_any_distance_make_a_curve() -> None:
+    x = (-2.0, -1.6, -1.2, -0.8, -0.4, 0.0, 0.4, 0.805)
+    curve = Curve(WaypointPath(name="row", waypoints=tuple((at, 0.3 * at) for at in x)))
+    assert (np.diff(curve.along_m) > 1e-3).all()
+    np.testing.assert_allclose(curve.points[curve.at_waypoints, 0], x, atol=1e-12)
+    np.testing.assert_allclose(curve.distances(curve.points), 0.0, atol=1e-9)
+
+
 def test_wrong_paths_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"path 'grid' is not known; there are eight, grid20, grid30"):
         load_path("grid")
