@@ -99,6 +99,7 @@ class Node:
         """
         publishing: threading.Thread | None = None
         teller = Teller(tell)
+        self.intake.truth = self.watch is not None
         next_diagnostics_s = time.monotonic()
         try:
             while not stop.wait(_POLL_S):
