@@ -71,6 +71,11 @@ class EstimationProcess:
         self._closing = False
         self._threads: list[threading.Thread] = []
 
+    @property
+    def ready(self) -> bool:
+        """Whether it has been started up: a run that begins now loses no time."""
+        return bool(self._connection.poll())
+
     def begin(self, settings: Settings, outlet: Outlet) -> None:
         """Set up the run; otherwise as `Estimation`."""
         self._most_images = settings.image_queue
@@ -186,6 +191,8 @@ class EstimationProcess:
                 kind, *content = self._connection.recv()
             except (EOFError, OSError):
                 return self._ended()
+            if kind == "ready":
+                continue
             if kind == "built":
                 outlet.built(*content)
             elif kind == "estimated":
@@ -250,6 +257,7 @@ class _Worker:
     def run(self) -> None:
         """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
         try:
+            self._tell("ready")
             estimation = Estimation(self._connection.recv(), self)
             with ThreadPoolExecutor(_ANSWERING) as pool:
                 while True:

@@ -106,11 +106,11 @@ class Node:
                 if self._failure is not None:
                     raise self._failure
                 teller.waiting(self.intake.find())
-                if self.live is None and self.intake.roles:
+                if self.live is None and self.intake.roles and self._process.ready:
                     self._start()
                     publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
                     publishing.start()
-                for role, topic in self.intake.subscribe():
+                for role, topic in self.intake.subscribe() if self.live is not None else ():
                     teller.tell(f"Subscribed: {topic} ({role}).")
                 status = None if self.live is None else self.live.status()
                 if status is not None:
@@ -193,7 +193,7 @@ class Node:
         self._last_ns = now.stamp_ns
         self._recent.add(now)
         base, odom = self._odom.base, self._odom.latest()
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, self._recent.twist()), base)
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist()), base)
         self.published["odometry"] += 1
         if odom is None:
             self._outputs.transform(now.stamp_ns, now.pose, base)
