@@ -6,6 +6,7 @@ would hold up the threads that receive messages and publish poses.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import os
@@ -256,6 +257,7 @@ class _Worker:
 
     def run(self) -> None:
         """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
+        gc.freeze()  # what was imported stays: nothing is to be collected there
         try:
             self._tell("ready")
             estimation = Estimation(self._connection.recv(), self)
