@@ -31,9 +31,9 @@ from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensors.cameras import camera_from_info
-from fgloc.sensors.images import ImageError
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.images import ImageError
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -59,7 +59,7 @@ DURATION_S = 80.0
 _ROOT = Path(__file__).resolve().parent.parent
 _CAMERA_HZ = 5.0
 _LOOK_EVERY = 50  # messages of the truth: 1 s
-_DETECTOR = [f"fgloc/sensors/{name}.py" for name in ("dictionaries", "edges", "images", "markers")]
+_DETECTOR = [f"fgloc/sensors/markers/{name}.py" for name in ("dictionaries", "edges", "images", "detector")]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

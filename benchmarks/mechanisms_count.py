@@ -24,7 +24,7 @@ DECIDING = (
     "robust/*.py",
     "relocalization/*.py",
     "sensors/learned/joint.py",
-    "sensors/gyro.py",
+    "sensors/gyro/rate.py",
     *(f"graph/{name}.py" for name in ("batch", "isam2", "joint")),
 )
 SECTIONS = ("WeightsConfig", "GateConfig", "EstimatorConfig")

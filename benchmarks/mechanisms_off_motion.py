@@ -17,7 +17,7 @@ from benchmarks.mechanisms_switch import (
 from fgloc.types import FloatArray
 
 _TRUST = "fgloc.robust.motion_faults"
-_GYRO = "fgloc.sensors.gyro"
+_GYRO = "fgloc.sensors.gyro.rate"
 
 
 def _unscaled(real: Function) -> Function:
@@ -113,7 +113,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "gyro_rest_bias",
         "The gyro's bias is learned while the wheels stand.",
-        ("sensors/gyro.py",),
+        ("sensors/gyro/rate.py",),
         (Switch(f"{_GYRO}:Gyro._watch_rest", Returns(None)),),
         Probe(f"{_GYRO}:Gyro._watch_rest", called),
         batch=True,
@@ -121,7 +121,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "gyro_fix_bias",
         "The gyro's bias is learned between two fixes of the yaw.",
-        ("sensors/gyro.py",),
+        ("sensors/gyro/rate.py",),
         (Switch(f"{_GYRO}:Gyro.fix", Returns(None)),),
         Probe(f"{_GYRO}:Gyro.fix", called),
         batch=True,

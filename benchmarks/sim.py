@@ -26,7 +26,7 @@ from datasets.sim.sensors import streams
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
 
 _HALL = World(size_m=(30.0, 30.0))

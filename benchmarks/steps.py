@@ -32,8 +32,8 @@ from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers import MarkerDetector
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.timing import Stopwatch
 from fgloc.types import (
     Camera,

@@ -26,7 +26,7 @@ MAX_FILE_LINES = 300
 
 SENSORS = {  # name -> where it lives in fgloc/sensors, its section of the configuration, classes defined elsewhere
     "wheels": (
-        ("wheels", "odometry", "encoders"),
+        ("wheels",),
         "wheels",
         ("OdometryEvent", "JointStatesEvent", "CommandEvent", "WheelsConfig"),
     ),

@@ -30,7 +30,7 @@ from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, CornersEvent, Estimate, FloatArray, LandmarkMap, MarkerCorners, Step
 
 Pipeline = Literal["marker_poses", "corners", "corners_rules"]

@@ -36,12 +36,12 @@ from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.robust.motion_noise import with_noise
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.timing import Stopwatch
 from fgloc.types import (
     Decision,

@@ -26,8 +26,9 @@ from fgloc.intake.topic_activity import TopicActivity
 from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
-from fgloc.sensors.markers import Detector, detect_stream
-from fgloc.sensors.remembered import RememberedDetections
+from fgloc.sensors.markers.detector import Detector, detect_stream
+from fgloc.sensors.markers.remembered import RememberedDetections
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.smoothing import SmoothedRun, smooth_run
 from fgloc.timing import one_blas_thread
 from fgloc.types import (
@@ -51,12 +52,6 @@ Progress = Callable[[float, float], None]
 """Called with seconds of the recording done, and its length."""
 EventFilter = Callable[[Iterator[Event]], Iterator[Event]]
 """Changes, drops, adds or delays events; what comes after it does not know."""
-
-
-def find_beside(bag: Path, name: str) -> Path | None:
-    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
-    folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
-    return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 class RunOptions(TypedDict, total=False):
@@ -165,7 +160,9 @@ def _replayed(
     """Run all events through the localizer."""
     memory, file = None, options.get("detections")
     if parts.detector is not None:
-        memory = RememberedDetections(file, parts.detector, wrong.detections, note=file is not None)
+        # What a file remembers must not depend on which images came before.
+        detector = TrackingDetector(parts.detector) if file is None else parts.detector
+        memory = RememberedDetections(file, detector, wrong.detections, note=file is not None)
     replay = _Replay(parts, recording, memory, progress, options)
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:

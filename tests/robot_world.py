@@ -15,7 +15,7 @@ from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     CommandEvent,

@@ -14,7 +14,7 @@ from fgloc import se2
 from fgloc.ablation.failures import AnyFailure, Scene, corrupt, generators
 from fgloc.config import Config, WheelsConfig
 from fgloc.frames import quaternion_yaw
-from fgloc.sensors.images import decode
+from fgloc.sensors.markers.images import decode
 from fgloc.types import (
     CommandEvent,
     ImuEvent,

@@ -26,7 +26,7 @@ from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.runner import run
 from fgloc.sensors.base import Context
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import LandmarkMap, OdometryEvent
 

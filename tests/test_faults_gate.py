@@ -24,7 +24,7 @@ from fgloc import se2
 from fgloc.config import GateConfig, WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from robot_world import CAMERA, SPEED, START_NS, TURN, Chain, World, config, nee
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.localizer import Localizer
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Kinematics

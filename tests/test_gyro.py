@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgloc.config import GyroConfig
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.types import ImuEvent, Step
 
 START = 10**18

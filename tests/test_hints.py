@@ -13,7 +13,7 @@ from fgloc.config import Config, RecordingConfig
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.images import decode
+from fgloc.sensors.markers.images import decode
 from fgloc.types import ImageEvent
 
 SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"

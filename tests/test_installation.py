@@ -35,9 +35,9 @@ from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.localizer import Localizer
 from fgloc.robust.motion_fusion import MotionFusion
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CommandEvent,
     CornersEvent,

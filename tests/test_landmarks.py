@@ -15,7 +15,7 @@ from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError
 from fgloc.frames import rpy_matrix
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     CornerMeasurement,
     CornersEvent,

@@ -24,7 +24,7 @@ from fgloc.live import Live
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.types import ImageEvent, ImuEvent, Mode
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
@@ -190,14 +190,14 @@ def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
     sample = SAMPLES / "first_run"
     settings = load_config(sample / "robot.yaml")
     seen = []
-    detect = MarkerDetector.detect
+    detect = TrackingDetector.detect
 
     def slowly(self, event):
         time.sleep(WAITED_S)
         seen.append(event.stamp_ns)
         return detect(self, event)
 
-    monkeypatch.setattr(MarkerDetector, "detect", slowly)
+    monkeypatch.setattr(TrackingDetector, "detect", slowly)
     with open_recording(sample / "bag", settings.recording) as recording:
         events = until(4.0, recording.events())
         images = [e.stamp_ns for e in events if isinstance(e, ImageEvent)]

@@ -13,8 +13,8 @@ from marker_scenes import forward_camera, image_event, project, render, standing
 
 from fgloc.config import MarkersConfig
 from fgloc.errors import ConfigError
-from fgloc.sensors.dictionaries import dictionary_names, load_dictionary
-from fgloc.sensors.markers import MarkerDetector, detect_stream, suggest_dictionary
+from fgloc.sensors.markers.detector import MarkerDetector, detect_stream, suggest_dictionary
+from fgloc.sensors.markers.dictionaries import dictionary_names, load_dictionary
 from fgloc.types import CommandEvent, CornersEvent, Event, ImageEvent
 
 CAMERA = forward_camera()

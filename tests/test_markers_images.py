@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fgloc.sensors.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, decode
 from fgloc.types import ImageEvent
 
 

@@ -23,12 +23,12 @@ from fgloc.robust.decision_log import motion_decisions
 from fgloc.robust.motion_faults import FaultVerdict
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.robust.motion_noise import with_noise
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import CommandEvent, ImuEvent, MotionMeasurement, MotionReadings, Step
 
 W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2

@@ -12,9 +12,9 @@ from fgloc.ablation.records import read_record
 from fgloc.ablation.suite import Suite, expand
 from fgloc.cli.runs import SAMPLE
 from fgloc.config import MarkersConfig
-from fgloc.sensors.images import ImageError
-from fgloc.sensors.markers import MarkerDetector
-from fgloc.sensors.remembered import RememberedDetections
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.markers.remembered import RememberedDetections
 
 DICTIONARY = "DICT_4X4_50"
 

@@ -12,7 +12,7 @@ from datasets.sim.physics import Log, Scene, make_scene, simulate
 from datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
 
 pytestmark = pytest.mark.render

@@ -17,7 +17,7 @@ from datasets.sim.record import record
 from datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, Landmark
 
 pytestmark = pytest.mark.render

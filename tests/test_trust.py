@@ -12,7 +12,7 @@ from fgloc.config import Config, WeightsConfig
 from fgloc.robust.glr_test import GlrTest
 from fgloc.robust.motion_faults import MotionFaultMonitor
 from fgloc.robust.motion_fusion import MotionFusion
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import MotionMeasurement, MotionReadings, Step
 
 DT = 0.1

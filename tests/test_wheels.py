@@ -10,8 +10,8 @@ from event_makers import command, corners, in_order_of_receipt, joints, ns, odom
 from fgloc import se2
 from fgloc.config import NoiseDensity, WheelsConfig
 from fgloc.errors import ConfigError
-from fgloc.sensors.timeline import TwistTimeline
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.sensors.wheels.timeline import TwistTimeline
 
 GEOMETRY = dict(left_radius=0.05, right_radius=0.06, track=0.3)
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config, GyroConfig, WheelsConfig
 from fgloc.intake.event_buffer import EventBuffer
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.card import WheelJoints
 from fgloc.sensors.learned.signals import Signals, signals_of
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent, Step
 
 _STEP_NS = 200_000_000  # of the gyro's filter

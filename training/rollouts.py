@@ -15,7 +15,7 @@ from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
 from fgloc.sensors.learned.forms import MotionModel, calibrated
 from fgloc.sensors.learned.signals import SignalReader
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import FloatArray
 from training.data import Run
 

@@ -25,7 +25,7 @@ from fgloc.config import MarkersConfig
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, LandmarkMap
 
 _STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.spines.top": False, "axes.spines.right": False}

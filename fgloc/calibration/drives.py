@@ -17,9 +17,9 @@ from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.runner import Progress
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.markers import detect_stream
+from fgloc.sensors.markers.detector import detect_stream
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.smoothing import smooth_run
 from fgloc.types import (
     CornerMeasurement,

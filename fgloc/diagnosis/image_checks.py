@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import islice
 
 from fgloc.recording.reader import Recording
-from fgloc.sensors.images import GrayImage, ImageError, decode
-from fgloc.sensors.markers import MarkerDetector, suggest_dictionary
+from fgloc.sensors.markers.detector import MarkerDetector, suggest_dictionary
+from fgloc.sensors.markers.images import GrayImage, ImageError, decode
 from fgloc.types import ImageEvent
 
 _IMAGES = 5  # looked at, spread over the recording

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc.config import Config, Role
 from fgloc.errors import ConfigError
-from fgloc.sensors.encoders import wheel_names
+from fgloc.sensors.wheels.encoders import wheel_names
 from fgloc.types import Event, FloatArray, JointsEvent
 
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps that differ more from the receive times are of another clock

@@ -9,7 +9,7 @@ from typing import Protocol
 from fgloc.config import Role
 from fgloc.recording.reader import Recording
 from fgloc.recording.transforms import FrameTree
-from fgloc.sensors.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, decode
 from fgloc.types import Camera, Event, ImageEvent
 
 _SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded is looked for

@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion

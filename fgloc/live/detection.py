@@ -7,8 +7,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
 
-from fgloc.sensors.images import ImageError
-from fgloc.sensors.markers import Detector, use_one_thread
+from fgloc.sensors.markers.detector import Detector, use_one_thread
+from fgloc.sensors.markers.images import ImageError
 from fgloc.types import CornersEvent, Event, ImageEvent
 
 

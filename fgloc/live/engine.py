@@ -13,6 +13,7 @@ from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import role_of
 from fgloc.live.run import OnlineRun
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, ImageEvent, Step
 
@@ -190,7 +191,8 @@ class Engine:
                 self._admit(self._held.popleft())
 
     def _build(self) -> None:
-        self.worker.detector = self._run.build().detector
+        detector = self._run.build().detector
+        self.worker.detector = None if detector is None else TrackingDetector(detector)
         assert self._run.anchors is not None
         self._outlet.built(self._run.anchors.parts)
 

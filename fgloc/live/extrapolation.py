@@ -20,7 +20,7 @@ from fgloc.live.status import LivePose
 from fgloc.robust.motion_fusion import MotionFusion
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import CommandEvent, Event, ImuEvent, JointsEvent, Mode, OdometryEvent, Step
 
 HISTORY_S = 5.0  # poses further back than this are not told

@@ -6,11 +6,11 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from fgloc.assembly import base_frame, given_pose
 from fgloc.config import Config, Role, role_names
 from fgloc.recording.transforms import FrameTree
+from fgloc.sensor_setup import base_frame, given_pose
 from fgloc.sensors import registry
-from fgloc.sensors.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, decode
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

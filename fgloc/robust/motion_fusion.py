@@ -12,10 +12,10 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.robust.motion_noise import add_slip_noise, is_commanded_to_move, noise_scales, turned_by, with_noise
-from fgloc.sensors.gyro import Gyro, Turn
+from fgloc.sensors.gyro.rate import Gyro, Turn
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position

@@ -10,9 +10,9 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.wheels import WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     CornerMeasurement,
     FloatArray,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Scene
-from fgloc.sensors.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, decode
 from fgloc.types import Event, ImageEvent
 
 

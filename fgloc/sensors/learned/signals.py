@@ -11,8 +11,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fgloc.sensors.encoders import wheel_names
 from fgloc.sensors.learned.card import ModelCard, WheelJoints
+from fgloc.sensors.wheels.encoders import wheel_names
 from fgloc.types import FloatArray, ImuEvent, JointsEvent, Step
 
 MAX_GAP_S = 0.25  # a signal that was silent for longer has a hole

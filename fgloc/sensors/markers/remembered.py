@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from fgloc.files.atomic import atomic_file
-from fgloc.sensors.markers import Detector
+from fgloc.sensors.markers.detector import Detector
 from fgloc.types import CornersEvent, ImageEvent, MarkerCorners
 
 Detections = tuple[MarkerCorners, ...]

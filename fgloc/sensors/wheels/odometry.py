@@ -8,8 +8,8 @@ from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.frames import quaternion_yaw
-from fgloc.sensors.timeline import Twist
-from fgloc.sensors.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
+from fgloc.sensors.wheels.timeline import Twist
+from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
 from fgloc.types import OdometryEvent
 
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
-from fgloc.sensors.timeline import Twist
-from fgloc.sensors.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
+from fgloc.sensors.wheels.timeline import Twist
+from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
 from fgloc.types import FloatArray, JointsEvent
 
 _PATIENCE = 20  # messages without the wheels' joints before that is said

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fgloc.config import WheelsConfig
-from fgloc.sensors.timeline import Twist, TwistTimeline
+from fgloc.sensors.wheels.timeline import Twist, TwistTimeline
 from fgloc.types import CommandEvent, Step
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset

@@ -9,10 +9,10 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import WheelsConfig
-from fgloc.sensors.encoders import TicksTrack
-from fgloc.sensors.odometry import OdometryTrack
-from fgloc.sensors.timeline import TwistTimeline
-from fgloc.sensors.tracks import CommandTrack, Track
+from fgloc.sensors.wheels.encoders import TicksTrack
+from fgloc.sensors.wheels.odometry import OdometryTrack
+from fgloc.sensors.wheels.timeline import TwistTimeline
+from fgloc.sensors.wheels.tracks import CommandTrack, Track
 from fgloc.types import FloatArray, MotionMeasurement, Step
 
 _TRACKS: dict[str, type[Track]] = {

@@ -1,0 +1,1 @@
+"""Yaw rate of an IMU as a motion source."""

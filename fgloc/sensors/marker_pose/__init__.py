@@ -1,0 +1,1 @@
+"""Poses of markers, as another node has estimated them from single views."""

@@ -1,0 +1,1 @@
+"""Markers in images: found by their corners, each corner a direction from the camera."""

@@ -1,0 +1,1 @@
+"""Ranges with bearings of landmarks."""
