@@ -70,6 +70,7 @@ class Node:
         self._messages = participant.messages
         self._failure: FglocError | None = None
         self._notes: list[str] = []  # to be told
+        self._given: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # pose and sigmas, before the run begins
         self._stopping = threading.Event()
         self._last_ns = 0  # stamp of the last odometry published
         self._last_odom_ns = 0
@@ -129,6 +130,7 @@ class Node:
         """The topics are known: whose first messages come soon belongs to the run from its beginning."""
         roles = tuple(self.intake.roles)
         self.live = Live(self._config, self._landmarks, state=self._state, roles=roles, process=self._process)
+        self._take_given(self.live)
         self._recent = RecentPoses(self.live.pose_at)
         for callback in self._subscribers:
             self.live.subscribe(callback)
@@ -155,16 +157,22 @@ class Node:
         if frame not in ("", MAP_FRAME):
             self._notes.append(f"{_INITIAL_POSE} is in frame {frame!r}, expected {MAP_FRAME!r}: not used.")
             return
-        if self.live is None:
-            self._notes.append(f"{_INITIAL_POSE} came before the robot's topics: not used.")
-            return
         pose, variances = message.pose.pose, np.asarray(message.pose.covariance)[[0, 7, 35]]
         if not (variances > 0.0).all():
             variances = np.square(self._config.estimator.initial_sigmas)
         q = pose.orientation
         yaw = quaternion_yaw((q.x, q.y, q.z, q.w))
+        self._given = (pose.position.x, pose.position.y, yaw), tuple(np.sqrt(variances).tolist())
+        if self.live is not None:
+            self._take_given(self.live)
+
+    def _take_given(self, live: Live) -> None:
+        """Go on from the pose that was given last, if one was."""
+        given, self._given = self._given, None
+        if given is None:
+            return
         try:
-            self.live.reset_pose((pose.position.x, pose.position.y, yaw), np.sqrt(variances).tolist())
+            live.reset_pose(*given)
         except FglocError as error:
             self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
 
