@@ -154,28 +154,36 @@ def test_poses_on_the_wire_are_those_of_an_online_run(tmp_path, monkeypatch):
 
 
 def test_a_pose_told_on_the_wire_moves_the_robot_and_its_odometry_frame(tmp_path):
-    """Dead reckoning on a circle from a configured pose; then somebody corrects it."""
+    """Dead reckoning on a circle from a pose that is given before there is anything else; then somebody corrects it."""
     bag = write_drive(tmp_path / "run")  # 10 s
     topics = {"image": "none", "sightings": "none", "command": "none", "joints": "none"}
-    config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (1.0, 2.0, 0.0)}})
+    config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (9.0, 9.0, 0.0)}})
     stop = threading.Event()
-    with Session(config) as session, Participant(DOMAIN) as one, Player(bag, one) as player:
-        assert player.wait_for_readers(20.0)
+    with Session(config) as session, Participant(DOMAIN) as one:
         writer = one.writer("/initialpose", POSE)
-        playing = threading.Thread(target=player.play, args=(3.0, stop))
-        playing.start()
-        assert wait_until(lambda: len(session.heard["/tf"]) > 20 and writer.readers)
-        (before,) = session.heard["/tf"][-1][1].transforms
-        for frame, x in (("somewhere", 90.0), ("map", 50.0)):
+
+        def give(frame, x, y, yaw):
             variances = np.zeros((6, 6))
             variances[[0, 1, 5], [0, 1, 5]] = 1e-4
-            pose = {"position": {"x": x, "y": -7.0}, "orientation": dict(zip("xyzw", yaw_quaternion(1.0), strict=True))}
+            pose = {"position": {"x": x, "y": y}, "orientation": dict(zip("xyzw", yaw_quaternion(yaw), strict=True))}
             message = {"header": {"frame_id": frame}, "pose": {"pose": pose, "covariance": variances.ravel()}}
             writer.write(one.messages.encode(POSE, message))
+
+        assert wait_until(lambda: writer.readers)
+        give("map", 1.0, 2.0, 0.0)
+        player = Player(bag, one)
+        assert player.wait_for_readers(20.0)
+        playing = threading.Thread(target=player.play, args=(3.0, stop))
+        playing.start()
+        assert wait_until(lambda: len(session.heard["/tf"]) > 20)
+        (before,) = session.heard["/tf"][-1][1].transforms
+        give("somewhere", 90.0, -7.0, 1.0)
+        give("map", 50.0, -7.0, 1.0)
         assert wait_until(lambda: session.heard["/fgloc/odometry"][-1][1].pose.pose.position.x > 40.0)
         assert wait_until(lambda: any("frame 'somewhere'" in sentence for sentence in session.told))
         stop.set()
         playing.join()
+        player.close()
     t = before.transform.translation
     assert (t.x, t.y) == pytest.approx((1.0, 2.0), abs=0.05)
     _, poses = session.planar("/fgloc/odometry")
