@@ -266,6 +266,11 @@ def test_a_keyframe_that_moves_the_robot_is_no_motion():
             assert recent.twist()[0] == pytest.approx([0.4, 0.0, 0.5], abs=1e-6)
         if k > 5:
             assert recent.twist()[1].diagonal() == pytest.approx(growth.diagonal() / SPAN_S, rel=0.1)
+    later = pose_at(59 * 20_000_000 + 20_000_000)
+    ahead = recent.ahead(later.stamp_ns)
+    assert ahead.pose == pytest.approx(later.pose, abs=1e-9)
+    assert ahead.cov.diagonal() == pytest.approx(later.cov.diagonal(), rel=0.02)
+    assert recent.ahead(later.stamp_ns + 1_000_000_000) is None
     between = 59 * 20_000_000 - 30_000_000
     assert recent.at(between) == pytest.approx(pose_at(between).pose, abs=1e-4)  # linear between two poses
     assert recent.at(0) is None

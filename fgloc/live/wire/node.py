@@ -25,6 +25,7 @@ from fgloc.live.wire.teller import Teller
 from fgloc.types import Estimate, Event, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
+_ASKED_EVERY = 2  # turns: the motion sources are asked at 25 Hz, which is most of the work; between, the twist is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
 _INITIAL_POSE = "/initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -72,6 +73,7 @@ class Node:
         self._notes: list[str] = []  # to be told
         self._given: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # pose and sigmas, before the run begins
         self._stopping = threading.Event()
+        self._turn = 0  # of publishing
         self._last_ns = 0  # stamp of the last odometry published
         self._last_odom_ns = 0
         if landmarks is not None:
@@ -195,11 +197,15 @@ class Node:
 
     def _publish_once(self) -> None:
         assert self.live is not None
-        now = self.live.pose_at(self._clock.now_ns()) or self.live.pose_at()
+        clock_ns = self._clock.now_ns()
+        self._turn += 1
+        ahead = self._recent.ahead(clock_ns) if self._turn % _ASKED_EVERY else None
+        now = ahead or self.live.pose_at(clock_ns) or self.live.pose_at()
         if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
             return
+        if ahead is None:
+            self._recent.add(now)
         self._last_ns = now.stamp_ns
-        self._recent.add(now)
         base, odom = self._odom.base, self._odom.latest()
         self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist()), base)
         self.published["odometry"] += 1
