@@ -43,7 +43,7 @@ class CornerBatch:
         self._twist = np.array([m.twist for m in seen])
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
-        self._moved = [None if m.motion_cov is None else _root(m.motion_cov) for m in seen]
+        self._moved = _roots([m.motion_cov for m in seen])
         self._outward, self._small = _shrinking(self._pixels)
         self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
         self._noise_px = np.hypot(self._sigma, self._blur_px)
@@ -161,6 +161,16 @@ class CornerBatch:
         along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
         return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
 
+    def shared_all(self, stack: Stacked) -> FloatArray:
+        """`shared` of all sightings ``(m, 8, s)``; columns that one lacks are 0."""
+        shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
+        jitter = self._jitter[:, None] * stack.H[:, :, 11]
+        common = np.stack([shrunk, jitter], axis=2)
+        if all(moved is None for moved in self._moved):
+            return common
+        roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
+        return np.concatenate([common, stack.J @ roots], axis=2)
+
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
         shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
@@ -196,7 +206,12 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def _root(cov: FloatArray) -> FloatArray:
-    """A square root of a covariance that may be singular."""
-    values, vectors = np.linalg.eigh(cov)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+def _roots(covs: Sequence[FloatArray | None]) -> list[FloatArray | None]:
+    """Square roots of covariances ``(3, 3)`` that may be singular; of one that several share, once."""
+    kept = {id(cov): cov for cov in covs if cov is not None}
+    if not kept:
+        return [None] * len(covs)
+    values, vectors = np.linalg.eigh(np.array(list(kept.values())))
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    by_id: dict[int, FloatArray] = dict(zip(kept, roots, strict=True))
+    return [None if cov is None else by_id[id(cov)] for cov in covs]
