@@ -22,6 +22,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
+from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     CornerMeasurement,
@@ -127,7 +128,7 @@ class BatchSmoother:
         Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
         keyframe; a sighting that is left out counts as the least that would be refused.
         """
-        total = float(self._of_motion().error(self._values))
+        total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
         held = [(*frame.sightings, *frame.refused) for frame in self.frames]
         seen = [s for some in held for s in some]
         if not self._factors.known or not seen:
@@ -141,6 +142,13 @@ class BatchSmoother:
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total
+
+    def _cost_of_installation(self) -> float:
+        """Of its prior, where that is not among the priors of the poses."""
+        if self._sightings is None or not len(self._factors.installation):
+            return 0.0
+        prior = self._factors.installation.prior()
+        return 0.5 * float(np.sum((whitening_of(prior.cov) @ (self._theta() - prior.mean)) ** 2))
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.
@@ -188,6 +196,7 @@ class BatchSmoother:
         self._solved = None
         for _ in range(_LINEARIZATIONS):
             poses, theta = self.poses(), self._theta()
+            self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
             graph = self._linearized()
             start = self._values if self._factors.known else without_orphans(self._values, graph)
             values = self._solve(graph, start)
@@ -220,8 +229,9 @@ class BatchSmoother:
         return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
+        """Of the poses, and of an installation that no sightings of a known map bring in."""
         installation = self._factors.installation
-        if len(installation):
+        if len(installation) and self._sightings is None:
             prior = installation.prior()
             yield gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))
         for frame in self.frames:

@@ -16,9 +16,10 @@ from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Stacked
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.graph.noise_models import whitening_of
+from fgloc.graph.observation import Observations
 from fgloc.types import FloatArray, IntArray, MotionMeasurement
 
-_AT_ONCE = 2000  # images whose Jacobians are held at the same time: each may have megabytes
+_AT_ONCE = 1000  # keyframes whose sightings are linearized at the same time: each may have 100 kB of Jacobians
 
 
 class BatchMotions:
@@ -74,34 +75,71 @@ class BatchMotions:
 
 
 class BatchSightings:
-    """Sightings of a known map from all keyframes, one factor an image, as `sighting_factors` makes them."""
+    """Sightings of a known map from all keyframes, and the prior of the installation.
+
+    Of each image only what concerns its pose becomes a factor: an orthogonal transform of its rows leaves three in
+    which the pose is, and the others, which hold the installation alone, are summed up over the whole recording. The
+    solution is that of `sighting_factors`, in a tenth of the memory.
+    """
 
     def __init__(
         self, frames: Sequence[Keyframe], accepted: Sequence[Sequence[LandmarkFactor]], factors: LandmarkFactors
     ) -> None:
         """Prepare what was accepted at each keyframe."""
-        held = [(i, frame.k, s) for i, (frame, some) in enumerate(zip(frames, accepted, strict=True)) for s in some]
-        self._row = np.array([i for i, _, _ in held], dtype=np.int64)  # of its keyframe, by sighting
-        self._k = np.array([k for _, k, _ in held], dtype=np.int64)
-        self._sightings = [s for _, _, s in held]
-        self._observed = factors.observe([s.measurement for s in self._sightings])
-        stamps = np.array([s.measurement.stamp_ns for s in self._sightings], dtype=np.int64)
-        order = np.lexsort((stamps, self._row))
-        new = np.flatnonzero(np.diff(stamps[order]) | np.diff(self._row[order])) + 1
-        self._images = np.split(order, new) if len(order) else []
+        self._installation = factors.installation
+        self._chunks: list[_Images] = []
+        for first in range(0, len(frames), _AT_ONCE):
+            chosen = range(first, min(first + _AT_ONCE, len(frames)))
+            held = [(i, frames[i].k, s) for i in chosen for s in accepted[i]]
+            if held:
+                self._chunks.append(_Images(held, factors))
 
     def factors(self, poses: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
         """All factors, linear about poses ``(n, 3)`` of the keyframes and an installation ``(p,)``."""
-        if not self._sightings:
-            return
+        rest = np.zeros((len(theta) + 1, len(theta) + 1))  # information of the installation, and its last column
+        for chunk in self._chunks:
+            yield from chunk.factors(poses, theta, rest)
+        if len(theta):
+            yield self._of_installation(theta, rest)
+
+    def _of_installation(self, theta: FloatArray, rest: FloatArray) -> gtsam.NonlinearFactor:
+        """Its prior, and all that the sightings tell of it alone."""
+        prior = self._installation.prior()
+        W = whitening_of(prior.cov)
+        both = np.column_stack([W, W @ (theta - prior.mean)])
+        total = both.T @ both + rest
+        n = len(theta)
+        root = np.linalg.cholesky(total[:n, :n]).T
+        residual = np.linalg.solve(root.T, total[:n, n])
+        A = np.vstack([root, np.zeros(n)])  # the last row is what no installation can explain
+        b = np.append(residual, np.sqrt(max(0.0, total[n, n] - float(residual @ residual))))
+        values = gtsam.Values()
+        values.insert(INSTALLATION, theta)
+        linear = gtsam.JacobianFactor(INSTALLATION, A, -b, gtsam.noiseModel.Unit.Create(n + 1))
+        return gtsam.LinearContainerFactor(linear, values)
+
+
+class _Images:
+    """The images of some keyframes."""
+
+    def __init__(self, held: Sequence[tuple[int, int, LandmarkFactor]], factors: LandmarkFactors) -> None:
+        """Take the sightings, each with the row and the number of its keyframe."""
+        self._row = np.array([i for i, _, _ in held], dtype=np.int64)
+        self._k = np.array([k for _, k, _ in held], dtype=np.int64)
+        self._sightings = [s for _, _, s in held]
+        self._observed = Observations([s.measurement for s in self._sightings], factors.landmarks, factors.installation)
+        stamps = np.array([s.measurement.stamp_ns for s in self._sightings], dtype=np.int64)
+        order = np.lexsort((stamps, self._row))
+        new = np.flatnonzero(np.diff(stamps[order]) | np.diff(self._row[order])) + 1
+        self._images = np.split(order, new)
+
+    def factors(self, poses: FloatArray, theta: FloatArray, rest: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """As `BatchSightings.factors`; what concerns the installation alone is added to ``rest``."""
         own = poses[self._row]
-        if len(self._observed.batches) > 1:
-            yield from self._one_by_one(own, theta)
-            return
-        ((_, batch),) = self._observed.batches
-        stack = batch.evaluate(own, theta)
-        shared = batch.shared_all(stack)
-        if shared is None:
+        (_, batch), *others = self._observed.batches
+        stack = None if others else batch.evaluate(own, theta)
+        shared = None if stack is None else batch.shared_all(stack)
+        if stack is None or shared is None:
             yield from self._one_by_one(own, theta)
             return
         if not np.isfinite(shared).all():
@@ -109,34 +147,29 @@ class BatchSightings:
         ahead = [image[~stack.behind[image]] for image in self._images]
         for size in sorted({len(image) for image in ahead} - {0}):
             same = np.array([image for image in ahead if len(image) == size])
-            for chosen in np.split(same, range(_AT_ONCE, len(same), _AT_ONCE)):
-                yield from self._of_size(chosen, stack, shared, own, theta)
+            white = whitened(_rows(same, stack, len(theta)), shared[same].reshape(len(same), -1, shared.shape[2]))
+            yield from self._of_poses(same[:, 0], white, own, theta, rest)
 
-    def _of_size(
-        self, chosen: IntArray, stack: Stacked, shared: FloatArray, own: FloatArray, theta: FloatArray
+    def _of_poses(
+        self, first: IntArray, white: FloatArray, own: FloatArray, theta: FloatArray, rest: FloatArray
     ) -> Iterator[gtsam.NonlinearFactor]:
-        """Factors of images ``(g, m)`` with equally many sightings."""
-        g, m = chosen.shape
-        d, n = stack.residual.shape[1], len(theta)
-        A = np.zeros((g, m, d, 3 + n + 1 + 1))  # pose, installation, a place for what is no state, residual
-        A[..., :3] = stack.J[chosen]
-        columns = np.where(stack.columns[chosen] >= 0, 3 + stack.columns[chosen], 3 + n)
-        np.put_along_axis(A, columns[:, :, None].repeat(d, axis=2), stack.H[chosen], axis=3)
-        A[..., -1] = stack.residual[chosen]
-        white = whitened(A.reshape(g, m * d, -1), shared[chosen].reshape(g, m * d, -1))
-        noise = gtsam.noiseModel.Unit.Create(m * d)
-        for first, rows in zip(chosen[:, 0], white, strict=True):
-            key = pose_key(int(self._k[first]))
+        """Factors of images, of which these are the first sightings, from white rows ``(g, d, 3 + n + 1)``."""
+        Q, R = np.linalg.qr(white[:, :, :3])
+        others = white[:, :, 3:]
+        top = np.swapaxes(Q, 1, 2) @ others
+        flat, flat_top = others.reshape(-1, others.shape[2]), top.reshape(-1, others.shape[2])
+        rest += flat.T @ flat - flat_top.T @ flat_top
+        noise = gtsam.noiseModel.Unit.Create(R.shape[1])
+        keys = [pose_key(k) for k in self._k[first].tolist()]
+        for key, pose, by_pose, by_rest in zip(keys, own[first], R, top, strict=True):
             values = gtsam.Values()
-            values.insert(key, gtsam.Pose2(*own[first]))
-            blocks: list[Any] = [key, rows[:, :3]]
-            if n:
+            values.insert(key, gtsam.Pose2(*pose))
+            blocks: list[Any] = [key, by_pose]
+            if len(theta):
                 values.insert(INSTALLATION, theta)
-                blocks += [INSTALLATION, rows[:, 3 : 3 + n]]
-            yield gtsam.LinearContainerFactor(
-                gtsam.JacobianFactor(*blocks, -rows[:, -1], noise),  # type: ignore[call-overload]
-                values,
-            )
+                blocks += [INSTALLATION, by_rest[:, :-1]]
+            linear = gtsam.JacobianFactor(*blocks, -by_rest[:, -1], noise)  # type: ignore[call-overload]
+            yield gtsam.LinearContainerFactor(linear, values)
 
     def _one_by_one(self, own: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
         """Of recordings with sightings of several kinds."""
@@ -147,6 +180,18 @@ class BatchSightings:
             if ahead:
                 sightings, some = [self._sightings[i] for i in ahead], [lines[i] for i in ahead]
                 yield from sighting_factors(int(self._k[start]), sightings, some, own[start], theta)
+
+
+def _rows(chosen: IntArray, stack: Stacked, n: int) -> FloatArray:
+    """Rows ``(g, m d, 3 + n + 1)`` of images ``(g, m)`` with equally many sightings: Jacobians, residual."""
+    g, m = chosen.shape
+    d = stack.residual.shape[1]
+    A = np.zeros((g, m, d, 3 + n + 2))  # with a place for what is no state
+    A[..., :3] = stack.J[chosen]
+    columns = np.where(stack.columns[chosen] >= 0, 3 + stack.columns[chosen], 3 + n + 1)
+    np.put_along_axis(A, columns[:, :, None].repeat(d, axis=2), stack.H[chosen], axis=3)
+    A[..., 3 + n] = stack.residual[chosen]
+    return A[..., :-1].reshape(g, m * d, 3 + n + 1)
 
 
 def whitenings(covs: Sequence[FloatArray]) -> FloatArray:

@@ -34,10 +34,13 @@ class CornerBatch:
         self._local = half[:, None, None] * square  # (m, 4, 3) in the marker's frame
         self._position = np.array([landmark.position for landmark in held])
         self._rotation = np.array([landmark.rotation for landmark in held])
-        T = np.array([m.camera.T_base_cam for m in seen])
+        cameras = {id(m.camera): m.camera for m in seen}
+        order = {camera: i for i, camera in enumerate(cameras)}
+        of = np.array([order[id(m.camera)] for m in seen])
+        T = np.array([camera.T_base_cam for camera in cameras.values()])[of]
         self._R, self._t = T[:, :3, :3], T[:, :3, 3]
-        self._K = np.array([m.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for m in seen])
-        self._D = np.array([np.concatenate([m.camera.D, np.zeros(4)])[:4] for m in seen])
+        self._K = np.array([camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras.values()])[of]
+        self._D = np.array([np.concatenate([camera.D, np.zeros(4)])[:4] for camera in cameras.values()])[of]
         self._pixels = np.array([m.corners_px for m in seen])
         self._sigma = np.array([m.sigma_px for m in seen])
         self._twist = np.array([m.twist for m in seen])
