@@ -7,8 +7,8 @@ the time that detection and update take.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import count
 from operator import itemgetter
@@ -112,7 +112,8 @@ def _drive(drive: Drive, scene: Scene, bag_folder: Path) -> Followed:
         bag = stack.enter_context(BagWriter(bag_folder, compress=True, tap=arrivals.take))
         channels = streams(scene, simulation.log, bag, camera=drive.sees)
         for channel in channels:
-            stack.callback(channel.close)
+            if isinstance(channel, Generator):  # the drive may end before its messages do
+                stack.enter_context(closing(channel))
         pursuit = Pursuit(curve, drive.path.speed_m_s, drive.settings)
         loop = ClosedLoop(Written(channels), arrivals, sensors, source, pursuit, scene.scenario.control.rest_s)
         log = simulation.run(loop)
