@@ -31,6 +31,7 @@ from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import Sees, stamp_ns, streams
 from fgloc.ablation.failures import Failure
 from fgloc.config import Config, Role, config_of
+from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.decode import events_of
 from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent
@@ -82,10 +83,16 @@ def follow(drive: Drive, out: Path | None = None) -> Followed:
     """Drive once, into ``out`` if it is given: a run's folder as of `record`, ``following.csv`` and ``following.yaml``.
 
     Raises:
-        ConfigError: a failure that a driving robot cannot have.
+        ConfigError: a failure that a driving robot cannot have, or fgloc is to guide a robot that sees nothing.
         SimulationError: the physics diverged.
         RenderError: images are wanted and there is no OpenGL.
     """
+    blind = drive.scenario.camera is None or drive.sees == "nothing"
+    if drive.pose.startswith("fgloc") and blind:
+        raise ConfigError(
+            f"scenario '{drive.scenario.name}' shows the robot no markers, so that {drive.pose} never knows where it is; "
+            "give it a camera, or --pose truth, wheels or learned"
+        )
     with ExitStack() as stack:
         if out is None:
             from tempfile import TemporaryDirectory
