@@ -90,7 +90,7 @@ def follow(drive: Drive, out: Path | None = None) -> Followed:
     blind = drive.scenario.camera is None or drive.sees == "nothing"
     if drive.pose.startswith("fgloc") and blind:
         raise ConfigError(
-            f"scenario '{drive.scenario.name}' shows the robot no markers, so that {drive.pose} never knows where it is; "
+            f"scenario '{drive.scenario.name}' shows the robot no markers: {drive.pose} would never know where it is; "
             "give it a camera, or --pose truth, wheels or learned"
         )
     with ExitStack() as stack:
