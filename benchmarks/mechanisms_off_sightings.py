@@ -102,7 +102,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "overruled_prediction",
         "Refused sightings of two landmarks that agree on a place nearby widen the motion and are fused.",
-        ("robust/association.py", "localizer.py"),
+        ("robust/association.py", "robust/sighting_judge.py"),
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
         batch=True,

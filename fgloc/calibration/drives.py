@@ -15,12 +15,13 @@ from fgloc.diagnosis.image_checks import fitting_dictionary
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.runner import Progress
+from fgloc.replay.options import Progress
+from fgloc.replay.smoothing import smooth_run
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.markers.detector import detect_stream
 from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.smoothing import smooth_run
 from fgloc.types import (
     CornerMeasurement,
     CornersEvent,
@@ -66,7 +67,8 @@ class Drive:
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
         sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
-        moved = MotionCompensation(sensor, wheels, self.parts.localizer.sources.gyro, config.camera.time_jitter_s)
+        motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
+        moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[CornerMeasurement]] = []
         for frame in self.frames:
             found = []
