@@ -22,7 +22,7 @@ from fgloc.graph.factors import (
     prior_factor,
     sighting_factors,
 )
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.stats import chi2_bound
 from fgloc.types import (
@@ -107,25 +107,25 @@ class BatchSmoother:
             frame.motions = motions.get(frame.k, frame.motions)
         self._optimize()
 
-    def installed(self) -> InstallationBelief:
+    def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found."""
         n = len(self._factors.installation)
         if not n:
-            return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
+            return InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
         marginals = self._marginals()
-        return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+        return InstallationEstimate(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def cost(self) -> float:
         """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
 
         Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
-        keyframe; a sighting that is left out counts as the least that would be refused.
+        keyframe; a sighting that is left out counts as the least that would be rejected.
         """
         total = float(self._of_motion().error(self._values))
         seen = [
             (pose, s)
             for frame, pose in zip(self.frames, self.poses(), strict=True)
-            for s in (*frame.sightings, *frame.refused)
+            for s in (*frame.sightings, *frame.rejected)
         ]
         if not self._factors.known or not seen:
             factors = [f for held in self.accepted.values() for s in held for f in s.factors]
