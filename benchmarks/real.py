@@ -24,7 +24,8 @@ from fgloc.recording.reader import open_recording
 from fgloc.runner import find_beside, run
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
-from fgloc.types import RangeBearingEvent, RangeBearingMeasurement, RunResult
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.types import RangeBearingMeasurement, RunResult
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 from benchmarks.common import Row, main, not_run
 from fgloc.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.types import ImageEvent
+from fgloc.sensors.markers.events import ImageEvent
 
 _ID = "stills.missed_ids"
 _DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
@@ -67,7 +67,7 @@ def outcomes(folder: Path) -> Iterator[Outcome]:
     for still in STILLS:
         own_file = Path(still.dictionary).suffix != ""
         detector = MarkerDetector(str(folder / still.dictionary) if own_file else still.dictionary, MarkersConfig())
-        found = Counter(s.marker_id for s in detector.detect(_image(folder / still.file)).sightings)
+        found = Counter(s.landmark_id for s in detector.detect(_image(folder / still.file)).sightings)
         listed = Counter(still.ids)
         yield Outcome(still, tuple((listed - found).elements()), tuple((found - listed).elements()))
 

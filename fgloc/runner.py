@@ -27,15 +27,14 @@ from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers.detector import Detector, detect_stream
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.markers.remembered import RememberedDetections
 from fgloc.smoothing import SmoothedRun, smooth_run
 from fgloc.timing import one_blas_thread
 from fgloc.types import (
-    CornersEvent,
     Decision,
     Estimate,
     Event,
-    ImageEvent,
     InstallationFound,
     RunResult,
     SensorEvent,

@@ -15,19 +15,16 @@ from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError
 from fgloc.frames import rpy_matrix
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     CornerMeasurement,
-    CornersEvent,
     FloatArray,
     Landmark,
     LandmarkMap,
-    MarkerCorners,
-    MarkerPose,
     MarkerPoseMeasurement,
-    MarkerPosesEvent,
-    RangeBearing,
-    RangeBearingEvent,
     RangeBearingMeasurement,
 )
 
@@ -106,7 +103,7 @@ def test_fault_43_ids_of_a_larger_dictionary_are_rejected() -> None:
     image = image_event(render(CAMERA, (0, 0, 0), [mine, foreign], "DICT_4X4_1000", rng))
     sensor = LandmarkSensor(Config(), known(mine), CAMERA, None)
     found = MarkerDetector("DICT_4X4_1000", Config().markers).detect(image)
-    assert [s.marker_id for s in found.sightings] == [3, 512]
+    assert [s.landmark_id for s in found.sightings] == [3, 512]
     assert [m.landmark_id for m in sensor.measure(found)] == [3]
     assert sensor.rejections == {"sightings.unknown_id": 1}
 

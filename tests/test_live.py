@@ -21,8 +21,10 @@ from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.types import ImageEvent, ImuEvent, Mode
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Mode
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes

@@ -112,7 +112,7 @@ def scattered(event, rng):
         sightings=tuple(
             dataclasses.replace(
                 s,
-                marker_id=int(rng.integers(20)),
+                landmark_id=int(rng.integers(20)),
                 corners_px=s.corners_px - s.corners_px.mean(axis=0) + rng.uniform(100, 380, 2),
             )
             for s in event.sightings

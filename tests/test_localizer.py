@@ -232,9 +232,13 @@ def test_fault_49_sightings_of_a_false_id_are_refused_and_do_no_harm():
     events, swapped = [], 0
     for event in clean.events():
         sightings = getattr(event, "sightings", ())
-        if any(s.marker_id == 7 for s in sightings) and not any(s.marker_id == 2 for s in sightings) and swapped < 25:
+        if (
+            any(s.landmark_id == 7 for s in sightings)
+            and not any(s.landmark_id == 2 for s in sightings)
+            and swapped < 25
+        ):
             event = replace(
-                event, sightings=tuple(replace(s, marker_id=2) if s.marker_id == 7 else s for s in sightings)
+                event, sightings=tuple(replace(s, landmark_id=2) if s.landmark_id == 7 else s for s in sightings)
             )
             swapped += 1
         events.append(event)

@@ -12,7 +12,8 @@ from robot_world import CAMERA, SIGMA_PX, Chain, World, config, position_error, 
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.association import Association
-from fgloc.types import CornerMeasurement, CornersEvent, Landmark, LandmarkMap
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.types import CornerMeasurement, Landmark, LandmarkMap
 
 SHARE = 0.4
 
@@ -35,9 +36,11 @@ def misread(events, ids, share: float, seed: int = 5):
         if isinstance(event, CornersEvent):
             seen = []
             for s in event.sightings:
-                other = int(rng.choice([i for i in ids if i != s.marker_id])) if rng.uniform() < share else s.marker_id
-                truth.setdefault((event.stamp_ns, other), []).append(s.marker_id)
-                seen.append(replace(s, marker_id=other))
+                other = (
+                    int(rng.choice([i for i in ids if i != s.landmark_id])) if rng.uniform() < share else s.landmark_id
+                )
+                truth.setdefault((event.stamp_ns, other), []).append(s.landmark_id)
+                seen.append(replace(s, landmark_id=other))
             event = replace(event, sightings=tuple(seen))
         made.append(event)
     return made, truth

@@ -13,6 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.localizer import Localizer
 from fgloc.relocalization.global_search import GlobalSearch
 from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     Estimate,
     Landmark,
@@ -20,8 +21,6 @@ from fgloc.types import (
     MarkerPoseMeasurement,
     Mode,
     MotionMeasurement,
-    RangeBearing,
-    RangeBearingEvent,
     RangeBearingMeasurement,
     Step,
 )

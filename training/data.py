@@ -23,7 +23,7 @@ from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.sensors.learned.commands import CommandTrack
-from fgloc.types import CommandEvent, Event, FloatArray, TruthEvent
+from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig
 from training.heard import TopicTimes
 
@@ -44,7 +44,7 @@ class Run:
     track: CommandTrack  # time zero is origin_ns
 
     @property
-    def commands(self) -> tuple[CommandEvent, ...]:
+    def commands(self) -> tuple[ControlEvent, ...]:
         """In order of stamp."""
         return self.heard.commands
 
@@ -103,7 +103,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
     for k, (first, last) in enumerate(pairwise(limits)):
         part = sensed[bisect_left(sensed_ns, first) : bisect_left(sensed_ns, last)]
         inside = (stamps >= first) & (stamps < last)
-        if not inside.any() or not any(isinstance(event, CommandEvent) for event in part):
+        if not inside.any() or not any(isinstance(event, ControlEvent) for event in part):
             continue
         heard, label = TopicTimes(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
@@ -135,7 +135,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
     else:
         stamps, rows = smoothed_truth(truth_from, config)
-    for kind, count in (("commands", sum(isinstance(e, CommandEvent) for e in sensed)), ("truth", len(stamps))):
+    for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
     return _Recorded(settings, sensed, (stamps, rows), up)
@@ -143,7 +143,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
 
 def make_run(
     name: str,
-    heard: TopicTimes | Sequence[CommandEvent],
+    heard: TopicTimes | Sequence[ControlEvent],
     truth_ns: NDArray[np.int64],
     truth: FloatArray,
     dt_s: float,

@@ -17,21 +17,14 @@ from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.runner import Progress
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
 from fgloc.sensors.markers.detector import detect_stream
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.motion_compensation import MotionCompensation
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.smoothing import smooth_run
-from fgloc.types import (
-    CornerMeasurement,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerPosesEvent,
-    RangeBearingEvent,
-)
+from fgloc.types import CornerMeasurement, Event, FloatArray, Landmark, LandmarkMap
 
 _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
 
@@ -108,7 +101,7 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
         seen: Counter[int] = Counter()
         for event in _checked(recording, parts, unreadable, progress):
             if isinstance(event, CornersEvent):
-                seen.update(s.marker_id for s in event.sightings)
+                seen.update(s.landmark_id for s in event.sightings)
             for step in parts.stepper.push(event):
                 parts.localizer.update(step)
         for step in parts.stepper.flush():

@@ -12,16 +12,9 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.window import Spots, Window
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import (
-    CornerMeasurement,
-    CornersEvent,
-    FloatArray,
-    LandmarkMap,
-    MarkerPoseMeasurement,
-    SightingsEvent,
-    Step,
-)
+from fgloc.types import CornerMeasurement, FloatArray, LandmarkMap, MarkerPoseMeasurement, SightingsEvent, Step
 
 SPAN_S = 8.0  # sightings of a window
 MARGIN_S = 1.2  # wheel motion before and after them, for clocks that differ

@@ -13,7 +13,7 @@ from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import Reception, role_of
 from fgloc.live.run import OnlineRun
 from fgloc.timing import one_blas_thread
-from fgloc.types import Estimate, Event, ImageEvent, Step
+from fgloc.types import Estimate, Event, RawEvent, Step
 
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot
 _MEAN_OF = 20  # steps, in the mean of their time
@@ -63,7 +63,7 @@ class Engine:
         with self.changed:
             self.check_alive()
             for passed in self.reception.receive(event, publisher):
-                is_image = isinstance(passed, ImageEvent)
+                is_image = isinstance(passed, RawEvent)
                 queued = Queued(passed, State.WAITING if is_image else State.READY, is_image)
                 if is_image:
                     self.worker.arrived(queued)

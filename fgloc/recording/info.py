@@ -13,11 +13,11 @@ import numpy as np
 from fgloc.config import BUILT_IN_ROLES, Config, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.checks import CHECKS, OtherChecks
-from fgloc.recording.checks_base import Collector
-from fgloc.recording.checks_camera import CameraInfoChecks, ImageChecks, SightingsChecks
+from fgloc.recording.checks import CameraInfoChecks, collector
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
+from fgloc.sensors.topic_checks import Collector, RawChecks, SightingsChecks
+from fgloc.types import MotionEvent
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
 
@@ -50,7 +50,7 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
     with Recording(path, config.recording) as recording:
         times = {topic.name: Times() for topic in recording.topics}
         role_of = {topic: role for role, topic in recording.roles.items()}
-        checks: dict[str, Collector] = {topic: CHECKS.get(role, OtherChecks)() for topic, role in role_of.items()}
+        checks: dict[str, Collector] = {topic: collector(role) for topic, role in role_of.items()}
         child_frame = ""
         for message in recording.messages():
             topic, _, received_ns, _ = message
@@ -60,7 +60,8 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
                     times[topic].decoded.append(received_ns)
                     times[topic].stamps.append(event.stamp_ns)
                     checks[topic].add(event)
-                    child_frame = child_frame or getattr(event, "child_frame_id", "")
+                    if isinstance(event, MotionEvent):
+                        child_frame = child_frame or event.base_frame_id
         start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
         undecodable = dict(recording.undecodable)
         reports, findings = [], []
@@ -99,10 +100,10 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
         found.append("No odometry, joint states or commands: nothing tells how the robot moves.")
     if not unsettled and not roles.keys() - _NO_PLACE:
         found.append("No images and no marker sightings: nothing bounds the drift.")
-    images = next((c for c in checks.values() if isinstance(c, ImageChecks)), None)
+    images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
     sightings = next((c for c in checks.values() if isinstance(c, SightingsChecks)), None)
-    needs_camera = images is not None or (sightings is not None and sightings.corners)
+    needs_camera = images is not None or (sightings is not None and sightings.in_pixels)
     if needs_camera and info is None and config.camera.file is None:
         found.append("No sensor_msgs/CameraInfo for the camera; give a calibration (camera.file in the configuration).")
     if images is not None and info is not None and images.sizes and info.size not in images.sizes:

@@ -58,4 +58,4 @@ def turned_by(motion: FloatArray, yaw: float) -> FloatArray:
 def is_commanded_to_move(step: Step) -> bool:
     """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
     since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)
+    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.controls)

@@ -9,19 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 from fgloc.config import Config, GateConfig, Section
-from fgloc.types import FloatArray, LandmarkMap, PoseMeasurement, SensorEvent
+from fgloc.sensors.field_checks import FieldChecks
+from fgloc.sensors.topic_checks import Collector, TimingOnly
+from fgloc.types import Event, FloatArray, LandmarkMap, PoseMeasurement
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
 
-Converter = Callable[[Any, When], SensorEvent]
+Converter = Callable[[Any, When], Event]
 """From a decoded message (fields as the message definition names them) to an event."""
 
-Check = Callable[[Any, GateConfig], SensorEvent | str]
+Check = Callable[[Any, GateConfig], Event | str]
 """Validates an event: the event, a repaired copy, or in one word why it is rejected."""
+
+Validator = Callable[[FieldChecks], Callable[[Any], Event | str]]
+"""Makes a `Check` for one run that counts the parts it rejects, or tells the user what it assumed."""
 
 
 class Stream(NamedTuple):
@@ -33,16 +39,48 @@ class Stream(NamedTuple):
         converters: by message type, ``"sensor_msgs/msg/Range"``.
         usual_names: topics that are taken without asking where several have such a type.
         keyframe: whether each event gets a pose of its own; otherwise it is moved to the next pose by the wheels, which
-            costs nothing within ``keyframes.max_interval_s`` unless they slip.
+            costs nothing within ``keyframes.max_interval_s`` unless they slip. Events of motion never get one.
         check: see `Check`. Stamps are checked for every sensor alike.
+        validator: takes the place of the check where a run's counts and notes are needed.
+        findings: what looks wrong with the topic of a recording, for ``fgloc info``.
     """
 
     role: str
-    event: type[SensorEvent]
+    event: type[Event]
     converters: Mapping[str, Converter]
     usual_names: tuple[str, ...]
-    keyframe: bool
-    check: Check
+    keyframe: bool = False
+    check: Check | None = None
+    validator: Validator | None = None
+    findings: Callable[[], Collector] = TimingOnly
+
+    def validate(self, checks: FieldChecks) -> Callable[[Any], Event | str]:
+        """What judges the events of one run."""
+        if self.validator is not None:
+            return self.validator(checks)
+        check = self.check
+        return _unchecked if check is None else partial(_checked, check, checks.config)
+
+
+def _unchecked(event: Event) -> Event | str:
+    return event
+
+
+def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
+    return check(event, config)
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltIn:
+    """What a sensor of fgloc itself brings: as much of `Sensor` as it shares with those of other packages.
+
+    Attributes:
+        name: of its rows in ``steps.csv``, and in the counts.
+        streams: what it reads.
+    """
+
+    name: str
+    streams: tuple[Stream, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

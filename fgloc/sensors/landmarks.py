@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -14,21 +14,20 @@ from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.cameras import pinhole, undistort_points
+from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates, marker_pose_cov
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     Camera,
     CornerMeasurement,
-    CornersEvent,
     FloatArray,
     Landmark,
     LandmarkMap,
     LandmarkSighting,
-    MarkerCorners,
-    MarkerPose,
     MarkerPoseMeasurement,
-    MarkerPosesEvent,
-    RangeBearing,
     RangeBearingMeasurement,
+    Sighting,
     SightingsEvent,
 )
 
@@ -36,7 +35,7 @@ _MIN_RANGE_M = 1e-3
 _CLEAR_RATIO = 2.0  # a marker's pose is believed if the mirrored one explains its corners this much worse
 _MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
 _MIN_COS_ALONG_AXIS = math.cos(math.radians(80.0))  # beyond it a distance along the axis says nothing of the range
-_S = TypeVar("_S", MarkerCorners, MarkerPose, RangeBearing)
+_S = TypeVar("_S", bound=Sighting)
 
 
 class LandmarkSensor:
@@ -85,20 +84,19 @@ class LandmarkSensor:
         """
         if isinstance(event, CornersEvent):
             return tuple(self._corners(event))
+        made: list[LandmarkSighting | None] = []
         if isinstance(event, MarkerPosesEvent):
-            poses = self._usable(event.sightings, lambda s: s.marker_id)
-            made = [self._marker_pose(event.stamp_ns, pose) for pose in poses]
-        else:
-            ranges = self._usable(event.sightings, lambda s: s.landmark_id)
-            made = [self._range_bearing(event.stamp_ns, seen) for seen in ranges]
+            made += [self._marker_pose(event.stamp_ns, pose) for pose in self._usable(event.sightings)]
+        elif isinstance(event, RangeBearingEvent):
+            made += [self._range_bearing(event.stamp_ns, seen) for seen in self._usable(event.sightings)]
         return tuple(m for m in made if m is not None)
 
-    def _usable(self, sightings: Sequence[_S], identify: Callable[[_S], int]) -> list[_S]:
+    def _usable(self, sightings: Sequence[_S]) -> list[_S]:
         """Sightings whose id is in the map, if there is one, and stands once in the message."""
-        times = Counter(map(identify, sightings))
+        times = Counter(s.landmark_id for s in sightings)
         usable = []
         for sighting in sightings:
-            number = identify(sighting)
+            number = sighting.landmark_id
             if self._map is not None and number not in self._map:
                 self.rejections["sightings.unknown_id"] += 1
             elif times[number] > 1:
@@ -114,13 +112,13 @@ class LandmarkSensor:
             raise CameraError(
                 f"{event.topic}: marker corners, but no calibration; record sensor_msgs/CameraInfo or set camera.file"
             )
-        usable = self._usable(event.sightings, lambda s: s.marker_id)
+        usable = self._usable(event.sightings)
         usable.sort(key=lambda s: -_area(s.corners_px))
         most = self._config.markers.max_sightings
         if len(usable) > most:
             self.rejections["sightings.beyond_max"] += len(usable) - most
         for seen in usable[:most]:
-            landmark = None if self._map is None else self._map.landmarks[seen.marker_id]
+            landmark = None if self._map is None else self._map.landmarks[seen.landmark_id]
             if landmark is None or landmark.size_m == 0.0:
                 measured = self._single_view(event, seen, self._camera, landmark)
             else:
@@ -137,7 +135,7 @@ class LandmarkSensor:
             return None
         section = self._config.markers
         return CornerMeasurement(
-            event.stamp_ns, seen.marker_id, corners, section.sigma_px, ideal, blur_s=section.blur_s
+            event.stamp_ns, seen.landmark_id, corners, section.sigma_px, ideal, blur_s=section.blur_s
         )
 
     def _single_view(
@@ -165,11 +163,11 @@ class LandmarkSensor:
         clear = len(candidates) == 1 or candidates[1][1] > _CLEAR_RATIO * max(rms, sigma_px)
         floor = self._config.landmarks.yaw_sigma_rad
         if floor is None or landmark is not None:
-            return self._polar(event.stamp_ns, seen.marker_id, in_base[:2, 3], cov_xy)
+            return self._polar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy)
         # Of a marker that may be mirrored the yaw says little; without it, it would be another kind of variable.
         yaw_var = max(floor if clear else _MIRRORED_SIGMA, math.sqrt((R @ cov[3:, 3:] @ R.T)[2, 2])) ** 2
         yaw = _planar_yaw(in_base[:3, :3], None)
-        return _planar(event.stamp_ns, seen.marker_id, in_base[:2, 3], cov_xy, yaw, yaw_var)
+        return _planar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy, yaw, yaw_var)
 
     # --- ranges, bearings, poses ---
 
@@ -206,12 +204,12 @@ class LandmarkSensor:
         J = np.array([[c, -distance * s], [s, distance * c]])
         place = self._T_base_sensor[:2, 3] + distance * np.array([c, s])
         cov = J @ self._range_bearing_cov(distance) @ J.T
-        landmark = None if self._map is None else self._map.landmarks[seen.marker_id]
+        landmark = None if self._map is None else self._map.landmarks[seen.landmark_id]
         if section.yaw_sigma_rad is None or (landmark is not None and landmark.size_m == 0.0):
-            return self._polar(stamp_ns, seen.marker_id, place, cov)
+            return self._polar(stamp_ns, seen.landmark_id, place, cov)
         rotation = self._T_base_sensor[:3, :3] @ quaternion_matrix(seen.orientation)
         yaw = _planar_yaw(rotation, landmark) - section.bearing_bias_rad
-        return _planar(stamp_ns, seen.marker_id, place, cov, yaw, section.yaw_sigma_rad**2)
+        return _planar(stamp_ns, seen.landmark_id, place, cov, yaw, section.yaw_sigma_rad**2)
 
     def _range_bearing_cov(self, distance: float) -> FloatArray:
         section = self._config.landmarks

@@ -103,7 +103,7 @@ class MotionCompensation:
             ]
             if exposure_ns != step.stamp_ns:
                 motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)
-                if self._gyro is not None and step.imu and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
+                if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
                     motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
                 late = [carry(m, motion, cov) for m in late]
             measured.extend(late)
@@ -118,14 +118,14 @@ class MotionCompensation:
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
         """``T_keyframe_then`` for another time, with its covariance."""
         motion, cov = self._wheels.carry(step, step.stamp_ns, at_ns)
-        if self._gyro is not None and step.imu and abs(at_ns - step.stamp_ns) < _SHORT_NS:
-            turned = self._gyro.rates_at(step.imu, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
+        if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
+            turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
             motion = np.array([*motion[:2], turned])
         return motion, cov
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Of the base at a time near the step's end."""
         twist = self._wheels.twist(step, at_ns)
-        if self._gyro is not None and step.imu:
-            twist[2] = self._gyro.rates_at(step.imu, (at_ns,))[0]
+        if self._gyro is not None and step.inertial:
+            twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]
         return twist

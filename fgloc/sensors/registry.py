@@ -1,40 +1,74 @@
-"""The sensors that are installed beside the built-in ones, by role and by event."""
+"""All sensors, the built-in ones and those of installed packages, by role and by event."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 from fgloc.extensions import outside_sensors
-from fgloc.sensors.base import Context, Converter, Sensor, Stream
+from fgloc.sensors.base import BuiltIn, Context, Converter, Sensor, Stream
 from fgloc.types import Event
 
 
+@cache
+def built_in() -> tuple[BuiltIn, ...]:
+    """The built-in sensors: one line each."""
+    from fgloc.sensors.commands import COMMANDS
+    from fgloc.sensors.gyro.sensor import GYRO
+    from fgloc.sensors.marker_pose.sensor import MARKER_POSE
+    from fgloc.sensors.markers.sensor import MARKERS
+    from fgloc.sensors.range_bearing.sensor import RANGE_BEARING
+    from fgloc.sensors.wheels.sensor import WHEELS
+
+    return (WHEELS, COMMANDS, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
+
+
 def sensors() -> tuple[type[Sensor], ...]:
-    """All registered sensors.
+    """The sensors of installed packages.
 
     Raises:
-        ConfigError: an installed one cannot be used.
+        ConfigError: one cannot be used.
     """
     return outside_sensors()
 
 
-def streams() -> Mapping[str, Stream]:
-    """Their streams, by role."""
-    return {stream.role: stream for sensor in sensors() for stream in sensor.streams}
+def streams() -> tuple[Stream, ...]:
+    """Streams of all sensors, the built-in ones first."""
+    return _streams(sensors())
+
+
+@cache
+def _streams(outside: tuple[type[Sensor], ...]) -> tuple[Stream, ...]:
+    own = [stream for sensor in built_in() for stream in sensor.streams]
+    return (*own, *(stream for sensor in outside for stream in sensor.streams))
+
+
+@cache
+def _role_by_class(outside: tuple[type[Sensor], ...]) -> dict[type[Event], str]:
+    return {stream.event: stream.role for stream in _streams(outside)}
+
+
+def streams_of(role: str) -> tuple[Stream, ...]:
+    """Streams that a role may have: for each class of events one."""
+    return tuple(stream for stream in streams() if stream.role == role)
 
 
 def converters(role: str) -> Mapping[str, Converter]:
-    """Converters of a registered role, by message type; empty if it is none."""
-    stream = streams().get(role)
-    return {} if stream is None else stream.converters
+    """Converters of a role, by message type; empty if no sensor has it."""
+    return {kind: converter for stream in streams_of(role) for kind, converter in stream.converters.items()}
+
+
+def usual_names(role: str) -> tuple[str, ...]:
+    """Topics that are taken for a role without asking."""
+    return tuple(name for stream in streams_of(role) for name in stream.usual_names)
 
 
 def role_of_event(event: Event) -> str | None:
-    """Role of a registered sensor's event; None if it is of none."""
-    return next((role for role, stream in streams().items() if isinstance(event, stream.event)), None)
+    """Role of a sensor's event; None if it is of none."""
+    return _role_by_class(sensors()).get(type(event))
 
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:
-    """The sensors of one run, of those that have a context."""
+    """The sensors of installed packages for one run, of those that have a context."""
     built = (s.build(context_of[s.name]) for s in sensors() if s.name in context_of)
     return tuple(sensor for sensor in built if sensor is not None)

@@ -15,23 +15,17 @@ from pydantic import AfterValidator, Field, model_validator
 
 from fgloc.config import Config, Section
 from fgloc.extensions import outside_sensors
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    LandmarkMap,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-)
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Event, LandmarkMap
 
 EVENTS: dict[str, tuple[type[Event], ...]] = {
     "camera": (ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent),
     "wheels": (OdometryEvent, JointsEvent),
-    "command": (CommandEvent,),
+    "command": (ControlEvent,),
     "imu": (ImuEvent,),
 }
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Scene
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import ImageError, decode
-from fgloc.types import Event, ImageEvent
+from fgloc.types import Event
 
 
 class Darkness(EventFailure):

@@ -12,7 +12,8 @@ from pydantic import model_validator
 from fgloc import se2
 from fgloc.ablation.failures.base import Failure, Scene, When, by_receipt
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
 
 
 class Kidnap(Failure):

@@ -13,7 +13,9 @@ from pydantic import Field, model_validator
 from fgloc import se2
 from fgloc.ablation.failures.base import EVENTS, Failure, Scene, When
 from fgloc.frames import quaternion_yaw, rpy_matrix, yaw_quaternion
-from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Event, FloatArray
 
 _BOUNCE_HZ, _BOUNCE_M_S2 = 1.9, 1.0  # vertical acceleration of what a walking person carries: amplitude
 _SWAY_HZ, _SWAY_RAD = 0.7, 0.03  # of the hands, in roll and pitch
@@ -59,7 +61,7 @@ class Lift(Failure):
                 changed = event
             elif isinstance(event, ImuEvent):
                 changed = hand.shake(event, t)
-            elif isinstance(event, CommandEvent):
+            elif isinstance(event, ControlEvent):
                 changed = replace(event, v=spin, omega=0.0)
             else:
                 changed = None if self.markers == "hidden" and isinstance(event, EVENTS["camera"]) else event

@@ -12,7 +12,9 @@ from pydantic import Field
 from fgloc import se2
 from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
 
 
 class EncoderFrozen(Failure):

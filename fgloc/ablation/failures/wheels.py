@@ -15,7 +15,8 @@ from fgloc import se2
 from fgloc.ablation.failures.base import Failure, Scene
 from fgloc.config import WheelsConfig
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fgloc.config import GyroConfig
-from fgloc.types import FloatArray, ImuEvent, Step
+from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
@@ -87,7 +87,7 @@ class Gyro:
             None if the gyro was silent; once it has spoken, that is counted.
         """
         dt = step.dt
-        raw = None if dt <= 0.0 else self._integral(step.imu, step.start_ns, step.stamp_ns)
+        raw = None if dt <= 0.0 else self._integral(step.inertial, step.start_ns, step.stamp_ns)
         if raw is None:
             self._standing_s = 0.0
             if self._heard:
@@ -101,7 +101,7 @@ class Gyro:
         noise = self._config.yaw_per_sqrt_s**2 * dt
         return Turn(yaw, noise + drift)
 
-    def rates_at(self, events: tuple[ImuEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
+    def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
         """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
         times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
         rates = np.array([event.angular_velocity for event in events]) @ self._up
@@ -152,7 +152,7 @@ class Gyro:
         self.bias_variance *= 1.0 - gain
         self._turned -= change * self._turned_s  # what was turned since the last fix, with the bias of now
 
-    def _integral(self, events: tuple[ImuEvent, ...], start_ns: int, end_ns: int) -> float | None:
+    def _integral(self, events: tuple[InertialEvent, ...], start_ns: int, end_ns: int) -> float | None:
         """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""
         if not events:
             return None

@@ -12,7 +12,7 @@ from fgloc.sensors.learned.commands import CommandTrack
 from fgloc.sensors.learned.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
 from fgloc.sensors.learned.network import Answering, Float32Array
 from fgloc.sensors.learned.signals import Signal, Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 
 _MIN_DENSITY = 1e-8  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
@@ -48,7 +48,7 @@ class DisplacementModel:
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,

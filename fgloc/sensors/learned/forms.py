@@ -20,7 +20,7 @@ from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.commands import CommandTrack
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.signals import Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 
 _SMALL = 1e-9
 Triple = Sequence[float]  # of x, y and yaw
@@ -43,7 +43,7 @@ class MotionModel(Protocol):
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -124,7 +124,7 @@ def joint_of(card: ModelCard) -> JointCalibration | None:
     return None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
 
 
-def duration_of(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) -> float:
+def duration_of(commands: tuple[ControlEvent, ...], start_ns: int, end_ns: int) -> float:
     """Length of the step [s]; raises `ModelError` if there is none, or no command."""
     if not commands:
         raise ModelError("no command to predict from; the step needs the last command at or before its start")
@@ -133,7 +133,7 @@ def duration_of(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) 
     return (end_ns - start_ns) * 1e-9
 
 
-def follow(track: CommandTrack | None, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+def follow(track: CommandTrack | None, commands: tuple[ControlEvent, ...]) -> CommandTrack:
     """The track of these commands, continued from the last step's where it can be."""
     return CommandTrack(commands) if track is None else track.following(commands)
 

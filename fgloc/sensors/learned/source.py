@@ -79,7 +79,7 @@ class LearnedMotion:
             return None
         if velocity is None and self._reached == (step.segment, step.start_ns):
             velocity = self._velocity
-        prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity, signals)
+        prediction = self.model.predict(step.controls, step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
             return None
@@ -88,7 +88,7 @@ class LearnedMotion:
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
     def _unusable(self, step: Step) -> str:
-        for command in reversed(step.commands):
+        for command in reversed(step.controls):
             if command.stamp_ns <= step.stamp_ns:
                 stale = (step.stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
                 return "learned.stale_commands" if stale else ""

@@ -21,7 +21,7 @@ from fgloc.sensors.learned.forms import (
 )
 from fgloc.sensors.learned.network import Answering
 from fgloc.sensors.learned.signals import Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 
 
 class NaiveModel:
@@ -36,7 +36,7 @@ class NaiveModel:
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -74,7 +74,7 @@ class VelocityModel:
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,

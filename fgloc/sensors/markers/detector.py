@@ -14,8 +14,9 @@ from cv2.typing import MatLike
 from fgloc.config import MarkersConfig
 from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
 from fgloc.sensors.markers.edges import refine_corners
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, ImageError, decode
-from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent, MarkerCorners
+from fgloc.types import Event, FloatArray
 
 _LOOKAHEAD = 4  # images that may be detected before the consumer asks for them
 _SECOND_LOOKS = 12  # small unreadable squares of an image that are enlarged and read again

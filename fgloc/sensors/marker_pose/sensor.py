@@ -1,0 +1,26 @@
+"""Marker poses as a sensor."""
+
+from __future__ import annotations
+
+from fgloc.sensors.base import BuiltIn, Stream
+from fgloc.sensors.marker_pose import messages, validation
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.topic_checks import SightingsChecks
+
+MARKER_POSE = BuiltIn(
+    name="marker_pose",
+    streams=(
+        Stream(
+            "sightings",
+            MarkerPosesEvent,
+            {
+                "aruco_msgs/msg/MarkerArray": messages.aruco_poses,
+                "vision_msgs/msg/Detection3DArray": messages.detections,
+            },
+            (),
+            keyframe=True,
+            validator=validation.marker_poses,
+            findings=SightingsChecks,
+        ),
+    ),
+)
