@@ -23,7 +23,7 @@ from fgloc.sensors.learned import (
     save_model,
 )
 from fgloc.sensors.learned.card import Kind
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.forms import noise_density
 from fgloc.types import ControlEvent, Step, by_class
 
@@ -69,7 +69,7 @@ def test_command_track_averages_a_zero_order_hold() -> None:
         ControlEvent(T0 + round(t * SECOND), 0, "c", v, 2 * v)
         for t, v in ((1.0, 1.0), (2.0, 3.0), (2.5, 0.0), (4.0, 5.0))
     )
-    track = CommandTrack(events, T0)
+    track = CommandHistory(events, T0)
     means = track.means(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 9.0]))
     np.testing.assert_allclose(means[:, 0], [0.0, 1.0, 1.5, 0.0, 5.0], atol=1e-12)
     np.testing.assert_allclose(means[:, 1], 2 * means[:, 0], atol=1e-12)
@@ -154,18 +154,18 @@ def test_covariance_is_composed_as_se2_does(kind: str, rng: np.random.Generator,
 
 def test_a_track_followed_step_by_step_equals_one_made_at_once(rng: np.random.Generator) -> None:
     events = commands(rng)
-    track = CommandTrack(events[:100])
+    track = CommandHistory(events[:100])
     for first in range(10, 180, 7):
         window = events[first : first + 100]
         assert track.following(window) is track
         times = (window[-1].stamp_ns - track.origin_ns) * 1e-9 - np.linspace(1.0, -0.5, 20)
         shifted = times + (track.origin_ns - window[0].stamp_ns) * 1e-9
-        np.testing.assert_allclose(track.means(times), CommandTrack(window).means(shifted), atol=1e-9)
+        np.testing.assert_allclose(track.means(times), CommandHistory(window).means(shifted), atol=1e-9)
     late = (*window[:50], replace(window[50], v=9.0, stamp_ns=window[50].stamp_ns - 1), *window[50:])
     assert track.following(late) is not track  # one came late, in the middle
     assert track.following(events[:50]) is not track  # an earlier part
     long = tuple(ControlEvent(T0 + i * 1000, 0, "c", 1.0, 0.0) for i in range(20_000))
-    track = CommandTrack(long[:50])
+    track = CommandHistory(long[:50])
     for first in range(0, 19_000, 40):
         track = track.following(long[first : first + 50])
     assert len(track._events) < 5000  # memory does not grow

@@ -22,7 +22,7 @@ from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig
 from training.heard import TopicTimes
@@ -41,7 +41,7 @@ class Run:
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
     valid: NDArray[np.bool_]  # (n,) the truth was heard around this time, and can be true
     heard: TopicTimes
-    track: CommandTrack  # time zero is origin_ns
+    track: CommandHistory  # time zero is origin_ns
 
     @property
     def commands(self) -> tuple[ControlEvent, ...]:
@@ -178,7 +178,7 @@ def make_run(
         velocities=velocities,
         valid=_heard(t_truth, times, config) & _possible(velocities, dt_s, config),
         heard=heard,
-        track=CommandTrack(commands, first),
+        track=CommandHistory(commands, first),
     )
 
 
@@ -221,7 +221,7 @@ def cut(run: Run, name: str, first: int, last: int) -> Run:
         poses=run.poses[first:last],
         velocities=run.velocities[first:last],
         valid=run.valid[first:last],
-        track=CommandTrack(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
+        track=CommandHistory(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
     )
 
 

@@ -10,7 +10,7 @@ _FOREVER_S = 1e4  # a last command holds on; who asks decides whether to believe
 _MIN_CAPACITY = 4096
 
 
-class CommandTrack:
+class CommandHistory:
     """Zero-order hold over commands, integrated once so that any mean over time is two look-ups.
 
     Before the first command the robot is taken to be at rest.
@@ -36,7 +36,7 @@ class CommandTrack:
         np.cumsum(np.multiply([complex(c.v, c.omega) for c in commands[:-1]], steps), out=self._integrals[1:n])
         self._extend(())
 
-    def following(self, commands: tuple[ControlEvent, ...]) -> CommandTrack:
+    def following(self, commands: tuple[ControlEvent, ...]) -> CommandHistory:
         """This track, extended by what is new in the next step's commands; a new one if they do not continue it."""
         last = self._events[-1]
         i = len(commands) - 1
@@ -45,7 +45,7 @@ class CommandTrack:
         first = len(self._events) - 1 - i  # our index of commands[0], if they are the same
         full = len(self._events) + len(commands) - i >= len(self._times)
         if i < 0 or first < 0 or self._events[first] is not commands[0] or full:
-            return CommandTrack(commands)
+            return CommandHistory(commands)
         self._extend(commands[i + 1 :])
         return self
 
