@@ -62,7 +62,9 @@ class Wanted:
         return [Cell(Take(self.variant, floor(self.case), split, seed), self.case, self.plain) for seed in seeds]
 
 
-def measure(quick: bool, split: Split = "test", prefixes: Sequence[str] = ("",)) -> Iterator[Row]:
+def measure(
+    quick: bool, split: Split = "test", prefixes: Sequence[str] = ("",), jobs: int | None = None
+) -> Iterator[Row]:
     """The rows whose ids begin with one of the prefixes; a quick run has one seed and two cases."""
     rows = [w for w in wanted() if w.id.startswith(tuple(prefixes))]
     seeds = SEEDS[split][:1] if quick else SEEDS[split]
@@ -70,7 +72,7 @@ def measure(quick: bool, split: Split = "test", prefixes: Sequence[str] = ("",))
     cells = {cell for w in todo for cell in w.cells(split, seeds)}
     try:
         prepare(cell.take for cell in cells)
-        found = run_all(sorted(cells)) if cells else {}
+        found = run_all(sorted(cells), jobs) if cells else {}
     except RenderError as error:
         yield from not_run([w.id for w in rows], str(error))
     else:
@@ -186,5 +188,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--rows", default="", help="comma-separated beginnings of ids")
+    parser.add_argument("--jobs", type=int, default=None, help="processes")
     known, rest = parser.parse_known_args()
-    main(lambda quick: measure(quick, known.split, tuple(known.rows.split(","))), __doc__ or "", rest)
+    main(lambda quick: measure(quick, known.split, tuple(known.rows.split(",")), known.jobs), __doc__ or "", rest)

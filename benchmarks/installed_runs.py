@@ -77,12 +77,12 @@ def floor(case: str) -> Floor:
 # --- Many cells -------------------------------------------------------------------------------------------------------
 
 
-def run_all(cells: Sequence[Cell]) -> dict[Cell, Scores]:
-    """Scores of all cells, from the cache or run now; one process per core keeps to one recording at a time."""
+def run_all(cells: Sequence[Cell], jobs: int | None = None) -> dict[Cell, Scores]:
+    """Scores of all cells, from the cache or run now; a process (by default one per core) keeps to one recording."""
     groups = [list(group) for _, group in groupby(sorted(cells), key=lambda cell: cell.take)]
     found: dict[Cell, Scores] = {}
     began = time.monotonic()
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(groups)), get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(groups)), get_context("spawn")) as pool:
         for job in as_completed([pool.submit(_run_group, group) for group in groups]):
             found.update(job.result())
             gone = time.monotonic() - began

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from fgloc.errors import (
@@ -36,6 +35,7 @@ from fgloc.errors import (
 
 if TYPE_CHECKING:
     from fgloc.config import Config, load_config
+    from fgloc.evaluation.results import Results, read_results
     from fgloc.live import Live
     from fgloc.runner import run
     from fgloc.sensors.maps import load_map
@@ -57,18 +57,22 @@ __all__ = [
     "ModelError",
     "OutputError",
     "RecordingError",
+    "Results",
     "RunResult",
     "Trajectory",
     "TrajectoryError",
     "WireError",
     "load_config",
     "load_map",
+    "read_results",
     "run",
 ]
 
 _IMPORTED_LATE = {
     "Config": "fgloc.config",
     "load_config": "fgloc.config",
+    "Results": "fgloc.evaluation.results",
+    "read_results": "fgloc.evaluation.results",
     "Live": "fgloc.live",
     "run": "fgloc.runner",
     "load_map": "fgloc.sensors.maps",
@@ -80,11 +84,6 @@ _IMPORTED_LATE = {
     "Trajectory": "fgloc.types",
 }
 
-try:
-    __version__ = version("fgloc")
-except PackageNotFoundError:  # run from a source tree that is not installed
-    __version__ = "0+unknown"
-
 # Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel. OpenCV reads this when it
 # is loaded, and keeps to it whatever the format.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 24))
@@ -92,9 +91,20 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 24))
 
 def __getattr__(name: str) -> Any:
     """A public name, imported when it is first used."""
+    if name == "__version__":
+        return _version()
     if name not in _IMPORTED_LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_IMPORTED_LATE[name]), name)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version  # takes as long as all the rest of `fgloc --help`
+
+    try:
+        return version("fgloc")
+    except PackageNotFoundError:  # run from a source tree that is not installed
+        return "0+unknown"
 
 
 def __dir__() -> list[str]:

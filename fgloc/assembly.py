@@ -3,46 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from fgloc.config import Config, Role
 from fgloc.diagnosis import Diagnosis
-from fgloc.errors import CameraError, ConfigError, RecordingError
-from fgloc.frames import BASE_NAMES, rpy_matrix
 from fgloc.intake.keyframing import KeyframeBuilder
-from fgloc.intake.stream_facts import HasFrames, RecordingFacts, StreamFacts, first_events
+from fgloc.intake.stream_facts import StreamFacts
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
-from fgloc.sensors import registry
-from fgloc.sensors.base import Context, Sensor
-from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
+from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
+from fgloc.sensors.base import Sensor
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    Camera,
-    CameraInfoEvent,
-    Event,
-    FloatArray,
-    InertialEvent,
-    LandmarkMap,
-    MotionEvent,
-    RawEvent,
-    SightingsEvent,
-)
-
-_OPTICAL_TO_BODY = np.array(
-    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-)  # optical axes in body axes (REP 103)
+from fgloc.types import Camera, LandmarkMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,72 +84,32 @@ def assemble(
         landmark_map: the map as it is to be used, if not as the file has it.
 
     Raises:
-        RecordingError: nothing in the recording says how the robot moves, or a frame is missing.
-        CameraError: the calibration is missing, unusable or does not fit the images.
-        MapError, ModelError, ConfigError: as their loaders have it.
+        FglocError: as `recorded_setup` has it.
     """
-    facts = RecordingFacts(recording)
-    _need_motion(facts)
-    if landmark_map is None and map_path is not None:
-        landmark_map = load_map(map_path, config.markers.default_size_m)
-    return assemble_stream(facts, landmark_map, config, keep_all)
-
-
-def _need_motion(facts: StreamFacts) -> None:
-    if not {"odometry", "joints", "command", "imu"} & set(facts.roles):
-        raise RecordingError(
-            f"{facts.name}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
-            f"{facts.topics}"
-        )
+    _, setup = recorded_setup(recording, map_path, config, landmark_map)
+    return _assembled(setup, keep_all)
 
 
 def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config: Config, keep_all: bool) -> Assembly:
     """Build and check the parts for a stream of which these facts are known; otherwise as `assemble`."""
-    _need_motion(facts)
-    notes = list(landmark_map.notes) if landmark_map is not None else []
-    if not {"odometry", "joints", "command"} & set(facts.roles):
-        notes.append(
-            "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
-            "gate.max_speed takes it."
-        )
-    first = facts.first
-    camera = _camera(facts, config) if "image" in facts.roles or _in_pixels(first) else None
-    notes += camera.notes if camera is not None else ()
-    T_base_sensor = _sensor_pose(facts, config, notes)
-    sensors = _sensors(facts, config, landmark_map)
-    if sensors and landmark_map is None:
-        landmark_map = _no_landmarks(facts, sensors)
-    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
-        config = resolved(config, landmark_map)
-        notes.append(
-            "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
-            "the map's origin; for long runs build the map once with `fgloc map`."
-        )
-    detector = None
-    if "image" in facts.roles:
-        dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
-        if not dictionary:
-            raise ConfigError(
-                "no marker dictionary: set markers.dictionary (such as DICT_4X4_50) in --config or the map"
-            )
-        detector = MarkerDetector(dictionary, config.markers)
-    learned = joint = None
-    if config.motion.use and config.motion.model is not None:
-        model = load_model(config.motion.model)
-        learned = LearnedMotion(model, config.motion, mounted_up(facts, config, first))
-        joint = model.joint if config.motion.correlation == "joint" else None
+    return _assembled(sensor_setup(facts, landmark_map, config), keep_all)
+
+
+def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
+    config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
+    learned, camera = setup.learned, setup.camera
+    joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
-    imu_up = mounted_up(facts, config, first) if "imu" in facts.roles and config.gyro.use else None
-    gyro = None if imu_up is None else Gyro(config.gyro, imu_up)
-    landmarks = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
-    seen_by: Role = "sightings" if detector is None else "image"
+    gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
+    landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
+    seen_by: Role = "sightings" if setup.detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     streams = [stream for sensor in sensors for stream in sensor.streams]
     return Assembly(
         config=config,
         landmark_map=landmark_map,
         gate=EventValidator(config.gate, known_ids, streams),
-        detector=detector,
+        detector=setup.detector,
         detections=EventValidator(config.gate, known_ids),
         stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams),
         wheels=wheels,
@@ -180,158 +118,6 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
         learned=learned,
         sensors=sensors,
         localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro, sensors),
-        diagnosis=Diagnosis(config, landmark_map, camera, T_base_sensor, seen_by, imu_up),
-        notes=tuple(notes),
+        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up),
+        notes=setup.notes,
     )
-
-
-def _sensors(facts: StreamFacts, config: Config, landmark_map: LandmarkMap | None) -> tuple[Sensor, ...]:
-    """Those registered sensors that have settings and a topic in this stream."""
-
-    def frame(name: str) -> FloatArray | None:
-        base = base_frame(facts, config, facts.first)
-        if name.lstrip("/") == base.lstrip("/"):
-            return np.eye(4)
-        return facts.frames.lookup(base, name) if name in facts.frames and base in facts.frames else None
-
-    contexts = {
-        sensor.name: Context(config, getattr(config, sensor.name), facts.roles, landmark_map, frame)
-        for sensor in registry.sensors()
-        if hasattr(config, sensor.name) and any(stream.role in facts.roles for stream in sensor.streams)
-    }
-    return registry.build(contexts)
-
-
-def _no_landmarks(facts: StreamFacts, sensors: Sequence[Sensor]) -> LandmarkMap:
-    """The map of a run that has the map's frame from registered sensors alone.
-
-    Raises:
-        ConfigError: there are sightings, whose landmarks would make a frame of their own.
-    """
-    seen = [role for role in ("image", "sightings") if role in facts.roles]
-    if seen:
-        names = ", ".join(sensor.name for sensor in sensors)
-        raise ConfigError(
-            f"{facts.name}: {names} measures in the frame of a map, and {' and '.join(seen)} without a map would make "
-            f"another one; give --map, or set recording.topics.{seen[0]}: none"
-        )
-    return LandmarkMap({})
-
-
-def resolved(config: Config, given_map: Path | LandmarkMap | None) -> Config:
-    """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
-    if given_map is not None or config.estimator.kind != "fixed_lag":
-        return config
-    return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
-
-
-def base_frame(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> str:
-    """Name of the robot's base frame: as configured, a usual one among the transforms, or the odometry's child."""
-    if config.recording.base_frame is not None:
-        return config.recording.base_frame
-    for name in BASE_NAMES:
-        if name in stream.frames:
-            return name
-    named = (event.base_frame_id for event in first.values() if isinstance(event, MotionEvent))
-    return next(filter(None, named), BASE_NAMES[0])
-
-
-def camera_frame(first: Mapping[type[Event], Event]) -> str:
-    """Name of the camera's frame, by the first event of each kind: CameraInfo, image, or what was found in one."""
-    seen = [event for event in first.values() if isinstance(event, RawEvent)]
-    found = [event for event in first.values() if isinstance(event, SightingsEvent) and event.in_pixels]
-    info = first.get(CameraInfoEvent)
-    return next(
-        (e.frame_id for e in (info, *seen, *found) if isinstance(e, CameraInfoEvent | RawEvent | SightingsEvent)), ""
-    )
-
-
-def _in_pixels(first: Mapping[type[Event], Event]) -> bool:
-    """Whether there are sightings that take a calibrated camera."""
-    return any(isinstance(event, SightingsEvent) and event.in_pixels for event in first.values())
-
-
-def _camera(facts: StreamFacts, config: Config) -> Camera:
-    if facts.camera is not None:
-        return _fitting(facts.camera, facts, config)
-    first = facts.first
-    info, frame = first.get(CameraInfoEvent), camera_frame(first)
-    T_base_cam = given_pose(config, default_axes="optical")
-    if T_base_cam is None:
-        T_base_cam = facts.frames.lookup(base_frame(facts, config, first), frame)
-    if config.camera.file is not None:
-        camera = load_camera(config.camera.file, T_base_cam)
-    elif isinstance(info, CameraInfoEvent):
-        camera = camera_from_info(info, T_base_cam)
-    else:
-        raise CameraError(
-            f"{facts.name}: images or marker corners, but no sensor_msgs/CameraInfo; "
-            "set camera.file to a calibration YAML in --config"
-        )
-    return _fitting(camera, facts, config)
-
-
-def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
-    """The camera as the configuration corrects it, for the size of the images."""
-    size = facts.image_size
-    if size is None or not camera.width or size == (camera.width, camera.height):
-        return corrected(camera, config.camera)
-    if not config.camera.rescale:
-        raise CameraError(
-            f"{facts.name}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
-            "calibrate at this size, or set camera.rescale: true"
-        )
-    return corrected(rescaled(camera, *size), config.camera)
-
-
-def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
-    """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level.
-
-    Its length is ``gyro.scale``, so that rates along it are true ones.
-    """
-    base = base_frame(stream, config, first)
-    event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
-    if event is not None and event.frame_id in stream.frames and base in stream.frames:
-        return np.asarray(config.gyro.scale * stream.frames.lookup(base, event.frame_id)[2, :3])
-    return np.array([0.0, 0.0, config.gyro.scale])
-
-
-def base_up(recording: Recording, config: Config) -> FloatArray | None:
-    """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
-    if "imu" not in recording.roles or not config.gyro.use:
-        return None
-    return mounted_up(recording, config, first_events(recording))
-
-
-def given_pose(config: Config, default_axes: str) -> FloatArray | None:
-    """``T_base_sensor (4, 4)`` as configured: z forward for optical axes; None if it is not configured."""
-    if config.recording.sightings_pose is None:
-        return None
-    x, y, z, roll, pitch, yaw = config.recording.sightings_pose
-    T = np.eye(4)
-    T[:3, :3] = rpy_matrix(roll, pitch, yaw)
-    if (config.recording.sightings_axes or default_axes) == "optical":
-        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
-    T[:3, 3] = x, y, z
-    return T
-
-
-def _sensor_pose(facts: StreamFacts, config: Config, notes: list[str]) -> FloatArray | None:
-    """Place of a sensor that reports ranges or marker poses: as configured, or from tf, or at the base."""
-    given = given_pose(config, default_axes="body")
-    first = facts.first
-    event = next((e for e in first.values() if isinstance(e, SightingsEvent) and not e.in_pixels), None)
-    if given is not None or event is None:
-        return given
-    base = base_frame(facts, config, first)
-    T = np.eye(4)
-    if event.frame_id in facts.frames and base in facts.frames:
-        T = facts.frames.lookup(base, event.frame_id).copy()
-    elif event.frame_id.lstrip("/") != base.lstrip("/"):
-        notes.append(
-            f"No transform from {base} to {event.frame_id or 'the sightings frame'}: sightings are taken as made at "
-            "the base; set recording.sightings_pose otherwise."
-        )
-    if config.recording.sightings_axes == "optical":  # although the frame that the header names has x forward
-        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
-    return T

@@ -52,12 +52,6 @@ EventFilter = Callable[[Iterator[Event]], Iterator[Event]]
 """Changes, drops, adds or delays events; what comes after it does not know."""
 
 
-def find_beside(bag: Path, name: str) -> Path | None:
-    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
-    folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
-    return next((folder / name for folder in folders if (folder / name).is_file()), None)
-
-
 class RunOptions(TypedDict, total=False):
     """What `run` takes besides, by keyword.
 

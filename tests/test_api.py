@@ -31,12 +31,14 @@ NAMES = [
     "ModelError",
     "OutputError",
     "RecordingError",
+    "Results",
     "RunResult",
     "Trajectory",
     "TrajectoryError",
     "WireError",
     "load_config",
     "load_map",
+    "read_results",
     "run",
 ]
 

@@ -10,10 +10,11 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from datasets.bag import BagWriter
-from fgloc.assembly import assemble, given_pose
+from fgloc.assembly import assemble
 from fgloc.config import Config, RecordingConfig
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
 from fgloc.recording.reader import open_recording
+from fgloc.sensor_setup import given_pose
 from fgloc.sensors.learned.load import save_model
 
 START_NS = 1_700_000_000_000_000_000

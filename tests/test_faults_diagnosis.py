@@ -27,15 +27,16 @@ from robot_world import (
 from datasets import mrclam, pioneer, turtlebot3
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.assembly import given_pose
 from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.topic_activity import TopicActivity
+from fgloc.recording.files import find_beside
 from fgloc.recording.roles import TopicInfo, select_roles
-from fgloc.runner import find_beside, run
+from fgloc.runner import run
+from fgloc.sensor_setup import given_pose
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.events import CornersEvent, MarkerCorners

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli
-from fgloc.assembly import assemble, base_up
+from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.excerpt import Picture, read_excerpt
@@ -24,6 +24,7 @@ from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import rpy_matrix, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensor_setup import base_up
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent

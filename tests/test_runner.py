@@ -12,8 +12,9 @@ from world_bags import write_world
 
 from fgloc import se2
 from fgloc.errors import EstimatorError
+from fgloc.recording.files import find_beside
 from fgloc.recording.outputs import write_tum
-from fgloc.runner import find_beside, run
+from fgloc.runner import run
 from fgloc.types import Mode, RunResult, TruthEvent
 
 

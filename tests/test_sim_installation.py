@@ -14,10 +14,10 @@ from datasets.sim.installation import Installation
 from datasets.sim.installed import Installed, install, load_installed, survey, write_installed
 from datasets.sim.mjcf import intrinsics
 from datasets.sim.physics import base_twist, make_scene, simulate, slipping, wheel_twist
+from datasets.sim.readings import odometry
 from datasets.sim.record import is_recorded, record
 from datasets.sim.room import make_map
 from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
-from datasets.sim.sensors import odometry
 from datasets.sim.suite import BUNDLED, load_suite
 from fgloc.config import Config, GateConfig, load_config
 from fgloc.errors import ConfigError

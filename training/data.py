@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from fgloc.assembly import mounted_up
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
+from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig

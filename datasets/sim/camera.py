@@ -6,7 +6,7 @@ Radiance is linear: sub-frames over the exposure are averaged, blurred by the le
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +21,7 @@ from datasets.sim.section import channel_rng
 from fgloc.errors import FglocError
 from fgloc.types import FloatArray
 
+Image = NDArray[np.uint8]
 _REMEDY = "install libegl1 and libgl1-mesa-dri (EGL) or libosmesa6 (MUJOCO_GL=osmesa), or record without camera"
 _SUBFRAMES = (4, 24)  # at least: they also smooth the edges; at most
 _READ_SHARE = 0.3  # of the noise's variance at gain 1 and middle gray that does not depend on the light
@@ -32,6 +33,17 @@ class RenderError(FglocError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """When an image is taken (the middle of the exposure) and how; known before the robot is there."""
+
+    stamp_s: float
+    exposure_s: float
+    gain: float
+    light: float  # 1 is full
+    take: Callable[[], Image]  # the image; once the log reaches beyond the exposure, and in order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One image and when it was taken (the middle of the exposure)."""
 
@@ -39,7 +51,7 @@ class Frame:
     exposure_s: float
     gain: float
     light: float  # 1 is full
-    image: NDArray[np.uint8]  # (height, width)
+    image: Image  # (height, width)
 
 
 class Renderer:
@@ -60,7 +72,7 @@ class Renderer:
             raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {_REMEDY}") from error
         self._pixels = np.empty((self._height, self._width, 3), np.uint8)
 
-    def render(self, position: FloatArray, quaternion: FloatArray, shift_px: FloatArray) -> NDArray[np.uint8]:
+    def render(self, position: FloatArray, quaternion: FloatArray, shift_px: FloatArray) -> Image:
         """Radiance ``(height, width)`` seen from a pose of the base, the pixel grid shifted by a part of a pixel."""
         data = self._data
         data.qpos[:3], data.qpos[3:7] = position, np.roll(quaternion, 1)
@@ -109,7 +121,17 @@ class Lens:
 
 
 def frames(scene: Scene, log: Log) -> Iterator[Frame]:
-    """All images of a run, in order.
+    """All images of a finished run, in order.
+
+    Raises:
+        RenderError: no OpenGL.
+    """
+    for e in exposures(scene, log):
+        yield Frame(e.stamp_s, e.exposure_s, e.gain, e.light, e.take())
+
+
+def exposures(scene: Scene, log: Log) -> Iterator[Exposure]:
+    """All exposures of a run, in order; an image is rendered when it is taken, at the latest before the next exposure.
 
     Raises:
         RenderError: no OpenGL.
@@ -130,10 +152,16 @@ def frames(scene: Scene, log: Log) -> Iterator[Frame]:
             wanted *= (camera.exposure_s / light / wanted) ** follow if k > 0 else 1.0 / light
             exposure = min(wanted, camera.max_exposure_s)
             gain = min(max(wanted / exposure, 1.0), camera.max_gain)
-            renderer.screen({m for ids, begin, end in hidden if begin <= start < end for m in ids})
-            image = lens.image(_expose(renderer, camera, log, start, exposure))
-            image *= light * gain * exposure / camera.exposure_s
-            yield Frame(start + 0.5 * exposure, exposure, gain, light, _sense(image, camera.noise, gain, rng))
+            covered = {m for ids, begin, end in hidden if begin <= start < end for m in ids}
+
+            def take(start: float = start, exposure: float = exposure, gain: float = gain, light: float = light,
+                     covered: set[int] = covered) -> Image:  # fmt: skip
+                renderer.screen(covered)
+                image = lens.image(_expose(renderer, camera, log, start, exposure))
+                image *= light * gain * exposure / camera.exposure_s
+                return _sense(image, camera.noise, gain, rng)
+
+            yield Exposure(start + 0.5 * exposure, exposure, gain, light, take)
     finally:
         renderer.close()
 
@@ -177,7 +205,7 @@ def _shifts(n: int) -> FloatArray:
     return np.asarray(points - points.mean(axis=0))
 
 
-def _sense(image: NDArray[np.float32], noise: float, gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _sense(image: NDArray[np.float32], noise: float, gain: float, rng: np.random.Generator) -> Image:
     middle = 128.0
     variance = noise**2 * (_READ_SHARE * gain**2 + (1 - _READ_SHARE) * gain * image / middle)
     noisy = image + np.sqrt(variance) * rng.standard_normal(image.shape, dtype=np.float32)

@@ -1,16 +1,20 @@
-"""Physics: a scenario and a seed in, a log of everything that happened out."""
+"""Physics: a scenario and a seed in, a log of everything that happened out.
+
+The log is filled tick by tick, so that a controller may read the robot's sensors while it drives.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.sim.control import Driver
+from datasets.sim.control import Command, Driver
 from datasets.sim.ground import Ground, make_ground
 from datasets.sim.installed import Installed, install, survey, true_robot
 from datasets.sim.mjcf import build_model, wheel_names
@@ -30,9 +34,12 @@ class SimulationError(FglocError):
     """A run that cannot be simulated."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Log:
-    """State of the robot every TICK_S, from time 0 on. The base frame is on the floor between the wheels."""
+    """State of the robot every TICK_S, from time 0 on. The base frame is on the floor between the wheels.
+
+    While the robot drives, the first ``ticks`` rows are filled; times are known from the start.
+    """
 
     stamps_s: FloatArray  # (n,)
     positions: FloatArray  # (n, 3) m in the map
@@ -43,6 +50,31 @@ class Log:
     wheel_rates: FloatArray  # (n, wheels) rad/s
     torques: FloatArray  # (n, wheels) Nm, at the wheel
     commands: FloatArray  # (m, 3) t [s], v [m/s], omega [rad/s]
+    ticks: int
+
+    def part(self, rows: slice) -> Log:
+        """Some rows; the commands are all there."""
+        parts = {name: getattr(self, name)[rows] for name in _PER_TICK}
+        return Log(**parts, commands=self.commands, ticks=len(parts["stamps_s"]))
+
+
+_PER_TICK = (
+    "stamps_s",
+    "positions",
+    "quaternions",
+    "velocities",
+    "rates",
+    "wheel_angles",
+    "wheel_rates",
+    "torques",
+)
+
+
+class Controller(Protocol):
+    """What drives the robot."""
+
+    def command(self, t: float, pose: tuple[float, float, float]) -> Command | None:
+        """Command at time t [s], asked in order of time; the true pose is x, y [m], yaw [rad]. None ends the run."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,78 +107,100 @@ def simulate(scene: Scene) -> Log:
     Raises:
         SimulationError: the physics diverged.
     """
-    scenario, model, robot = scene.scenario, scene.model, scene.scenario.robot
-    names = wheel_names(robot)
-    joints = [model.joint(name).id for name in names]
-    q, v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    data = mujoco.MjData(model)
-    qpos, qvel, force, ctrl, places = data.qpos, data.qvel, data.actuator_force, data.ctrl, data.geom_xpos
-    qpos[:2] = scenario.start[:2]
-    qpos[2] = scene.ground.height_at(*scenario.start[:2], reach_m=0.2)
-    qpos[3:7] = np.roll(yaw_quaternion(scenario.start[2]), 1)
-    tyres = [
-        (model.geom_friction[model.geom(n.removesuffix("_joint")).id], places[model.geom(n.removesuffix("_joint")).id])
-        for n in names
-    ]
-    driver, regulator = Driver(scenario, scene.seed), Regulator(robot)
-    substeps = round(TICK_S / robot.contact.timestep_s)
-    every_command = round(1.0 / scenario.rates.command / TICK_S)
-    every_regulation = round(1.0 / robot.motor.regulator_hz / TICK_S)
-    delay = round(robot.command_delay_s / TICK_S)
-    n = round(scenario.duration_s / TICK_S) + 1
-    all_q, all_v, all_force = np.empty((n, model.nq)), np.empty((n, model.nv)), np.empty((n, model.nu))
-    commands: list[tuple[float, float, float]] = []
-    delayed: deque[tuple[int, float, float]] = deque()
-    set_point = (0.0, 0.0)
-    for tick in range(-round(_SETTLE_S / TICK_S), n):
-        if tick >= 0:
-            all_q[tick], all_v[tick], all_force[tick] = qpos, qvel, force
-            if tick % every_command == 0:
-                wanted = driver.command(tick * TICK_S, _planar(qpos))
-                commands.append((tick * TICK_S, *wanted))
-                delayed.append((tick + delay, *wanted))
-            while delayed and delayed[0][0] <= tick:
-                set_point = delayed.popleft()[1:]
-        if tick % every_regulation == 0:
-            ctrl[: len(names)] = regulator.volts(set_point, qpos[q].tolist())
-            if robot.payload is not None:
-                moved = tick * TICK_S > robot.payload.shift_at_s
-                ctrl[-1] = math.dist(robot.payload.start, robot.payload.end) if moved else 0.0
-        for friction, place in tyres:  # that of the floor under each wheel
-            friction[0] = scene.ground.mu_at(place[0], place[1])
-        mujoco.mj_step(model, data, nstep=substeps)
-    if not (np.isfinite(all_q).all() and np.abs(all_v).max() < _DIVERGED):
-        raise SimulationError(f"{scenario.name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
-    wheels = (all_q[:, q], all_v[:, v], all_force[:, : len(names)])
-    return _log(all_q, all_v, wheels, commands)
+    return Simulation(scene).run(Driver(scene.scenario, scene.seed))
 
 
-def _log(
-    q: FloatArray,
-    v: FloatArray,
-    wheels: tuple[FloatArray, FloatArray, FloatArray],
-    commands: list[tuple[float, float, float]],
-) -> Log:
-    """The log of a run.
+class Simulation:
+    """One run of a scene.
 
-    Args:
-        q: positions ``(n, nq)`` at each tick, the base first.
-        v: velocities ``(n, nv)``.
-        wheels: angles, rates and torques of the wheels, each ``(n, wheels)``.
-        commands: time [s], forward speed [m/s], yaw rate [rad/s].
+    Attributes:
+        log: of what has happened so far.
     """
-    angles, rates, torques = wheels
-    return Log(
-        stamps_s=np.arange(len(q)) * TICK_S,
-        positions=q[:, :3],
-        quaternions=np.roll(q[:, 3:7], -1, axis=1),
-        velocities=v[:, :3],
-        rates=v[:, 3:6],
-        wheel_angles=np.ascontiguousarray(angles),
-        wheel_rates=np.ascontiguousarray(rates),
-        torques=torques,
-        commands=np.array(commands),
-    )
+
+    def __init__(self, scene: Scene) -> None:
+        """Put the robot at its start."""
+        scenario, model, robot = scene.scenario, scene.model, scene.scenario.robot
+        self._scene, self._data = scene, mujoco.MjData(model)
+        self._names = wheel_names(robot)
+        joints = [model.joint(name).id for name in self._names]
+        self._wheel_q, self._wheel_v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        qpos = self._data.qpos
+        qpos[:2] = scenario.start[:2]
+        qpos[2] = scene.ground.height_at(*scenario.start[:2], reach_m=0.2)
+        qpos[3:7] = np.roll(yaw_quaternion(scenario.start[2]), 1)
+        self._regulator = Regulator(robot)
+        self._every_command = round(1.0 / scenario.rates.command / TICK_S)
+        n, wheels = round(scenario.duration_s / TICK_S) + 1, len(self._names)
+        self._q, self._v = np.empty((n, model.nq)), np.empty((n, model.nv))
+        commands = np.zeros((-(-n // self._every_command), 3))
+        commands[:, 0] = [tick * TICK_S for tick in range(0, n, self._every_command)]
+        self.log = Log(
+            stamps_s=np.arange(n) * TICK_S,
+            positions=self._q[:, :3],
+            quaternions=np.empty((n, 4)),
+            velocities=self._v[:, :3],
+            rates=self._v[:, 3:6],
+            wheel_angles=np.empty((n, wheels)),
+            wheel_rates=np.empty((n, wheels)),
+            torques=np.empty((n, wheels)),
+            commands=commands,
+            ticks=0,
+        )
+
+    def run(self, controller: Controller) -> Log:
+        """Drive until the scenario's time is over or the controller ends the run.
+
+        Raises:
+            SimulationError: the physics diverged.
+        """
+        scene, data, robot = self._scene, self._data, self._scene.scenario.robot
+        substeps = round(TICK_S / robot.contact.timestep_s)
+        every_regulation = round(1.0 / robot.motor.regulator_hz / TICK_S)
+        delay = round(robot.command_delay_s / TICK_S)
+        delayed: deque[tuple[int, float, float]] = deque()
+        set_point = (0.0, 0.0)
+        tyres = self._tyres()
+        for tick in range(-round(_SETTLE_S / TICK_S), len(self._q)):
+            if tick >= 0:
+                self._record(tick)
+                if tick % self._every_command == 0:
+                    wanted = controller.command(tick * TICK_S, _planar(data.qpos))
+                    if wanted is None:
+                        break
+                    self.log.commands[tick // self._every_command, 1:] = wanted
+                    delayed.append((tick + delay, *wanted))
+                while delayed and delayed[0][0] <= tick:
+                    set_point = delayed.popleft()[1:]
+            if tick % every_regulation == 0:
+                self._regulate(tick, set_point)
+            for friction, place in tyres:  # that of the floor under each wheel
+                friction[0] = scene.ground.mu_at(place[0], place[1])
+            mujoco.mj_step(scene.model, data, nstep=substeps)
+        q, v = self._q[: self.log.ticks], self._v[: self.log.ticks]
+        if not (np.isfinite(q).all() and np.abs(v).max() < _DIVERGED):
+            name = scene.scenario.name
+            raise SimulationError(f"{name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
+        return self.log
+
+    def _tyres(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Friction and place of each wheel's geometry, as MuJoCo holds them."""
+        ids = [self._scene.model.geom(n.removesuffix("_joint")).id for n in self._names]
+        return [(self._scene.model.geom_friction[i], self._data.geom_xpos[i]) for i in ids]
+
+    def _record(self, tick: int) -> None:
+        data, log = self._data, self.log
+        self._q[tick], self._v[tick] = data.qpos, data.qvel
+        log.quaternions[tick, :3], log.quaternions[tick, 3] = data.qpos[4:7], data.qpos[3]
+        log.wheel_angles[tick], log.wheel_rates[tick] = data.qpos[self._wheel_q], data.qvel[self._wheel_v]
+        log.torques[tick] = data.actuator_force[: len(self._names)]
+        log.ticks = tick + 1
+
+    def _regulate(self, tick: int, set_point: Command) -> None:
+        payload, ctrl = self._scene.scenario.robot.payload, self._data.ctrl
+        ctrl[: len(self._names)] = self._regulator.volts(set_point, self._data.qpos[self._wheel_q].tolist())
+        if payload is not None:
+            moved = tick * TICK_S > payload.shift_at_s
+            ctrl[-1] = math.dist(payload.start, payload.end) if moved else 0.0
 
 
 class Regulator:

@@ -7,6 +7,7 @@ length, with one draw of the error for each stretch.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from datasets.sim.section import channel_rng
 from fgloc.frames import quaternion_matrix
 from fgloc.types import FloatArray, IntArray
 
+Values = Callable[[int, int], FloatArray]
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84
 _ITERATIONS = 8  # of the latitude; each gains two digits
 
@@ -39,13 +41,12 @@ def anchors(scenario: Scenario, uwb: Uwb) -> FloatArray:
     return places
 
 
-def uwb_ranges(scenario: Scenario, uwb: Uwb, log: Log, seed: int) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Numbers of the anchors, times [s] and ranges [m], each ``(n,)``."""
+def uwb_ranges(scenario: Scenario, uwb: Uwb, log: Log, seed: int) -> tuple[IntArray, IntArray, Values]:
+    """Ticks of the log and numbers of the anchors, each ``(n,)``; and the ranges [m] of messages i to j."""
     rng = channel_rng(seed, "uwb")
     ticks = _ticks(log, uwb.rate_hz)
     which = np.arange(len(ticks)) % uwb.anchors
-    tag = _points(log, ticks, uwb.tag)
-    true = np.linalg.norm(tag - anchors(scenario, uwb)[which], axis=1)
+    places = anchors(scenario, uwb)
     seconds = log.stamps_s[ticks]
     excess = np.zeros(len(ticks))
     for anchor in range(uwb.anchors):
@@ -53,7 +54,14 @@ def uwb_ranges(scenario: Scenario, uwb: Uwb, log: Log, seed: int) -> tuple[IntAr
         stretch = _stretches(rng, seconds[mine], uwb.nlos_share, uwb.nlos_s)
         draws = rng.exponential(uwb.nlos_mean_m, int(stretch.max(initial=0)) + 1)
         excess[mine] = np.where(stretch > 0, draws[stretch], 0.0)
-    return which + 1, seconds, np.maximum(true + excess + rng.normal(0.0, uwb.sigma_m, len(true)), 0.1)
+    noise = rng.normal(0.0, uwb.sigma_m, len(ticks))
+
+    def ranges(first: int, last: int) -> FloatArray:
+        these = slice(first, last)
+        true = np.linalg.norm(_points(log, ticks[these], uwb.tag) - places[which[these]], axis=1)
+        return np.asarray(np.maximum(true + excess[these] + noise[these], 0.1))
+
+    return ticks, which + 1, ranges
 
 
 def uwb_settings(scenario: Scenario, uwb: Uwb) -> dict[str, Any]:
@@ -62,21 +70,25 @@ def uwb_settings(scenario: Scenario, uwb: Uwb) -> dict[str, Any]:
     return {"anchors": places, "tag": list(uwb.tag), "sigma_m": uwb.sigma_m}
 
 
-def gnss_places(gnss: Gnss, log: Log, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Times ``(n,)`` [s], and latitude, longitude [degrees], altitude [m] ``(n, 3)``."""
+def gnss_places(gnss: Gnss, log: Log, seed: int) -> tuple[IntArray, Values]:
+    """Ticks of the log ``(n,)``; and latitude, longitude [degrees], altitude [m] ``(., 3)`` of messages i to j."""
     rng = channel_rng(seed, "gnss")
     ticks = _ticks(log, gnss.rate_hz)
-    seconds = log.stamps_s[ticks]
-    stretch = _stretches(rng, seconds, gnss.multipath_share, gnss.multipath_s)
+    stretch = _stretches(rng, log.stamps_s[ticks], gnss.multipath_share, gnss.multipath_s)
     count = int(stretch.max(initial=0)) + 1
     far, direction = rng.exponential(gnss.multipath_mean_m, count), rng.uniform(-math.pi, math.pi, count)
     off = np.where(stretch > 0, far[stretch], 0.0)
-    places = _points(log, ticks, gnss.antenna)
     c, s = math.cos(gnss.yaw_rad), math.sin(gnss.yaw_rad)
-    enu = places @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    enu[:, 0] += off * np.cos(direction[stretch]) + rng.normal(0.0, gnss.sigma_m, len(enu))
-    enu[:, 1] += off * np.sin(direction[stretch]) + rng.normal(0.0, gnss.sigma_m, len(enu))
-    return seconds, geodetic(enu, gnss.origin)
+    east, north = (rng.normal(0.0, gnss.sigma_m, len(ticks)) for _ in range(2))
+    east, north = off * np.cos(direction[stretch]) + east, off * np.sin(direction[stretch]) + north
+
+    def places(first: int, last: int) -> FloatArray:
+        enu = _points(log, ticks[first:last], gnss.antenna) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+        enu[:, 0] += east[first:last]
+        enu[:, 1] += north[first:last]
+        return geodetic(enu, gnss.origin)
+
+    return ticks, places
 
 
 def gnss_settings(gnss: Gnss) -> dict[str, Any]:

@@ -1,9 +1,14 @@
-"""What the robot's channels say about a log: streams of messages in the order of their arrival."""
+"""What the robot's channels say about a log: streams of messages in the order of their arrival.
+
+When a message is received is known from the start; what it says is computed when it is written. So a finished log is
+written as a whole, and one that is still being filled as far as it reaches (`datasets.sim.following`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,26 +16,26 @@ from numpy.typing import NDArray
 
 from datasets.bag import BagWriter
 from datasets.convert import Message
-from datasets.sim.camera import frames, light_level
+from datasets.sim.camera import Exposure, exposures, light_level
 from datasets.sim.installed import camera_jitter_s
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
 from datasets.sim.positioning import gnss_places, uwb_ranges
-from datasets.sim.scenario import Gnss, Robot, Uwb
+from datasets.sim.readings import encoders, mean_over, odometry, specific_force
+from datasets.sim.rows import Rows
+from datasets.sim.scenario import Gnss, Uwb
 from datasets.sim.section import channel_rng
-from fgloc import se2
-from fgloc.frames import quaternion_matrix, rpy_matrix
+from fgloc.frames import rpy_matrix
 from fgloc.types import FloatArray, IntArray
 
 EPOCH_NS = 1_760_000_000_000_000_000  # time 0 of every run
 FULL_LIGHT_LUX = 500.0
-_GRAVITY = np.array([0.0, 0.0, 9.81])
 _LIGHT_HZ = 10.0
 _ODOMETRY_VARIANCE = (4e-4, 2.5e-3)  # of v and ω: a constant that the driver sends, as drivers do
 
 
 def streams(scene: Scene, log: Log, bag: BagWriter, camera: bool) -> list[Iterator[Message]]:
-    """All channels of a run, to be merged by their receive times."""
+    """All channels of a run, to be merged by receive times; a message is written before the next one is asked for."""
     channels: list[Iterator[Message]] = [
         _commands(scene, log, bag),
         _wheels(scene, log, bag),
@@ -52,135 +57,157 @@ def stamp_ns(seconds: float) -> int:
     return EPOCH_NS + round(seconds * 1e9)
 
 
-def odometry(log: Log, robot: Robot, every: int) -> tuple[FloatArray, FloatArray]:
-    """What the robot's driver makes of its encoders every ``every`` ticks.
-
-    Returns:
-        Poses ``(n, 3)`` and twists ``(n, 2)`` (v, ω) of the last interval, by the *nominal* radii and track.
-    """
-    angles = encoder_angles(log, robot)[::every]
-    turned = np.diff(angles, axis=0, prepend=angles[:1])
-    left = turned[:, 0::2].mean(axis=1) * robot.radius_m
-    right = turned[:, 1::2].mean(axis=1) * robot.radius_m
-    along, turn = 0.5 * (left + right), (right - left) / (robot.track_m * robot.track_scale)
-    poses = np.zeros((len(angles), 3))
-    for i in range(1, len(poses)):
-        poses[i] = se2.compose(poses[i - 1], se2.exp((along[i], 0.0, turn[i])))
-    return poses, np.column_stack([along, turn]) / (every * TICK_S)
-
-
-def encoder_angles(log: Log, robot: Robot) -> FloatArray:
-    """Wheel angles ``(n, wheels)`` in whole encoder ticks [rad]."""
-    tick = 2.0 * math.pi / robot.ticks_per_turn
-    return np.asarray(np.floor(log.wheel_angles / tick) * tick)
-
-
 def _commands(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     stamps = _stamps(log.commands[:, 0])
-    for stamp, received, (_, v, omega) in zip(stamps, _received(scene, "command", stamps), log.commands, strict=True):
-        yield _message(bag.command, received, "/cmd_vel", stamp, v=v, omega=omega, frame_id="base_link")
+
+    def write(i: int, received: int) -> None:
+        _, v, omega = log.commands[i]
+        bag.command("/cmd_vel", stamps[i], v=v, omega=omega, frame_id="base_link", received_ns=received)
+
+    return _messages(_received(scene, "command", stamps), write)
 
 
 def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     """``/odom`` and ``/joint_states``: both from one reading of the encoders, one packet."""
     robot = scene.scenario.robot
-    every = round(1.0 / scene.scenario.rates.odometry / TICK_S)
-    poses, twists = odometry(log, robot, every)
-    angles = encoder_angles(log, robot)[::every]
-    rates = np.diff(angles, axis=0, prepend=angles[:1]) / (every * TICK_S)
-    rng = channel_rng(scene.seed, "effort")
-    effort = _mean_over(log.torques, every) + rng.normal(0, robot.motor.effort_noise_nm, angles.shape)
+    every, ticks = _ticks(log, scene.scenario.rates.odometry)
+    stamps, late = _stamps(log.stamps_s[ticks]), round(1e9 * scene.installed.wheels.time_offset_s)
     names = wheel_names(robot)
+    noise = channel_rng(scene.seed, "effort").normal(0, robot.motor.effort_noise_nm, (len(ticks), len(names)))
     twist_cov = np.diag([_ODOMETRY_VARIANCE[0], 1e-6, 1e-6, 1e-6, 1e-6, _ODOMETRY_VARIANCE[1]])
-    stamps, late = _stamps(log.stamps_s[::every]), round(1e9 * scene.installed.wheels.time_offset_s)
-    for i, received in enumerate(_received(scene, "odometry", stamps)):
-        stamp = stamps[i] + late
-        yield _message(bag.odometry, received, "/odom", stamp, poses[i], twists[i], twist_cov=twist_cov)
-        yield _message(bag.joints, received, "/joint_states", stamp, names, angles[i], rates[i], effort[i])
+    reached: FloatArray | None = None
+
+    def make(first: int, last: int) -> tuple[FloatArray, ...]:
+        nonlocal reached
+        poses, twists = odometry(log, robot, every, slice(first, last), reached)
+        reached = poses[-1]
+        angles, turned = encoders(log, robot, every, slice(first, last))
+        effort = mean_over(log.torques, every, first, last) + noise[first:last]
+        return poses, twists, angles, turned / (every * TICK_S), effort
+
+    rows = Rows(log, ticks, make)
+
+    def write_odometry(i: int, received: int) -> None:
+        (poses, twists, *_), k = rows.at(i)
+        bag.odometry("/odom", stamps[i] + late, poses[k], twists[k], twist_cov=twist_cov, received_ns=received)
+
+    def write_joints(i: int, received: int) -> None:
+        (*_, angles, rates, effort), k = rows.at(i)
+        bag.joints("/joint_states", stamps[i] + late, names, angles[k], rates[k], effort[k], received_ns=received)
+
+    return _messages(_received(scene, "odometry", stamps), write_odometry, write_joints)
 
 
 def _imu(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     imu, installed = scene.scenario.imu, scene.installed.imu
-    every = round(1.0 / scene.scenario.rates.imu / TICK_S)
+    every, ticks = _ticks(log, scene.scenario.rates.imu)
+    dt, shape = every * TICK_S, (len(ticks), 3)
     rng = channel_rng(scene.seed, "imu")
-    rates = _mean_over(log.rates, every)
-    rotation = np.array([quaternion_matrix(q) for q in log.quaternions[::every]])
-    arm = np.einsum("nij,nj->ni", rotation, np.cross(log.rates[::every], imu.position))
-    speeds = log.velocities[::every] + arm
-    dt = every * TICK_S
-    force = np.einsum("nji,nj->ni", rotation, np.diff(speeds, axis=0, prepend=speeds[:1]) / dt + _GRAVITY)
-    walk = rng.normal(0, imu.gyro_walk * math.sqrt(dt), rates.shape).cumsum(axis=0)
+    walk = rng.normal(0, imu.gyro_walk * math.sqrt(dt), shape).cumsum(axis=0)
+    gyro_bias, gyro_noise = rng.normal(0, imu.gyro_bias, 3), rng.normal(0, imu.gyro_noise, shape)
+    accel_bias, accel_noise = rng.normal(0, imu.accel_bias, 3), rng.normal(0, imu.accel_noise, shape)
     R_base_imu = rpy_matrix(*installed.rpy)
-    rates, force = installed.gyro_scale * rates @ R_base_imu, force @ R_base_imu
-    gyro = rates + rng.normal(0, imu.gyro_bias, 3) + walk + rng.normal(0, imu.gyro_noise, rates.shape)
-    accel = force + rng.normal(0, imu.accel_bias, 3) + rng.normal(0, imu.accel_noise, force.shape)
-    stamps, late = _stamps(log.stamps_s[::every]), round(1e9 * installed.time_offset_s)
-    for i, received in enumerate(_received(scene, "imu", stamps)):
-        yield _message(
-            bag.imu,
-            received,
+
+    def make(first: int, last: int) -> tuple[FloatArray, FloatArray]:
+        rates = mean_over(log.rates, every, first, last)
+        force = specific_force(log, every, first, last, imu.position)
+        rates, force = installed.gyro_scale * rates @ R_base_imu, force @ R_base_imu
+        these = slice(first, last)
+        return rates + gyro_bias + walk[these] + gyro_noise[these], force + accel_bias + accel_noise[these]
+
+    rows = Rows(log, ticks, make)
+    stamps, late = _stamps(log.stamps_s[ticks]), round(1e9 * installed.time_offset_s)
+
+    def write(i: int, received: int) -> None:
+        (gyro, accel), k = rows.at(i)
+        bag.imu(
             "/imu",
             stamps[i] + late,
-            gyro[i],
-            accel[i],
+            gyro[k],
+            accel[k],
             angular_velocity_variance=imu.gyro_noise**2,
             linear_acceleration_variance=imu.accel_noise**2,
+            received_ns=received,
         )
+
+    return _messages(_received(scene, "imu", stamps), write)
 
 
 def _truth(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     """``/truth``, ``/truth/slip`` (true minus wheel twist) and ``/truth/slipping``."""
     robot = scene.scenario.robot
-    every = round(1.0 / scene.scenario.rates.truth / TICK_S)
-    true, wheels = base_twist(log)[::every], wheel_twist(log, robot)[::every]
-    slips = slipping(log, robot)[::every]
-    stamps = _stamps(log.stamps_s[::every])
-    for i, received in enumerate(_received(scene, "truth", stamps)):
-        k = i * every
-        yield _message(bag.truth, received, "/truth", stamps[i], log.positions[k], log.quaternions[k])
-        forward, left, turn = true[i] - (wheels[i, 0], 0.0, wheels[i, 1])
-        yield _message(bag.twist, received, "/truth/slip", stamps[i], (forward, left, 0.0), (0.0, 0.0, turn))
-        yield _message(bag.flag, received, "/truth/slipping", bool(slips[i]))
+    every, ticks = _ticks(log, scene.scenario.rates.truth)
+
+    def make(first: int, last: int) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        part = log.part(slice(first * every, (last - 1) * every + 1, every))
+        return base_twist(part), wheel_twist(part, robot), slipping(part, robot)
+
+    rows = Rows(log, ticks, make)
+    stamps = _stamps(log.stamps_s[ticks])
+
+    def write_pose(i: int, received: int) -> None:
+        k = ticks[i]
+        bag.truth("/truth", stamps[i], log.positions[k], log.quaternions[k], received_ns=received)
+
+    def write_slip(i: int, received: int) -> None:
+        (true, wheels, _), k = rows.at(i)
+        forward, left, turn = true[k] - (wheels[k, 0], 0.0, wheels[k, 1])
+        bag.twist("/truth/slip", stamps[i], (forward, left, 0.0), (0.0, 0.0, turn), received_ns=received)
+
+    def write_flag(i: int, received: int) -> None:
+        (*_, slips), k = rows.at(i)
+        bag.flag("/truth/slipping", bool(slips[k]), received)
+
+    return _messages(_received(scene, "truth", stamps), write_pose, write_slip, write_flag)
 
 
 def _light(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     seconds = np.arange(0.0, log.stamps_s[-1], 1.0 / _LIGHT_HZ)
     stamps = _stamps(seconds)
-    for i, received in enumerate(_received(scene, "truth", stamps)):
+
+    def write(i: int, received: int) -> None:
         lux = FULL_LIGHT_LUX * light_level(scene.scenario.world.light, seconds[i])
-        yield _message(bag.illuminance, received, "/truth/light", stamps[i], lux)
+        bag.illuminance("/truth/light", stamps[i], lux, received_ns=received)
+
+    return _messages(_received(scene, "truth", stamps), write)
 
 
 def _ranges(scene: Scene, uwb: Uwb, log: Log, bag: BagWriter) -> Iterator[Message]:
-    numbers, seconds, readings = uwb_ranges(scene.scenario, uwb, log, scene.seed)
-    stamps = _stamps(seconds)
-    for i, received in enumerate(_received(scene, "uwb", stamps)):
-        yield _message(bag.range_reading, received, "/uwb/range", stamps[i], readings[i], f"anchor_{numbers[i]}")
+    ticks, numbers, make = uwb_ranges(scene.scenario, uwb, log, scene.seed)
+    rows, stamps = Rows(log, ticks, make), _stamps(log.stamps_s[ticks])
+
+    def write(i: int, received: int) -> None:
+        readings, k = rows.at(i)
+        bag.range_reading("/uwb/range", stamps[i], readings[k], f"anchor_{numbers[i]}", received_ns=received)
+
+    return _messages(_received(scene, "uwb", stamps), write)
 
 
 def _fixes(scene: Scene, gnss: Gnss, log: Log, bag: BagWriter) -> Iterator[Message]:
-    seconds, places = gnss_places(gnss, log, scene.seed)
-    stamps, variances = _stamps(seconds), (gnss.sigma_m**2, gnss.sigma_m**2, 4.0 * gnss.sigma_m**2)
-    for i, received in enumerate(_received(scene, "gnss", stamps)):
-        yield _message(bag.satellite_fix, received, "/gnss/fix", stamps[i], places[i], variances)
+    ticks, make = gnss_places(gnss, log, scene.seed)
+    rows, stamps = Rows(log, ticks, make), _stamps(log.stamps_s[ticks])
+    variances = (gnss.sigma_m**2, gnss.sigma_m**2, 4.0 * gnss.sigma_m**2)
+
+    def write(i: int, received: int) -> None:
+        places, k = rows.at(i)
+        bag.satellite_fix("/gnss/fix", stamps[i], places[k], variances, received_ns=received)
+
+    return _messages(_received(scene, "gnss", stamps), write)
 
 
 def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
     """What the installer believes of where camera and IMU are: the IMU is level."""
     camera = scene.installed.believed.camera
     assert camera is not None
-    yield _message(
-        bag.static_transform,
-        EPOCH_NS,
-        EPOCH_NS,
-        "base_link",
-        "camera_optical",
-        camera.position,
-        quaternion_of(camera.rotation),
-    )
-    yield _message(
-        bag.static_transform, EPOCH_NS, EPOCH_NS, "base_link", "imu_link", scene.scenario.imu.position, (0, 0, 0, 1)
-    )
+    mounted = {
+        "camera_optical": (camera.position, quaternion_of(camera.rotation)),
+        "imu_link": (scene.scenario.imu.position, np.array([0.0, 0.0, 0.0, 1.0])),
+    }
+    for frame, (position, quaternion) in mounted.items():
+        yield (
+            EPOCH_NS,
+            partial(bag.static_transform, EPOCH_NS, "base_link", frame, position, tuple(quaternion), EPOCH_NS),
+        )
 
 
 def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
@@ -194,27 +221,37 @@ def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     least, mean = scene.scenario.latency.camera
     last = last_stamp = 0
     quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    for frame, extra_s in zip(frames(scene, log), jitter, strict=False):
-        taken = stamp_ns(frame.stamp_s)
+    for exposure, extra_s in zip(exposures(scene, log), jitter, strict=False):
+        taken = stamp_ns(exposure.stamp_s)
         stamp = last_stamp = max(taken + round(1e9 * (installed.time_offset_s + extra_s)), last_stamp + 1)
-        received = taken + round(1e9 * (0.5 * frame.exposure_s + least + rng.exponential(mean)))
+        received = taken + round(1e9 * (0.5 * exposure.exposure_s + least + rng.exponential(mean)))
         received = last = max(received, last)
-        data = cv2.imencode(".jpg", frame.image, quality)[1].tobytes()
-        yield _message(
-            bag.camera_info,
-            received,
-            "/camera/camera_info",
-            stamp,
-            camera.width,
-            camera.height,
-            believed.matrix,
-            believed.distortion,
-        )
-        yield _message(bag.compressed_image, received, "/camera/image/compressed", stamp, data)
+
+        def write_info(stamp: int = stamp, received: int = received) -> None:
+            matrix, distortion = believed.matrix, believed.distortion
+            bag.camera_info(
+                "/camera/camera_info", stamp, camera.width, camera.height, matrix, distortion, received_ns=received
+            )
+
+        def write_image(exposure: Exposure = exposure, stamp: int = stamp, received: int = received) -> None:
+            data = cv2.imencode(".jpg", exposure.take(), quality)[1].tobytes()
+            bag.compressed_image("/camera/image/compressed", stamp, data, received_ns=received)
+
+        yield received, write_info
+        yield received, write_image
 
 
-def _message(write: Callable[..., None], received_ns: int, *args: object, **fields: object) -> Message:
-    return received_ns, lambda: write(*args, **fields, received_ns=received_ns)
+def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:
+    """Messages i = 0, 1, ... of one channel, each by all of its writers, which are given i and when it is received."""
+    for i, at_ns in enumerate(received):
+        for one in write:
+            yield at_ns, partial(one, i, at_ns)
+
+
+def _ticks(log: Log, rate_hz: float) -> tuple[int, IntArray]:
+    """A message every so many ticks, and all of the ticks."""
+    every = round(1.0 / rate_hz / TICK_S)
+    return every, np.arange(0, len(log.stamps_s), every)
 
 
 def _stamps(seconds: FloatArray) -> list[int]:
@@ -227,12 +264,6 @@ def _received(scene: Scene, channel: str, stamps: list[int]) -> list[int]:
     rng = channel_rng(scene.seed, f"latency of {channel}")
     late: IntArray = np.array(stamps) + np.round(1e9 * (least + rng.exponential(mean, len(stamps)))).astype(np.int64)
     return [int(s) for s in np.maximum.accumulate(late)]
-
-
-def _mean_over(values: FloatArray, every: int) -> FloatArray:
-    """Mean ``(n, d)`` of the ``every`` ticks up to each message; the first has one."""
-    rows = values[1 : 1 + (len(values) - 1) // every * every].reshape(-1, every, values.shape[1])
-    return np.concatenate([values[:1], rows.mean(axis=1)])
 
 
 def quaternion_of(rotation: NDArray[np.float64]) -> FloatArray:

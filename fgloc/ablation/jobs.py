@@ -23,7 +23,6 @@ from fgloc import se2
 from fgloc.ablation.failures import Scene, corrupt, generators
 from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path, read_record, write_record
 from fgloc.ablation.suite import Cell
-from fgloc.assembly import resolved
 from fgloc.config import Config
 from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
@@ -32,6 +31,7 @@ from fgloc.frames import quaternion_yaw
 from fgloc.recording.outputs import sha256_of, write_text
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensor_setup import resolved
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import Mode, RunResult, TruthEvent
 

@@ -15,7 +15,8 @@ from fgloc.ablation.failures import BuiltInFailure, Failure
 from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.files.settings_file import Settings, sentences
-from fgloc.runner import RunMode, find_beside
+from fgloc.recording.files import find_beside
+from fgloc.runner import RunMode
 from fgloc.sensors.registry import sensors
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ import numpy as np
 from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
-from fgloc.runner import Progress, find_beside, run
+from fgloc.recording.files import find_beside
+from fgloc.runner import Progress, run
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _SIGHTINGS = ("corners", "range_bearing", "marker_pose")

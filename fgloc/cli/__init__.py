@@ -10,7 +10,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from fgloc.cli import live, runs, surveys, sweeps, tools
+from fgloc.cli import exports, live, runs, surveys, sweeps, tools
 from fgloc.cli.terminal import EXIT_BAD_INPUT, say
 from fgloc.errors import FglocError
 
@@ -41,6 +41,7 @@ app.command()(runs.online)
 app.command(name="live")(live.live)
 app.command(name="play")(live.play)
 app.command()(tools.evaluate)
+app.command()(exports.export)
 app.command(name="map")(surveys.make_map)
 app.command()(runs.calibrate)
 app.command()(sweeps.ablate)

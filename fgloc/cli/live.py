@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from tqdm import tqdm
 
 from fgloc.cli.options import Bag, ModelOption, configured
 from fgloc.cli.terminal import columns, run_bar, say
@@ -118,6 +117,8 @@ def _interrupted() -> Iterator[threading.Event]:
 
 
 def _tell(sentence: str) -> None:
+    from tqdm import tqdm
+
     tqdm.write(sentence, file=sys.stdout)
     sys.stdout.flush()
 
@@ -151,6 +152,8 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 @contextmanager
 def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     """The pose, on a terminal."""
+    from tqdm import tqdm
+
     with tqdm(bar_format="{desc}", disable=None, file=sys.stderr, leave=False) as bar:
         if bar.disable:
             yield

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pydantic import ValidationError
 
-from fgloc.config import Config, MotionConfig, config_of, load_config
 from fgloc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
 
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
@@ -34,6 +35,10 @@ ConfigOption = Annotated[
 RrdOption = Annotated[
     Path | None, typer.Option("--rrd", metavar="FILE", dir_okay=False, help="also write the run for rerun's viewer")
 ]
+McapOption = Annotated[
+    Path | None,
+    typer.Option("--mcap", metavar="FILE", dir_okay=False, help="also write the run as a bag of standard messages"),
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
 SchedulerOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")
@@ -46,7 +51,10 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     Raises:
         ConfigError: the file is missing or wrong.
     """
-    from fgloc.runner import find_beside
+    from pydantic import ValidationError
+
+    from fgloc.config import MotionConfig, config_of, load_config
+    from fgloc.recording.files import find_beside
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = config_of({}) if file is None else load_config(file)

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import fgloc
+from fgloc.cli.exports import write_for_viewers
 from fgloc.cli.options import (
     Bag,
     Bags,
     ConfigOption,
     MapOption,
+    McapOption,
     ModelOption,
     Out,
     RrdOption,
@@ -25,11 +27,11 @@ from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
-from fgloc.types import RunResult
 
 if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
+    from fgloc.types import RunResult
 
 _TOLD = 3  # judgements in the short form
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
@@ -81,16 +83,17 @@ def smooth(
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     rrd: RrdOption = None,
+    mcap: McapOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
-        if rrd is not None:
-            raise ConfigError("--rrd: expected one bag; give each its own command")
+        if rrd is not None or mcap is not None:
+            raise ConfigError("--rrd, --mcap: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
     result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
-    _finish(result, metrics, out, rrd)
+    _finish(result, metrics, out, rrd, mcap)
 
 
 def online(
@@ -101,11 +104,12 @@ def online(
     config: ConfigOption = None,
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
+    mcap: McapOption = None,
 ) -> None:
     """Replay the recording as on a live robot; each pose depends only on what came before."""
     pace = 1.0 if speed is Speed.REAL_TIME else None
     result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
-    _finish(result, metrics, out, rrd)
+    _finish(result, metrics, out, rrd, mcap)
 
 
 def calibrate(
@@ -142,10 +146,11 @@ def _localise(
 ) -> tuple[RunResult, Metrics]:
     """Run one recording and write its results."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.assembly import resolved
     from fgloc.evaluation.report import write_results
+    from fgloc.recording.files import find_beside
     from fgloc.recording.outputs import sha256_of
-    from fgloc.runner import find_beside, run
+    from fgloc.runner import run
+    from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
@@ -155,14 +160,11 @@ def _localise(
     return result, write_results(result, result.config or config, out, command, sha256_of(bag))
 
 
-def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None) -> None:
-    """Say what came out, and write it for rerun's viewer."""
+def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mcap: Path | None) -> None:
+    """Say what came out, and write it for the viewers that were asked for."""
     from fgloc.evaluation.judgements import gravest
 
-    if rrd is not None:
-        from fgloc.view.file import write_rrd
-
-        write_rrd(result, rrd)
+    write_for_viewers(result, rrd, mcap)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
     if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
         rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
@@ -82,6 +81,8 @@ def _of_points(bag: Path, out: Path, settings: Config) -> None:
 
 
 def _tell(found: Survey, out: Path) -> None:
+    import numpy as np
+
     rows = []
     for i, views in found.views.items():
         cov = found.landmarks.landmarks[i].cov

@@ -9,12 +9,10 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import typer
-from tqdm import tqdm
-
-from fgloc.types import Mode, RunResult
 
 if TYPE_CHECKING:
     from fgloc.runner import Progress
+    from fgloc.types import RunResult
 
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
@@ -36,11 +34,15 @@ def typed() -> str:
 
 def exit_code(result: RunResult) -> int:
     """0, or 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+    from fgloc.types import Mode
+
     return EXIT_LOST if Mode.LOST in result.modes or result.mistakes else 0
 
 
 def exit_unless_trusted(result: RunResult) -> None:
     """End with code 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+    from fgloc.types import Mode
+
     lost = sum(mode is Mode.LOST for mode in result.modes)
     if lost:
         say(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
@@ -53,6 +55,8 @@ def exit_unless_trusted(result: RunResult) -> None:
 @contextmanager
 def run_bar(label: str) -> Iterator[Progress]:
     """Seconds of one recording: a bar on a terminal, nothing on a pipe."""
+    from tqdm import tqdm
+
     form = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}]"
     with tqdm(desc=label, total=1.0, disable=None, bar_format=form, file=sys.stderr, leave=False) as bar:
 
@@ -67,6 +71,8 @@ def run_bar(label: str) -> Iterator[Progress]:
 @contextmanager
 def jobs_bar(label: str, count: int) -> Iterator[Callable[[int, int], None]]:
     """Jobs of a sweep, with an estimate of the time left: a bar on a terminal, nothing on a pipe."""
+    from tqdm import tqdm
+
     with tqdm(desc=label, total=count, disable=None, file=sys.stderr, leave=False) as bar:
 
         def show(done: int, total: int) -> None:

@@ -22,8 +22,8 @@ class Align(StrEnum):
 def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
     """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong, also with the map."""
     from fgloc.diagnosis.gross_mistakes import inspect_all
+    from fgloc.recording.files import find_beside
     from fgloc.recording.info import format_info
-    from fgloc.runner import find_beside
 
     map_path = map_file or find_beside(bag, "map.yaml")
     say(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)

@@ -92,36 +92,60 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         config: bounds of what is taken.
         detector: of markers; None: the recording holds corners.
     """
-    found, gate = Excerpt(), EventValidator(config.gate)
-    role_of = {topic: role for role, topic in recording.roles.items()}
-    first_image: int | None = None
-    last_image = 0
-    end_ns: int | None = None
+    collector = ExcerptCollector(recording, config, detector)
     for event in recording.events():
-        if end_ns is None:
-            end_ns = event.received_ns + round(_PATIENCE_S * 1e9)
-        if event.received_ns > end_ns:
+        if not collector.add(event):
             break
-        role = role_of.get(event.topic)
+    return collector.found
+
+
+class ExcerptCollector:
+    """Takes an excerpt from the events of a recording, as `read_excerpt` does.
+
+    Attributes:
+        found: the excerpt, so far.
+    """
+
+    def __init__(self, recording: Recording, config: Config, detector: Detector | None) -> None:
+        """As `read_excerpt`, but nothing is read."""
+        self.found = Excerpt()
+        self._gate = EventValidator(config.gate)
+        self._detector = detector
+        self._role_of = {topic: role for role, topic in recording.roles.items()}
+        self._first_image: int | None = None
+        self._last_image = 0
+        self._end_ns: int | None = None
+
+    def add(self, event: Event) -> bool:
+        """Take what is wanted of an event; False: it came after the excerpt's end."""
+        if self._end_ns is None:
+            self._end_ns = event.received_ns + round(_PATIENCE_S * 1e9)
+        if event.received_ns > self._end_ns:
+            return False
+        role = self._role_of.get(event.topic)
         if role is not None:
-            found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
-        if not isinstance(event, ImageEvent | CornersEvent):
-            _take_motion(found, gate, event)
-            continue
-        if first_image is None:
-            first_image = event.stamp_ns
-            end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
-        which, within = divmod((event.stamp_ns - first_image) * 1e-9, PERIOD_S)
-        if not (0 <= which < STRETCHES and within < STRETCH_S) or event.stamp_ns - last_image < _SPACING_S * 1e9:
-            continue
-        last_image = event.stamp_ns
-        corners = _corners(event, detector)
-        passed = None if corners is None else gate.check(corners)
+            self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
+        if isinstance(event, ImageEvent | CornersEvent):
+            self._take_image(event)
+        else:
+            _take_motion(self.found, self._gate, event)
+        return True
+
+    def _take_image(self, event: ImageEvent | CornersEvent) -> None:
+        if self._first_image is None:
+            self._first_image = event.stamp_ns
+            self._end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
+        which, within = divmod((event.stamp_ns - self._first_image) * 1e-9, PERIOD_S)
+        near = event.stamp_ns - self._last_image < _SPACING_S * 1e9
+        if near or not (0 <= which < STRETCHES and within < STRETCH_S):
+            return
+        self._last_image = event.stamp_ns
+        corners = _corners(event, self._detector)
+        passed = None if corners is None else self._gate.check(corners)
         if isinstance(passed, CornersEvent):
-            found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
+            self.found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
         elif corners is not None:
-            found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
-    return found
+            self.found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
 
 
 def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:

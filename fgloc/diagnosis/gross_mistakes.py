@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from fgloc import se2
-from fgloc.assembly import Assembly, assemble, base_up
 from fgloc.config import Config, Role
-from fgloc.diagnosis.excerpt import GRID_S, Excerpt, read_excerpt, wheel_increments
+from fgloc.diagnosis.excerpt import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
 from fgloc.diagnosis.image_checks import image_hints
 from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
 from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
-from fgloc.recording.info import RecordingInfo, inspect
+from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.markers.remembered import Detections, RememberedDetections
 from fgloc.types import FloatArray, LandmarkMap
 
@@ -70,19 +70,27 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
-    """What `inspect` reports of a recording, with the gross mistakes first among the findings.
+    """What `inspect` reports of a recording, with the gross mistakes first among the findings; it is read once.
 
     Raises:
         RecordingError: nothing can be read.
     """
-    info = inspect(path, config)
-    if info.problems:
-        return info
-    try:
-        sentences = find_mistakes(path, map_path, config).sentences
-    except FglocError as error:
-        sentences = (str(error),)
-    return replace(info, findings=(*sentences, *info.findings))
+    search = _Search(path, map_path, config)
+    with Recording(path, config.recording) as recording:
+        if recording.problems:
+            return inspect_recording(recording, config)
+        try:
+            setup, detector = search.begin(recording)
+        except FglocError as error:
+            info = inspect_recording(recording, config)
+            return replace(info, findings=(str(error), *info.findings))
+        collector = ExcerptCollector(recording, config, detector)
+        info = inspect_recording(recording, config, collector.add)
+        try:
+            search.go_on(recording, setup, collector.found)
+        except FglocError as error:
+            return replace(info, findings=(str(error), *info.findings))
+    return replace(info, findings=(*search.sentences, *info.findings))
 
 
 class _Search:
@@ -96,55 +104,61 @@ class _Search:
         self.detections: dict[bytes, Detections] = {}
 
     def run(self) -> None:
-        """All checks, in the order in which one makes the next possible."""
-        if self._read_anew():
-            self._read_anew()
-
-    def _read_anew(self) -> bool:
-        """All checks with the stamps as they are; whether these were corrected and all has to begin again."""
+        """Read the excerpt, and check it."""
         with open_recording(self._path, self.config.recording) as recording:
-            parts = assemble(recording, self._map_path, self.config, keep_all=False)
-            excerpt = self._excerpt(recording, parts)
-            roles = other_clocks(excerpt.delays)
-            given = self.config.recording.received_stamps
-            if roles and not set(roles) <= set(given):
-                self.sentences.append(clock_sentence(roles, excerpt.delays, given))
-                self._change("recording", received_stamps=(*given, *roles))
-                return True
-            rolled = roll_over(excerpt.motion, self.config)
-            if rolled is not None:
-                self.sentences.append(
-                    f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
-                    f"set wheels.angle_range: {rolled[0]:.4f}."
-                )
-                self._change("wheels", angle_range=rolled[0])
-            if parts.landmark_map is None:
-                return False
-            if self._unseen(excerpt, parts) and not self._images(recording, parts):
-                return False
-            if self.config.markers.dictionary != parts.config.markers.dictionary:
-                self.detections.clear()
-                parts = assemble(recording, self._map_path, self.config, keep_all=False)
-                excerpt = self._excerpt(recording, parts)
-            self._fit(recording, excerpt, parts)
+            self.go_on(recording, *self._read(recording))
+
+    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberedDetections | None]:
+        """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
+        setup = recorded_setup(recording, self._map_path, self.config)[1]
+        if setup.detector is None:
+            return setup, None
+        memory = RememberedDetections(None, setup.detector, self.detections)
+        self.detections = memory.found
+        return setup, memory
+
+    def go_on(self, recording: Recording, setup: SensorSetup, excerpt: Excerpt) -> None:
+        """As `run`, of an excerpt that was read."""
+        if self._check(recording, setup, excerpt):
+            with open_recording(self._path, self.config.recording) as corrected:
+                self._check(corrected, *self._read(corrected))
+
+    def _read(self, recording: Recording) -> tuple[SensorSetup, Excerpt]:
+        setup, detector = self.begin(recording)
+        return setup, read_excerpt(recording, self.config, detector)
+
+    def _check(self, recording: Recording, parts: SensorSetup, excerpt: Excerpt) -> bool:
+        """All checks, in the order in which one makes the next possible; whether stamps were corrected meanwhile."""
+        roles = other_clocks(excerpt.delays)
+        given = self.config.recording.received_stamps
+        if roles and not set(roles) <= set(given):
+            self.sentences.append(clock_sentence(roles, excerpt.delays, given))
+            self._change("recording", received_stamps=(*given, *roles))
+            return True
+        rolled = roll_over(excerpt.motion, self.config)
+        if rolled is not None:
+            self.sentences.append(
+                f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
+                f"set wheels.angle_range: {rolled[0]:.4f}."
+            )
+            self._change("wheels", angle_range=rolled[0])
+        if parts.landmark_map is None:
+            return False
+        if self._unseen(excerpt, parts) and not self._images(recording, parts):
+            return False
+        if self.config.markers.dictionary != parts.config.markers.dictionary:
+            self.detections.clear()
+            parts, excerpt = self._read(recording)
+        self._fit(recording, excerpt, parts)
         return False
 
-    def _excerpt(self, recording: Recording, parts: Assembly) -> Excerpt:
-        """The excerpt; what is found in its images is remembered."""
-        if parts.detector is None:
-            return read_excerpt(recording, self.config, None)
-        memory = RememberedDetections(None, parts.detector, self.detections)
-        excerpt = read_excerpt(recording, self.config, memory)
-        self.detections = memory.found
-        return excerpt
-
-    def _unseen(self, excerpt: Excerpt, parts: Assembly) -> bool:
+    def _unseen(self, excerpt: Excerpt, parts: SensorSetup) -> bool:
         """Whether images were searched and next to none shows a marker of the map."""
         assert parts.landmark_map is not None
         shown = [any(m.landmark_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
         return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
 
-    def _images(self, recording: Recording, parts: Assembly) -> bool:
+    def _images(self, recording: Recording, parts: SensorSetup) -> bool:
         """Report why no marker is found; whether another dictionary finds them."""
         assert parts.detector is not None
         hints, fitting = image_hints(recording, parts.detector)
@@ -153,7 +167,7 @@ class _Search:
             self._change("markers", dictionary=fitting)
         return fitting is not None
 
-    def _fit(self, recording: Recording, excerpt: Excerpt, parts: Assembly) -> None:
+    def _fit(self, recording: Recording, excerpt: Excerpt, parts: SensorSetup) -> None:
         landmark_map, camera = parts.landmark_map, parts.camera
         if camera is None or landmark_map is None:
             return

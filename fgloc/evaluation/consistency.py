@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fgloc.errors import CovarianceError
+from fgloc.stats import chi2_bound
 
 FloatArray = NDArray[np.float64]
 
@@ -50,5 +50,5 @@ def mean_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[floa
     For the mean NEES or NIS over independent runs or seeds; successive poses of one run are not independent.
     """
     tail = 0.5 * (1.0 - probability)
-    low, high = chi2.ppf([tail, 1.0 - tail], dof * samples) / samples
-    return float(low), float(high)
+    low, high = (chi2_bound(p, dof * samples) / samples for p in (tail, 1.0 - tail))
+    return low, high

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from fgloc.assembly import base_frame, camera_frame, given_pose
 from fgloc.config import Config, Role, role_names
 from fgloc.recording.transforms import FrameTree
+from fgloc.sensor_setup import base_frame, camera_frame, given_pose
 from fgloc.sensors import registry
 from fgloc.types import Camera, CameraInfoEvent, Event, RawEvent, SightingsEvent, TransformEvent, TruthEvent
 

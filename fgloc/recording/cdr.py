@@ -75,6 +75,10 @@ class Messages:
             queue += [field.element for field in found[name] if field.nested]
         return found
 
+    def definition(self, message_type: str) -> str:
+        """The text of a message type and of all the types inside it, as recordings embed it."""
+        return str(self._store.generate_msgdef(message_type, ros_version=2)[0])
+
     def decode(self, message_type: str, cdr: bytes) -> Any:
         """The message. Raises whatever rosbags leaks on damaged bytes."""
         return self._store.deserialize_cdr(cdr, message_type)

@@ -50,15 +50,14 @@ class Decoder:
                 embedded.update(_parse(message_type, definition))
             except Exception:  # the parser leaks what damaged text makes it meet
                 damaged.add(message_type)
-        default = _default_definitions(ros1)
         self.store = get_typestore(Stores.EMPTY)
         try:
-            needed = _needed(used, {**default, **embedded})
+            needed = _needed(used, embedded, ros1)
             check_sizes(needed)
             self.store.register(needed)
         except Exception:  # a definition that parses may still be nonsense
             self.store = get_typestore(Stores.EMPTY)
-            self.store.register(_needed(used, default))
+            self.store.register(_needed(used, {}, ros1))
             damaged |= embedded.keys() & used
         self._deserialize = self.store.deserialize_ros1 if ros1 else self.store.deserialize_cdr
         self.notes: list[str] = []
@@ -80,15 +79,21 @@ def _default_definitions(ros1: bool) -> Typesdict:
     return default_typestore(ros1).fielddefs
 
 
-def _needed(used: Iterable[str], definitions: Typesdict) -> Typesdict:
-    """The definitions of some types and of all the types inside them: registering hundreds more takes a while."""
+def _needed(used: Iterable[str], embedded: Typesdict, ros1: bool) -> Typesdict:
+    """The definitions of some types and of all the types inside them: loading hundreds more takes a while.
+
+    The default definitions are loaded only if one is not embedded.
+    """
     needed: Typesdict = {}
     queue = list(used)
     while queue:
         name = queue.pop()
-        if name in definitions and name not in needed:
-            needed[name] = definitions[name]
-            queue += [inner for _, field in definitions[name][1] for inner in _names(field)]
+        if name in needed:
+            continue
+        found = embedded.get(name) or _default_definitions(ros1).get(name)
+        if found is not None:
+            needed[name] = found
+            queue += [inner for _, field in found[1] for inner in _names(field)]
     return needed
 
 

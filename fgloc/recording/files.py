@@ -12,6 +12,12 @@ _KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
 EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 
+def find_beside(bag: Path, name: str) -> Path | None:
+    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
+    folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
 def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
     """Storage files of a recording, in order, and its metadata where used.
 

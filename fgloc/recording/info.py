@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ from fgloc.recording.checks import CameraInfoChecks, collector
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
 from fgloc.sensors.topic_checks import Collector, RawChecks, SightingsChecks
-from fgloc.types import MotionEvent
+from fgloc.types import Event, MotionEvent
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
 
@@ -48,48 +48,66 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
         RecordingError: nothing can be read.
     """
     with Recording(path, config.recording) as recording:
-        times = {topic.name: Times() for topic in recording.topics}
-        role_of = {topic: role for role, topic in recording.roles.items()}
-        checks: dict[str, Collector] = {topic: collector(role) for topic, role in role_of.items()}
-        child_frame = ""
-        for message in recording.messages():
-            topic, _, received_ns, _ = message
-            times.setdefault(topic, Times()).received.append(received_ns)  # damage may hide a topic at first
-            if topic in role_of:
-                for event in recording.decode(message, role_of[topic]):
-                    times[topic].decoded.append(received_ns)
-                    times[topic].stamps.append(event.stamp_ns)
-                    checks[topic].add(event)
-                    if isinstance(event, MotionEvent):
-                        child_frame = child_frame or event.base_frame_id
-        start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
-        undecodable = dict(recording.undecodable)
-        reports, findings = [], []
-        for info in recording.topics:
-            report, found = report_topic(info, times[info.name], start_ns, config)
-            reports.append(report)
-            findings += found
-            if info.name in checks and times[info.name].stamps:
-                seconds = np.asarray((int64(times[info.name].decoded) - start_ns) * 1e-9)
-                with np.errstate(all="ignore"):  # absurd magnitudes overflow: that is what is looked for
-                    findings += checks[info.name].findings(info.name, seconds, config)
-        findings += [f"{topic}: {n} messages cannot be decoded." for topic, n in undecodable.items()]
-        findings += _roles(recording, config, checks, child_frame)
-        findings += early_clocks(reports)
-        ids = next((c.ids for c in checks.values() if isinstance(c, SightingsChecks)), Counter())
-        return RecordingInfo(
-            path=path,
-            kind=recording.kind,
-            start_ns=start_ns,
-            duration_s=recording.duration_s,
-            size_bytes=recording.size_bytes,
-            topics=tuple(reports),
-            roles=recording.roles,
-            marker_ids=dict(sorted(ids.items())),
-            problems=recording.problems,
-            findings=tuple(findings),
-            notes=recording.notes,
-        )
+        return inspect_recording(recording, config)
+
+
+def inspect_recording(
+    recording: Recording, config: Config, watch: Callable[[Event], object] | None = None
+) -> RecordingInfo:
+    """As `inspect`, of an opened recording; `watch` is called with each event that is decoded, tf's excepted."""
+    times, checks, child_frame = _read_through(recording, watch)
+    start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
+    undecodable = dict(recording.undecodable)
+    reports, findings = [], []
+    for info in recording.topics:
+        report, found = report_topic(info, times[info.name], start_ns, config)
+        reports.append(report)
+        findings += found
+        if info.name in checks and times[info.name].stamps:
+            seconds = np.asarray((int64(times[info.name].decoded) - start_ns) * 1e-9)
+            with np.errstate(all="ignore"):  # absurd magnitudes overflow: that is what is looked for
+                findings += checks[info.name].findings(info.name, seconds, config)
+    findings += [f"{topic}: {n} messages cannot be decoded." for topic, n in undecodable.items()]
+    findings += _roles(recording, config, checks, child_frame)
+    findings += early_clocks(reports)
+    ids = next((c.ids for c in checks.values() if isinstance(c, SightingsChecks)), Counter())
+    return RecordingInfo(
+        path=recording.path,
+        kind=recording.kind,
+        start_ns=start_ns,
+        duration_s=recording.duration_s,
+        size_bytes=recording.size_bytes,
+        topics=tuple(reports),
+        roles=recording.roles,
+        marker_ids=dict(sorted(ids.items())),
+        problems=recording.problems,
+        findings=tuple(findings),
+        notes=recording.notes,
+    )
+
+
+def _read_through(
+    recording: Recording, watch: Callable[[Event], object] | None
+) -> tuple[dict[str, Times], dict[str, Collector], str]:
+    """Times and checks of each topic, and the first name of a child frame."""
+    times = {topic.name: Times() for topic in recording.topics}
+    role_of = {topic: role for role, topic in recording.roles.items()}
+    checks: dict[str, Collector] = {topic: collector(role) for topic, role in role_of.items()}
+    child_frame = ""
+    recording.undecodable = {}
+    for message in recording.messages():
+        topic, _, received_ns, _ = message
+        times.setdefault(topic, Times()).received.append(received_ns)  # damage may hide a topic at first
+        if topic in role_of:
+            for event in recording.decode(message, role_of[topic]):
+                times[topic].decoded.append(received_ns)
+                times[topic].stamps.append(event.stamp_ns)
+                checks[topic].add(event)
+                if watch is not None:
+                    watch(event)
+                if isinstance(event, MotionEvent):
+                    child_frame = child_frame or event.base_frame_id
+    return times, checks, child_frame
 
 
 def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector], child_frame: str) -> list[str]:

@@ -45,16 +45,30 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         TrajectoryError: a pose is not finite.
         OutputError: the file cannot be written.
     """
-    bad = np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=1))
-    if bad.size:
-        pose = trajectory.poses[bad[0]].tolist()
-        raise TrajectoryError(f"{path}: pose {bad[0]} is {pose}, expected finite x, y, yaw; nothing was written")
+    _check_finite(path, trajectory)
     with atomic_file(path) as file:
         file.write(_TUM_HEADER)
         for stamp, (x, y, yaw) in zip(trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True):
             qz, qw = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
             numbers = (x, y, 0.0, 0.0, 0.0, qz, qw)
             file.write(f"{_seconds(stamp)} " + " ".join(f"{number:.9f}" for number in numbers) + "\n")
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write a planar trajectory as KITTI's odometry benchmark has it: the 12 numbers of ``[R | t]``, row by row.
+
+    The axes are ours (x forward, z up); KITTI's own files have a camera's. There are no stamps: one line a pose.
+
+    Raises:
+        TrajectoryError: a pose is not finite.
+        OutputError: the file cannot be written.
+    """
+    _check_finite(path, trajectory)
+    with atomic_file(path) as file:
+        for x, y, yaw in trajectory.poses.tolist():
+            c, s = math.cos(yaw), math.sin(yaw)
+            numbers = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, 0.0)
+            file.write(" ".join(f"{number:.9e}" for number in numbers) + "\n")
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -111,6 +125,13 @@ def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
         for d in decisions:
             fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
             rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason, *_shown(d)))
+
+
+def _check_finite(path: Path, trajectory: Trajectory) -> None:
+    bad = np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=1))
+    if bad.size:
+        pose = trajectory.poses[bad[0]].tolist()
+        raise TrajectoryError(f"{path}: pose {bad[0]} is {pose}, expected finite x, y, yaw; nothing was written")
 
 
 def _shown(d: Decision) -> tuple[str, str]:

@@ -20,12 +20,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
-from fgloc.frames import quaternion_matrix, rpy_matrix
+from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
 from fgloc.sensors.markers.dictionaries import load_dictionary
 from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
@@ -122,6 +121,8 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
+    from scipy.spatial.transform import Rotation  # takes a fifth of a second to load, and reading needs none
+
     lines = [f"dictionary: {landmark_map.dictionary}"] if landmark_map.dictionary else []
     lines.append("landmarks:")
     for number in sorted(landmark_map.landmarks):
@@ -213,7 +214,7 @@ def _tagslam(path: Path, root: Item, bodies: Item, builder: _Builder) -> Landmar
 def _tagslam_pose(pose: Item) -> FloatArray:
     T = np.eye(4)
     T[:3, 3] = _xyz(pose.need("position"))
-    T[:3, :3] = Rotation.from_rotvec(_xyz(pose.need("rotation"))).as_matrix()
+    T[:3, :3] = rotation_of(_xyz(pose.need("rotation")))
     return T
 
 
