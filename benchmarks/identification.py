@@ -28,7 +28,8 @@ from benchmarks.common import Row, main, not_run
 from datasets import mrclam
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
-from fgloc.runner import find_beside, run
+from fgloc.recording.files import find_beside
+from fgloc.runner import run
 from fgloc.sensors.learned import MotionModel, load_model, save_model
 from fgloc.sensors.learned.card import Kinematics, Split
 from fgloc.sensors.learned.load import model_of, read_model

@@ -18,9 +18,9 @@ import numpy as np
 from benchmarks.common import Row
 from datasets import drive
 from fgloc.config import load_config
+from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
-from fgloc.runner import find_beside
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Input, Split
 from fgloc.types import Event, TruthEvent

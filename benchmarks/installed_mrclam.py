@@ -24,7 +24,8 @@ from benchmarks.installed_runs import kept
 from benchmarks.installed_scores import errors
 from datasets import mrclam
 from fgloc.config import load_config
-from fgloc.runner import find_beside, run
+from fgloc.recording.files import find_beside
+from fgloc.runner import run
 from fgloc.types import Estimate, Step, Trajectory
 
 _ROOT = Path(__file__).resolve().parent.parent

@@ -20,8 +20,9 @@ from datasets import mrclam, pioneer, turtlebot3
 from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import compute_metrics
+from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
-from fgloc.runner import find_beside, run
+from fgloc.runner import run
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
