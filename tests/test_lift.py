@@ -12,8 +12,8 @@ from robot_world import START_NS, Chain, World, config, room
 from test_ablation_failures import apply, driving, make, of
 
 from fgloc.ablation.failures import corrupt
-from fgloc.ablation.failures.base import Scene
 from fgloc.robust.lift import LiftMonitor
+from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Mode, MotionMeasurement, MotionReadings, Step, by_class

@@ -70,6 +70,14 @@ def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
     return check(event, config)
 
 
+class Joined(Protocol):
+    """One topic without a jump where a piece of the recording was cut out."""
+
+    def join(self, event: Event, shift: int) -> Event:
+        """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class BuiltIn:
     """What a sensor of fgloc itself brings: as much of `Sensor` as it shares with those of other packages.
@@ -77,10 +85,19 @@ class BuiltIn:
     Attributes:
         name: of its rows in ``steps.csv``, and in the counts.
         streams: what it reads.
+        failing_as: by what name failures call it; "": by its own.
+        failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
+        carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
+            its streams is changed. None: nothing is special about it.
+        joined: makes its events count on across a piece of the recording that was cut out; None: they count nothing.
     """
 
     name: str
     streams: tuple[Stream, ...] = ()
+    failing_as: str = ""
+    failures: Callable[[], tuple[type[Any], ...]] = tuple
+    carried: Callable[[Any], Callable[[Event], Event]] | None = None
+    joined: Callable[[], Joined] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +126,7 @@ class Sensor(Protocol):
         name: key of ``robot.yaml`` and name of the entry point.
         Config: the section under that key. All its values need defaults.
         streams: what it reads.
-        failures: subclasses of `fgloc.ablation.failures.base.Failure`, for ``fgloc ablate``.
+        failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         notes: what the user should know, one sentence each.
     """
 

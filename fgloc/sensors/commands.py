@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from fgloc.sensors.base import BuiltIn, Stream, When
 from fgloc.sensors.field_checks import FieldChecks
 from fgloc.sensors.topic_checks import Table, spikes
 from fgloc.types import ControlEvent, Event, FloatArray
+
+if TYPE_CHECKING:
+    from fgloc.sensors.failures import Carriage
 
 
 def from_twist(message: Any, when: When) -> Event:
@@ -60,6 +64,16 @@ class CommandChecks:
         return found
 
 
+def carried(carriage: Carriage) -> Callable[[Event], Event]:
+    """In the air the wheels are told to stand, or to spin."""
+
+    def tell(event: Event) -> Event:
+        assert isinstance(event, ControlEvent)
+        return event if carriage.interval(event) is None else replace(event, v=carriage.spin_m_s, omega=0.0)
+
+    return tell
+
+
 COMMANDS = BuiltIn(
     name="command",
     streams=(
@@ -72,4 +86,5 @@ COMMANDS = BuiltIn(
             findings=CommandChecks,
         ),
     ),
+    carried=carried,
 )

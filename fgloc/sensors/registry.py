@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
+from typing import TYPE_CHECKING
 
 from fgloc.extensions import outside_sensors
-from fgloc.sensors.base import BuiltIn, Context, Converter, Sensor, Stream
+from fgloc.sensors.base import BuiltIn, Context, Converter, Joined, Sensor, Stream
 from fgloc.types import Event
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+    from fgloc.sensors.failures import Carriage
 
 
 @cache
@@ -66,6 +71,36 @@ def usual_names(role: str) -> tuple[str, ...]:
 def role_of_event(event: Event) -> str | None:
     """Role of a sensor's event; None if it is of none."""
     return _role_by_class(sensors()).get(type(event))
+
+
+def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
+    """Classes of events by the name that failures have for their sensor."""
+    found: dict[str, tuple[type[Event], ...]] = {}
+    for sensor in built_in():
+        name = sensor.failing_as or sensor.name
+        found[name] = (*found.get(name, ()), *(stream.event for stream in sensor.streams))
+    return found | {s.name: tuple(stream.event for stream in s.streams) for s in sensors()}
+
+
+def failures() -> tuple[type[Section], ...]:
+    """Failures of all sensors."""
+    return tuple(
+        failure for own in (*(s.failures() for s in built_in()), *(s.failures for s in sensors())) for failure in own
+    )
+
+
+def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
+    """What becomes of the events of a robot that is carried, by class; those of other classes are left as they are."""
+    made: dict[type[Event], Callable[[Event], Event]] = {}
+    for sensor in built_in():
+        if sensor.carried is not None:
+            made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.carried(carriage))
+    return made
+
+
+def joiner_of(event: Event) -> Callable[[], Joined] | None:
+    """What joins the events of a topic on to those before a cut; None if they count nothing."""
+    return next((s.joined for s in built_in() if any(type(event) is stream.event for stream in s.streams)), None)
 
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Change, EventFailure, Failure, Scene
 from fgloc.frames import rpy_matrix
+from fgloc.sensors.failures import Change, EventFailure, Failure, Scene
 from fgloc.types import Event, LandmarkMap, Sighting, SightingsEvent
 
 

@@ -2,10 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 from fgloc.sensors.base import BuiltIn, Stream
 from fgloc.sensors.gyro import messages, validation
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.findings import ImuChecks
+from fgloc.types import Event
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+    from fgloc.sensors.failures import Carriage
+
+
+def _failures() -> tuple[type[Section], ...]:
+    from fgloc.sensors.gyro.failures import ImuBias
+
+    return (ImuBias,)
+
+
+def _carried(carriage: Carriage) -> Callable[[Event], Event]:
+    from fgloc.sensors.gyro.carried import carried
+
+    return carried(carriage)
+
 
 GYRO = BuiltIn(
     name="gyro",
@@ -19,4 +40,7 @@ GYRO = BuiltIn(
             findings=ImuChecks,
         ),
     ),
+    failing_as="imu",
+    failures=_failures,
+    carried=_carried,
 )

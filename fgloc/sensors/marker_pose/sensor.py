@@ -23,4 +23,5 @@ MARKER_POSE = BuiltIn(
             findings=SightingsChecks,
         ),
     ),
+    failing_as="camera",
 )

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from fgloc.sensors.base import BuiltIn, Stream
 from fgloc.sensors.markers import messages, validation
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.topic_checks import RawChecks, SightingsChecks
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+
+
+def _failures() -> tuple[type[Section], ...]:
+    from fgloc.sensors.markers.failures import Darkness, FrameRate, MirroredImage
+
+    return (Darkness, FrameRate, MirroredImage)
+
 
 MARKERS = BuiltIn(
     name="corners",
@@ -28,4 +40,6 @@ MARKERS = BuiltIn(
             findings=SightingsChecks,
         ),
     ),
+    failing_as="camera",
+    failures=_failures,
 )

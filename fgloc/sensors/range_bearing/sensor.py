@@ -20,4 +20,5 @@ RANGE_BEARING = BuiltIn(
             findings=SightingsChecks,
         ),
     ),
+    failing_as="camera",
 )

@@ -2,10 +2,48 @@
 
 from __future__ import annotations
 
-from fgloc.sensors.base import BuiltIn, Stream
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from fgloc.sensors.base import BuiltIn, Joined, Stream
 from fgloc.sensors.wheels import messages, validation
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.findings import OdometryChecks
+from fgloc.types import Event
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+    from fgloc.sensors.failures import Carriage
+
+
+def _failures() -> tuple[type[Section], ...]:
+    from fgloc.sensors.wheels import failures as speeds
+    from fgloc.sensors.wheels import message_failures as contents
+
+    return (
+        speeds.WheelSlip,
+        speeds.EncoderDead,
+        contents.EncoderFrozen,
+        speeds.EncoderQuantized,
+        contents.EncoderRollover,
+        speeds.WheelScaleDrift,
+        contents.OdometryReset,
+        contents.WheelNan,
+        contents.WrongCovariance,
+    )
+
+
+def _carried(carriage: Carriage) -> Callable[[Event], Event]:
+    from fgloc.sensors.wheels.carried import carried
+
+    return carried(carriage)
+
+
+def _joined() -> Joined:
+    from fgloc.sensors.wheels.carried import JoinedWheels
+
+    return JoinedWheels()
+
 
 WHEELS = BuiltIn(
     name="wheels",
@@ -26,4 +64,7 @@ WHEELS = BuiltIn(
             validator=validation.joints,
         ),
     ),
+    failures=_failures,
+    carried=_carried,
+    joined=_joined,
 )
