@@ -326,8 +326,8 @@ class MotionReadings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CornerMeasurement:
-    """Four corners of one marker, rid of what Cal3DS2 cannot model, with isotropic noise."""
+class PixelMeasurement:
+    """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
 
     stamp_ns: int
     landmark_id: int
@@ -341,31 +341,49 @@ class CornerMeasurement:
     blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
     jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
+    cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeBearingMeasurement:
-    """A landmark's direction and distance from the base (the sensor's offset is already taken out)."""
+class PointMeasurement:
+    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
 
     stamp_ns: int
     landmark_id: int
     range_m: float
     bearing_rad: float
     cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
-    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MarkerPoseMeasurement:
-    """A standing marker's planar pose ``T_base_marker`` (see Landmark.planar) with right-perturbation covariance."""
+class FrameMeasurement:
+    """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
 
     stamp_ns: int
     landmark_id: int
     pose: FloatArray  # (3,)
     cov: FloatArray  # (3, 3)
-    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -406,6 +424,11 @@ class PoseMeasurement(ABC):
         return ()
 
     @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return len(self.cov)
+
+    @property
     def landmark_id(self) -> int:
         """A number that no landmark of the map has."""
         return -2 - self.target
@@ -416,7 +439,7 @@ class PoseMeasurement(ABC):
         return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
 
 
-LandmarkSighting = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
+LandmarkSighting = PixelMeasurement | PointMeasurement | FrameMeasurement
 LandmarkMeasurement = LandmarkSighting | PoseMeasurement
 
 
@@ -438,7 +461,7 @@ class Decision:
 
     step: int
     stamp_ns: int
-    kind: str  # a motion source, "corners", "range_bearing", "marker_pose", "place", "mode", "clock" or a sensor
+    kind: str  # a sensor by its name, "place", "mode" or "clock"
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float

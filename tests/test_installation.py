@@ -41,7 +41,7 @@ from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, RangeBearingMeasurement, Step, by_class
+from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, PointMeasurement, Step, by_class
 
 # --- names and priors -------------------------------------------------------------------------------------------------
 
@@ -102,11 +102,11 @@ POINTS = LandmarkMap(
 )
 
 
-def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> RangeBearingMeasurement:
+def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> PointMeasurement:
     x, y, _ = se2.between(pose, (*POINTS.landmarks[i].position[:2], 0.0))
     R = np.diag([0.01, 0.02]) ** 2
     bearing, distance = rng.multivariate_normal((math.atan2(y, x), math.hypot(x, y)), R)
-    return RangeBearingMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
+    return PointMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
 
 
 def correlated(rng, n: int) -> tuple[PoseWithCovariance, InstallationBelief]:

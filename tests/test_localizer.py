@@ -33,7 +33,7 @@ from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import carry
-from fgloc.types import CornerMeasurement, LandmarkMap, Mode
+from fgloc.types import LandmarkMap, Mode, PixelMeasurement
 
 MAPS = {"corners": room, "beacons": beacons}
 
@@ -150,7 +150,7 @@ def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
     then = se2.compose(keyframe, motion)
     values = []
     for _ in range(40):
-        seen = CornerMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
+        seen = PixelMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
         wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
         fit = joint_fit(keyframe, [carry(seen, wrong, cov)], factors, settings)
         error = se2.log(se2.between(fit.pose, keyframe))

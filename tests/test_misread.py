@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.association import Association
 from fgloc.sensors.markers.events import CornersEvent
-from fgloc.types import CornerMeasurement, Landmark, LandmarkMap
+from fgloc.types import Landmark, LandmarkMap, PixelMeasurement
 
 SHARE = 0.4
 
@@ -23,10 +23,10 @@ def hanging(landmark_id: int, along: float) -> Landmark:
     return standing(landmark_id, 3.0, along, math.pi)
 
 
-def measured(world_map: LandmarkMap, landmark_id: int, read: int | None = None) -> CornerMeasurement:
+def measured(world_map: LandmarkMap, landmark_id: int, read: int | None = None) -> PixelMeasurement:
     """As seen from the origin, and the id that was read."""
     corners = project(np.zeros(3), world_map.landmarks[landmark_id])
-    return CornerMeasurement(10**9, landmark_id if read is None else read, corners, SIGMA_PX, CAMERA)
+    return PixelMeasurement(10**9, landmark_id if read is None else read, corners, SIGMA_PX, CAMERA)
 
 
 def misread(events, ids, share: float, seed: int = 5):

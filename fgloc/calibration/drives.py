@@ -24,7 +24,7 @@ from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.smoothing import smooth_run
-from fgloc.types import CornerMeasurement, Event, FloatArray, Landmark, LandmarkMap
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement
 
 _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
 
@@ -49,7 +49,7 @@ class Drive:
     sightings: Mapping[int, int]
     notes: tuple[str, ...]
 
-    def measure(self, sizes: Mapping[int, float], offset_s: float = 0.0) -> list[list[CornerMeasurement]]:
+    def measure(self, sizes: Mapping[int, float], offset_s: float = 0.0) -> list[list[PixelMeasurement]]:
         """Corners of these markers as seen from each keyframe.
 
         Args:
@@ -60,12 +60,12 @@ class Drive:
         config = self.parts.config
         sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
         moved = MotionCompensation(sensor, wheels, self.parts.localizer.sources.gyro, config.camera.time_jitter_s)
-        seen: list[list[CornerMeasurement]] = []
+        seen: list[list[PixelMeasurement]] = []
         for frame in self.frames:
             found = []
             if frame.step is not None:
                 wheels.measure(frame.step)
-                found = [m for m in moved.measure(frame.step, offset_s) if isinstance(m, CornerMeasurement)]
+                found = [m for m in moved.measure(frame.step, offset_s) if isinstance(m, PixelMeasurement)]
             seen.append([replace(m, sigma_px=m.sigma_px * _coarseness(m.corners_px)) for m in found])
         return seen
 

@@ -21,7 +21,7 @@ from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.markers.events import MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap
+from fgloc.types import Camera, FloatArray, IntArray, Landmark, LandmarkMap, PixelMeasurement
 
 _SIZE, _MAP = 0, 1
 _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise
@@ -101,7 +101,7 @@ class Problem:
         sigma = float(np.hypot(setup.config.markers.sigma_px, _SIGMA_PX))
         self._motion = Motion(stretches, setup.turned, setup.config)
         self._corners: list[FloatArray] = []
-        self._measured: list[CornerMeasurement] = []
+        self._measured: list[PixelMeasurement] = []
         frames = []
         for i, picture in enumerate(p for s in stretches for p in s.pictures):
             for m in usable(picture, setup.landmark_map):
@@ -109,7 +109,7 @@ class Problem:
                 if np.isfinite(corners).all():
                     frames.append(i)
                     self._corners.append(m.corners_px)
-                    self._measured.append(CornerMeasurement(0, m.landmark_id, corners, sigma, ideal))
+                    self._measured.append(PixelMeasurement(0, m.landmark_id, corners, sigma, ideal))
         self._frame: IntArray = np.array(frames, dtype=np.int64)
         self._ids = [m.landmark_id for m in self._measured]
         self._held = LandmarkMap({i: setup.landmark_map.landmarks[i] for i in sorted(set(self._ids))})

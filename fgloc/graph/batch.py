@@ -26,11 +26,11 @@ from fgloc.graph.installation import InstallationBelief
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.stats import chi2_bound
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
     MotionMeasurement,
+    PixelMeasurement,
 )
 
 _LINEARIZATIONS = 6
@@ -135,7 +135,7 @@ class BatchSmoother:
         for (_, s), one in zip(seen, lines, strict=True):
             bound = chi2_bound(self._probability, len(one.residual))
             total += 0.5 * (bound if one.behind else min(bound, float(one.residual @ one.residual)))
-            if not isinstance(s.measurement, CornerMeasurement):
+            if not isinstance(s.measurement, PixelMeasurement):
                 total += 0.5 * float(np.linalg.slogdet(s.alone.cov)[1])  # type: ignore[union-attr]
         return total
 

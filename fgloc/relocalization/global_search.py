@@ -20,22 +20,21 @@ from fgloc.relocalization.pose_fit import Fit, PoseFit, joint_fit, sighting_cost
 from fgloc.sensors.motion_compensation import carry
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     LandmarkMap,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
     MotionMeasurement,
     MotionReadings,
+    PixelMeasurement,
+    PointMeasurement,
     PoseMeasurement,
-    RangeBearingMeasurement,
     Step,
 )
 
 _WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings determine the pose
 ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
-_RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
 _LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
 _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
@@ -224,7 +223,7 @@ class GlobalSearch:
             m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
         few = self._map is not None and len(self._map) < _CHECKABLE
-        if few or not all(isinstance(m, RangeBearingMeasurement) for m in agreeing):
+        if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
             return True
         for landmark_id in best.agreeing:
             fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id], _ITERATIONS)
@@ -286,15 +285,15 @@ class GlobalSearch:
         for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
             yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
         sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
-        whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
+        whole = [m for m in sightings if not isinstance(m, PointMeasurement)]  # that give a place each
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
-        for m in [*seeds, *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
+        for m in [*seeds, *(m for m in sightings if isinstance(m, PointMeasurement))]:
             landmark = self._map.landmarks[m.landmark_id]
-            if isinstance(m, CornerMeasurement):
+            if isinstance(m, PixelMeasurement):
                 yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
-            elif isinstance(m, MarkerPoseMeasurement):
+            elif isinstance(m, FrameMeasurement):
                 yield se2.compose(landmark.planar, se2.inverse(m.pose))
-            elif isinstance(m, RangeBearingMeasurement):
+            elif isinstance(m, PointMeasurement):
                 points.append((landmark.position[:2], m.range_m, m.bearing_rad))
         yield from candidates_from_points(points)
 
@@ -336,9 +335,9 @@ def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
 
 
 def _residuals(m: LandmarkMeasurement) -> int:
-    return len(m.cov) if isinstance(m, PoseMeasurement) else _RESIDUALS[type(m)]
+    return m.dof
 
 
 def _information(m: LandmarkMeasurement) -> float:
     """What a sighting weighs, in comparison with others of its kind."""
-    return 1.0 / (m.sigma_px**2 if isinstance(m, CornerMeasurement) else float(np.trace(m.cov[:2, :2])))
+    return 1.0 / (m.sigma_px**2 if isinstance(m, PixelMeasurement) else float(np.trace(m.cov[:2, :2])))

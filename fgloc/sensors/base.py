@@ -7,7 +7,7 @@ docs/adding-a-sensor.md goes through one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.field_checks import FieldChecks
 from fgloc.sensors.topic_checks import Collector, TimingOnly
-from fgloc.types import Event, FloatArray, LandmarkMap, PoseMeasurement
+from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
@@ -89,6 +89,9 @@ class BuiltIn:
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
             its streams is changed. None: nothing is special about it.
+        measures: from a `fgloc.sensors.landmarks.SightingContext` to what makes measurements of its events; None: it
+            sees no landmarks.
+        measured: classes of measurements that have its name in ``steps.csv``.
         joined: makes its events count on across a piece of the recording that was cut out; None: they count nothing.
     """
 
@@ -98,6 +101,8 @@ class BuiltIn:
     failures: Callable[[], tuple[type[Any], ...]] = tuple
     carried: Callable[[Any], Callable[[Event], Event]] | None = None
     joined: Callable[[], Joined] | None = None
+    measures: Callable[[Any], Callable[[Any], Iterator[LandmarkSighting]]] | None = None
+    measured: tuple[type[LandmarkSighting], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,10 +14,10 @@ from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
+    PixelMeasurement,
     PoseMeasurement,
     Step,
 )
@@ -38,7 +38,7 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         moved = se2.compose_cov(cov, m.T_keyframe_then, known)
         return dataclasses.replace(m, T_keyframe_then=se2.compose(motion, m.T_keyframe_then), motion_cov=moved)
     ad = se2.adjoint(motion)
-    if isinstance(m, CornerMeasurement):
+    if isinstance(m, PixelMeasurement):
         x, y, yaw = motion
         T = np.eye(4)
         T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
@@ -46,7 +46,7 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
         spread = cov if m.motion_cov is None else cov + m.motion_cov
         return dataclasses.replace(m, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ m.twist)
-    if isinstance(m, MarkerPoseMeasurement):
+    if isinstance(m, FrameMeasurement):
         pose = se2.compose(motion, m.pose)
         return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
     x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
@@ -99,7 +99,7 @@ class MotionCompensation:
             twist = self.twist(step, exposure_ns)
             late: list[LandmarkMeasurement] = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
             late = [
-                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, CornerMeasurement) else m for m in late
+                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
             ]
             if exposure_ns != step.stamp_ns:
                 motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fgloc.extensions import outside_sensors
 from fgloc.sensors.base import BuiltIn, Context, Converter, Joined, Sensor, Stream
-from fgloc.types import Event
+from fgloc.types import Event, LandmarkSighting
 
 if TYPE_CHECKING:
     from fgloc.config import Section
     from fgloc.sensors.failures import Carriage
+    from fgloc.sensors.landmarks import SightingContext
 
 
 @cache
@@ -96,6 +97,30 @@ def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
         if sensor.carried is not None:
             made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.carried(carriage))
     return made
+
+
+def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:
+    """What makes measurements of the sightings of one run, by class of event."""
+    made: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = {}
+    for sensor in built_in():
+        if sensor.measures is not None:
+            made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.measures(context))
+    return made
+
+
+def kind_of(measured: type[LandmarkSighting]) -> str:
+    """Name of a landmark measurement in ``steps.csv``: that of the sensor whose it is."""
+    return _kinds()[measured]
+
+
+@cache
+def _kinds() -> dict[type, str]:
+    return {measured: sensor.name for sensor in built_in() for measured in sensor.measured}
+
+
+def landmark_kinds() -> tuple[str, ...]:
+    """Names of all landmark measurements."""
+    return tuple(sensor.name for sensor in built_in() if sensor.measured)
 
 
 def joiner_of(event: Event) -> Callable[[], Joined] | None:
