@@ -6,8 +6,12 @@ The bundled recordings, at their own speed. A third process, this one, subscribe
   at common keyframes; ``live.equal_keyframes`` is the share of the latter's keyframes that were published.
 - ``live.rate_hz``, ``live.jitter_ms_p99``: of the odometry, by the times of sending: messages a second, and how far the
   time between two messages is from its mean.
-- ``live.cpu_share``: processor time of ``fgloc live``, all of its threads, over the time, of one core.
+- ``live.wire_latency_ms_*``: from the arrival of an image, here, to the sending of the pose of its exposure.
+- ``live.cpu_share``: processor time of ``fgloc live``, all of its threads and processes, over the time, of one core.
 - ``live.stop_s``: from Ctrl-C to the end of the process.
+- ``live.busy_*``: the same with two other processes that compute without end.
+- ``live.load``: processes of this machine that ran or wanted to run, mean over the last minute of the unhurried runs:
+  more than the machine's cores disturb all of these figures.
 - ``live.interop``: as `benchmarks.live_interop` has it.
 """
 
@@ -18,9 +22,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +41,8 @@ _SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 _NAMES = ("first_run", "installed_run")
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _PATIENCE_S = 30.0
+_IMAGES = "/camera/image/compressed"  # of the bundled recordings
+_OTHERS = 2  # processes beside, on a machine of two cores
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +51,7 @@ class Heard:
 
     stamps_ns: IntArray  # (n,) of the keyframes' poses
     positions: FloatArray  # (n, 2)
+    latencies_ms: FloatArray  # (k,) of those at an image
     sent_s: FloatArray  # (m,) times of sending of the odometry
     cpu_share: float
     stop_s: float
@@ -55,17 +64,36 @@ class _Recorder:
 
     def __init__(self, participant: Participant) -> None:
         self.poses: list[tuple[int, float, float]] = []
+        self.pose_sent_ns: dict[int, int] = {}  # by stamp
+        self.images_ns: dict[int, int] = {}  # by stamp: when they came
         self.sent_ns: list[int] = []
         self._messages = participant.messages
         participant.read("/fgloc/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", self._on_pose)
+        participant.read(_IMAGES, "sensor_msgs/msg/CompressedImage", self._on_image)
         participant.read(
             "/fgloc/odometry", "nav_msgs/msg/Odometry", lambda sample: self.sent_ns.append(sample.source_ns)
         )
 
     def _on_pose(self, sample: Sample) -> None:
         message = self._messages.decode(sample.message_type, sample.cdr)
-        stamp, position = message.header.stamp, message.pose.pose.position
-        self.poses.append((stamp.sec * 1_000_000_000 + stamp.nanosec, position.x, position.y))
+        position, stamp_ns = message.pose.pose.position, _stamp_ns(message)
+        self.poses.append((stamp_ns, position.x, position.y))
+        self.pose_sent_ns[stamp_ns] = sample.source_ns
+
+    def _on_image(self, sample: Sample) -> None:
+        now = time.time_ns()
+        self.images_ns[_stamp_ns(self._messages.decode(sample.message_type, sample.cdr))] = now
+
+    @property
+    def latencies_ms(self) -> FloatArray:
+        """Of each image whose exposure has a pose."""
+        both = self.images_ns.keys() & self.pose_sent_ns.keys()
+        return np.array([(self.pose_sent_ns[stamp] - self.images_ns[stamp]) * 1e-6 for stamp in sorted(both)])
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def live_run(sample: Path, domain: int, rate: float = 1.0) -> Heard:
@@ -96,7 +124,7 @@ def live_run(sample: Path, domain: int, rate: float = 1.0) -> Heard:
     poses = np.array(sorted(recorder.poses)).reshape(-1, 3)
     stamps = np.array([stamp for stamp, _, _ in sorted(recorder.poses)], dtype=np.int64)
     sent_s = np.array(recorder.sent_ns, dtype=np.int64) * 1e-9
-    return Heard(stamps, poses[:, 1:], np.sort(sent_s), cpu_share, stop_s, live.returncode, said)
+    return Heard(stamps, poses[:, 1:], recorder.latencies_ms, np.sort(sent_s), cpu_share, stop_s, live.returncode, said)
 
 
 def _share_while_publishing(pid: int, play: subprocess.Popen[bytes], recorder: _Recorder) -> float:
@@ -110,9 +138,22 @@ def _share_while_publishing(pid: int, play: subprocess.Popen[bytes], recorder: _
 
 
 def _cpu_s(pid: int) -> float:
-    """Processor time of a process so far, of all its threads."""
+    """Processor time so far of a process and those that it has started, of all their threads."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S
+    started = " ".join(path.read_text("utf-8") for path in Path(f"/proc/{pid}/task").glob("*/children")).split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S + sum(_cpu_s(int(child)) for child in started)
+
+
+@contextmanager
+def _busy(count: int) -> Iterator[None]:
+    """Other processes that compute without end."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
 
 
 def largest_difference_mm(heard: Heard, sample: Path) -> tuple[float, float]:
@@ -126,22 +167,33 @@ def largest_difference_mm(heard: Heard, sample: Path) -> tuple[float, float]:
 
 def measure(quick: bool) -> Iterator[Row]:
     """Rows of the benchmark."""
-    names = _NAMES[:1] if quick else _NAMES
-    runs = [
-        live_run(_SAMPLES / name, 100 + (os.getpid() + k) % 100, 4.0 if quick else 1.0) for k, name in enumerate(names)
-    ]
+    names, rate = (_NAMES[:1], 4.0) if quick else (_NAMES, 1.0)
+    runs = [live_run(_SAMPLES / name, 100 + (os.getpid() + k) % 100, rate) for k, name in enumerate(names)]
+    load = os.getloadavg()[0]
     equal = np.array([largest_difference_mm(heard, _SAMPLES / name) for heard, name in zip(runs, names, strict=True)])
+    yield Row("live.equal_mm", float(equal[:, 0].max()), n=len(runs), unit="mm")
+    yield Row("live.equal_keyframes", float(equal[:, 1].min()), n=len(runs))
+    yield from timing("live.", runs)
+    yield Row("live.load", load)
+    with _busy(_OTHERS):
+        yield from timing("live.busy_", [live_run(_SAMPLES / names[-1], 100 + (os.getpid() + len(names)) % 100, rate)])
+    yield from live_interop.measure(quick)
+
+
+def timing(prefix: str, runs: Sequence[Heard]) -> Iterator[Row]:
+    """Of several runs the worst; latencies over all."""
     gaps_ms = [np.diff(heard.sent_s) * 1e3 for heard in runs]
     rates = [1e3 / float(gaps.mean()) for gaps in gaps_ms]
     jitters = [float(np.percentile(np.abs(gaps - gaps.mean()), 99)) for gaps in gaps_ms]
+    latencies = np.concatenate([heard.latencies_ms for heard in runs])
     n = len(runs)
-    yield Row("live.equal_mm", float(equal[:, 0].max()), n=n, unit="mm")
-    yield Row("live.equal_keyframes", float(equal[:, 1].min()), n=n)
-    yield Row("live.rate_hz", min(rates), n=n, unit="Hz")
-    yield Row("live.jitter_ms_p99", max(jitters), n=n, unit="ms")
-    yield Row("live.cpu_share", max(heard.cpu_share for heard in runs), n=n)
-    yield Row("live.stop_s", max(heard.stop_s for heard in runs), n=n, unit="s")
-    yield from live_interop.measure(quick)
+    yield Row(prefix + "rate_hz", min(rates), n=n, unit="Hz")
+    yield Row(prefix + "jitter_ms_p99", max(jitters), n=n, unit="ms")
+    for share in (50, 99):
+        latency = float(np.percentile(latencies, share))
+        yield Row(f"{prefix}wire_latency_ms_p{share}", latency, n=len(latencies), unit="ms")
+    yield Row(prefix + "cpu_share", max(heard.cpu_share for heard in runs), n=n)
+    yield Row(prefix + "stop_s", max(heard.stop_s for heard in runs), n=n, unit="s")
 
 
 if __name__ == "__main__":

@@ -1,22 +1,42 @@
-"""Photographs of markers whose ids others have published: which of them do we miss?"""
+"""Photographs of markers whose ids others have published: which of them do we miss? And what does tracking miss?
+
+stills.missed_ids            published ids that are not found
+detect.over_full             time of a thorough search of every image over that of following markers
+detect.search_over_full      likewise, without the fit of the markers' edges, which both do alike
+detect.lost, detect.gained   markers that only the former finds, and only the latter: the bundled samples' images, and
+                             the photographs, each shown five times
+detect.corner_rms_px         difference of their corners
+"""
 
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
-from fgloc.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector
+from benchmarks.equal import SAMPLES
+from fgloc.config import MarkersConfig, load_config
+from fgloc.recording.reader import open_recording
+from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.detector import MarkerDetector, use_one_thread
+from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.events import ImageEvent
+from fgloc.sensors.markers.images import GrayImage, decode
+from fgloc.sensors.markers.tracking import TrackingDetector
+from fgloc.types import FloatArray
 
 _ID = "stills.missed_ids"
+_SHOWN, _SHOWN_EVERY_NS = 5, 50_000_000
 _DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 _TUTORIAL_DICTIONARY = "opencv_aruco/tutorial_dict.yml"
 
@@ -65,11 +85,14 @@ class Outcome:
 def outcomes(folder: Path) -> Iterator[Outcome]:
     """Detect in each photograph below the folder marker_images."""
     for still in STILLS:
-        own_file = Path(still.dictionary).suffix != ""
-        detector = MarkerDetector(str(folder / still.dictionary) if own_file else still.dictionary, MarkersConfig())
-        found = Counter(s.landmark_id for s in detector.detect(_image(folder / still.file)).sightings)
+        found = Counter(s.marker_id for s in _detector(still, folder).detect(_image(folder / still.file)).sightings)
         listed = Counter(still.ids)
         yield Outcome(still, tuple((listed - found).elements()), tuple((found - listed).elements()))
+
+
+def _detector(still: Still, folder: Path) -> MarkerDetector:
+    own_file = Path(still.dictionary).suffix != ""
+    return MarkerDetector(str(folder / still.dictionary) if own_file else still.dictionary, MarkersConfig())
 
 
 def missed_ids(folder: Path | None = None) -> list[tuple[str, int]]:
@@ -80,6 +103,7 @@ def missed_ids(folder: Path | None = None) -> list[tuple[str, int]]:
 def measure(quick: bool) -> Iterator[Row]:
     """The row, after the table of photographs."""
     folder = _folder()
+    yield from _tracking(folder, quick)
     if not folder.is_dir():
         yield from not_run([_ID], f"{folder} is absent; set FGLOC_REAL_DATA")
         return
@@ -89,6 +113,63 @@ def measure(quick: bool) -> Iterator[Row]:
         said = f"{len(outcome.still.ids):3d} listed, missed {list(outcome.missed)}, not listed {list(outcome.false)}"
         print(f"{outcome.still.file:45s} {said}")
     yield Row(_ID, float(missed), n=sum(len(s.ids) for s in STILLS), unit="ids")
+
+
+def _sequences(folder: Path, quick: bool) -> Iterator[tuple[MarkerDetector, list[tuple[int, GrayImage]]]]:
+    """Detector, and stamps with images of a camera: of the bundled samples, and of the photographs."""
+    samples = sorted(path.parent for path in SAMPLES.glob("*/robot.yaml"))
+    for sample in samples[:1] if quick else samples:
+        config = load_config(sample / "robot.yaml")
+        with open_recording(sample / "bag", config.recording) as recording:
+            images = [(e.stamp_ns, decode(e)) for e in recording.events() if isinstance(e, ImageEvent)]
+        yield MarkerDetector(load_map(sample / "map.yaml").dictionary, config.markers), images
+    for still in STILLS if folder.is_dir() else ():
+        image = decode(_image(folder / still.file))
+        yield _detector(still, folder), [(k * _SHOWN_EVERY_NS, image) for k in range(_SHOWN)]
+
+
+def _tracking(folder: Path, quick: bool) -> Iterator[Row]:
+    use_one_thread()
+    seconds, search_s = np.zeros(2), np.zeros(2)
+    lost = gained = images = 0
+    differences: list[FloatArray] = []
+    for detector, sequence in _sequences(folder, quick):
+        followed = TrackingDetector(detector)
+        for stamp_ns, image in sequence:
+            with _timed(seconds, search_s, 0):
+                whole = detector.find(image)
+            with _timed(seconds, search_s, 1):
+                tracked = followed.find(image, stamp_ns)
+            a, b = (Counter(i for i, _ in found) for found in (whole, tracked))
+            lost, gained, images = lost + (a - b).total(), gained + (b - a).total(), images + 1
+            same = dict(tracked)
+            differences += [c - same[i] for i, c in whole if a[i] == b[i] == 1]
+    rms = float(np.sqrt(np.mean(np.square(differences))))
+    yield Row("detect.over_full", float(seconds[0] / seconds[1]), n=images)
+    yield Row("detect.search_over_full", float(search_s[0] / search_s[1]), n=images)
+    yield Row("detect.lost", float(lost), n=len(differences) + lost, unit="markers")
+    yield Row("detect.gained", float(gained), n=len(differences) + lost, unit="markers")
+    yield Row("detect.corner_rms_px", rms, n=len(differences), unit="px")
+
+
+@contextmanager
+def _timed(seconds: FloatArray, search_s: FloatArray, which: int) -> Iterator[None]:
+    """Add the processor time of a search, and the same without the fit of edges."""
+    edges_s = 0.0
+
+    def timed(*arguments: Any) -> FloatArray:
+        nonlocal edges_s
+        start = time.thread_time()
+        found = refine_all(*arguments)
+        edges_s += time.thread_time() - start
+        return found
+
+    with patch("fgloc.sensors.markers.detector.refine_all", timed):
+        start = time.thread_time()
+        yield
+        taken = time.thread_time() - start
+    seconds[which] += taken
+    search_s[which] += taken - edges_s
 
 
 def _folder() -> Path:

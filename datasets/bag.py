@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,6 +15,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from fgloc.recording.messages import default_typestore
 
+Tap = Callable[[str, str, Any, int], None]
+
 
 class BagWriter:
     """Writes a rosbag2 folder. Stamps are integer nanoseconds; ``received_ns`` defaults to the stamp.
@@ -24,7 +26,9 @@ class BagWriter:
         ...     bag.command("/cmd_vel", 1_000_000_000, v=0.2, omega=0.0)
     """
 
-    def __init__(self, path: Path, storage: str = "mcap", overwrite: bool = False, compress: bool = False) -> None:
+    def __init__(
+        self, path: Path, storage: str = "mcap", overwrite: bool = False, compress: bool = False, tap: Tap | None = None
+    ) -> None:
         """Open a new bag folder.
 
         Args:
@@ -32,6 +36,7 @@ class BagWriter:
             storage: "mcap" or "sqlite3".
             overwrite: replace an existing bag folder (one that holds a metadata.yaml).
             compress: zstd chunks, which readers of MCAP undo by themselves; MCAP only.
+            tap: given every message as it is read from the bag, with its topic, type and receive time [ns].
 
         Raises:
             FileExistsError: the folder exists and is not to be replaced.
@@ -49,6 +54,7 @@ class BagWriter:
         if compress:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._connections: dict[str, Connection] = {}
+        self._tap = tap
 
     def __enter__(self) -> BagWriter:
         self._writer.open()
@@ -330,6 +336,40 @@ class BagWriter:
         ]
         self._write(topic, "aruco_msgs/msg/MarkerArray", stamp_ns, received_ns, frame_id, dict(markers=markers))
 
+    def corners(
+        self,
+        topic: str,
+        stamp_ns: int,
+        markers: Mapping[int, ArrayLike],
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``apriltag_msgs/AprilTagDetectionArray`` of corners (4, 2) [px] by id, clockwise from the top left.
+
+        The message counts from the first pixel's corner and holds the tag upside down (`fgloc.recording.decode`).
+        """
+        detections = []
+        for number, given in markers.items():
+            corners = np.asarray(given, dtype=float)[[1, 0, 3, 2]] + 0.5
+            points = [self._make("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in corners]
+            x, y = corners.mean(axis=0).tolist()
+            centre = self._make("apriltag_msgs/msg/Point", x=x, y=y)
+            detections.append(
+                self._make(
+                    "apriltag_msgs/msg/AprilTagDetection",
+                    family="",
+                    id=number,
+                    hamming=0,
+                    goodness=0.0,
+                    decision_margin=100.0,
+                    centre=centre,
+                    corners=points,
+                    homography=np.zeros(9),
+                )
+            )
+        kind = "apriltag_msgs/msg/AprilTagDetectionArray"
+        self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(detections=detections))
+
     def copy(self, topic: str, message_type: str, raw: bytes | memoryview, received_ns: int) -> None:
         """Write a message that is already serialized (CDR); its type must be in the typestore."""
         self._writer.write(self._connection(topic, message_type), received_ns, raw)
@@ -342,6 +382,8 @@ class BagWriter:
         """Write any message of the typestore."""
         raw = self._store.serialize_cdr(message, message_type)
         self._writer.write(self._connection(topic, message_type), received_ns, raw)
+        if self._tap is not None:
+            self._tap(topic, message_type, self._store.deserialize_cdr(raw, message_type), received_ns)
 
     def make(self, message_type: str, **fields: Any) -> Any:
         """A message of the typestore, for `write`."""

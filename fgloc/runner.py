@@ -29,6 +29,7 @@ from fgloc.recording.truth import TruthTrack
 from fgloc.sensors.markers.detector import Detector, detect_stream
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.markers.remembered import RememberedDetections
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.smoothing import SmoothedRun, smooth_run
 from fgloc.timing import one_blas_thread
 from fgloc.types import (
@@ -158,7 +159,9 @@ def _replayed(
     """Run all events through the localizer."""
     memory, file = None, options.get("detections")
     if parts.detector is not None:
-        memory = RememberedDetections(file, parts.detector, wrong.detections, note=file is not None)
+        # What a file remembers must not depend on which images came before.
+        detector = TrackingDetector(parts.detector) if file is None else parts.detector
+        memory = RememberedDetections(file, detector, wrong.detections, note=file is not None)
     replay = _Replay(parts, recording, memory, progress, options)
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:

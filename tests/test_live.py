@@ -1,5 +1,7 @@
 """A live run: the same poses as a replay, poses between keyframes, threads, overload, sensors that join later."""
 
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -19,11 +21,12 @@ import fgloc
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
+from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.events import ImageEvent
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.types import Mode
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
@@ -84,6 +87,43 @@ def test_images_give_the_poses_of_a_replay_bit_by_bit():
         assert live.status().dropped == {}
     assert len(made) > 25
     assert all((e.pose == replayed[e.stamp_ns].pose).all() for e in made)
+
+
+def test_in_a_process_of_its_own_the_run_is_the_same(tmp_path):
+    """Estimates, poses between and beyond them, and the saved state; the process ends with the run."""
+    world, told, states = World(room(), seconds=5.0, rate=5), [], []
+    for process in (False, True):
+        path = tmp_path / f"{process}.json"
+        with live_in(world, process=process, state=path) as live:
+            made = feed(live, world.events())
+            newest = made[-1].stamp_ns
+            asked = [live.pose_at(newest + round(s * 1e9)) for s in (-2.03, -0.5, 0.0, 0.07, 0.3)]
+        assert live.status().keyframes == len(made) > 20
+        told.append([(p.stamp_ns, *p.pose, *p.cov.ravel()) for p in (*made, *asked)])
+        states.append(read_state(path, fingerprint(world.map)).state)
+    assert told[0] == told[1]
+    assert (states[0].pose, states[0].cov) == (states[1].pose, states[1].cov)
+    assert not [t for t in threading.enumerate() if t.name.startswith("fgloc-")]
+    with pytest.raises(EstimatorError, match="closed"):
+        live.push(world.events()[0])
+
+
+def test_an_estimation_process_that_ends_or_fails_is_told():
+    world = World(beacons(), seconds=2.0)
+    with live_in(world, process=True) as live:
+        feed(live, world.events())
+        os.kill(live._estimation._child.pid, signal.SIGKILL)
+        with pytest.raises(EstimatorError, match="ended with exit code -9"):
+            live.wait(PATIENCE_S)
+        with pytest.raises(EstimatorError, match="start again"):
+            live.pose_at()
+    settings = config(wheels={"source": "ticks", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3})
+    names = ("left_wheel", "left_wheel_rear")
+    with Live(settings, beacons(), roles=("joints",), process=True) as live:
+        with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
+            feed(live, [joints(1.0 + 0.02 * k, 0.0, 0.0, names=names) for k in range(200)])
+        with pytest.raises(ConfigError):
+            live.pose_at()
 
 
 def test_poses_between_keyframes_are_as_good_as_their_covariance_says():
@@ -152,14 +192,14 @@ def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
     sample = SAMPLES / "first_run"
     settings = load_config(sample / "robot.yaml")
     seen = []
-    detect = MarkerDetector.detect
+    detect = TrackingDetector.detect
 
     def slowly(self, event):
         time.sleep(WAITED_S)
         seen.append(event.stamp_ns)
         return detect(self, event)
 
-    monkeypatch.setattr(MarkerDetector, "detect", slowly)
+    monkeypatch.setattr(TrackingDetector, "detect", slowly)
     with open_recording(sample / "bag", settings.recording) as recording:
         events = until(4.0, recording.events())
         images = [e.stamp_ns for e in events if isinstance(e, ImageEvent)]
@@ -234,7 +274,7 @@ def test_a_gyro_that_begins_later_joins_without_losing_the_pose():
     with live_in(world) as live:
         made = feed(live, sorted(events, key=lambda e: e.received_ns))
         status = live.status()
-        assert live._run.parts.localizer.sources.gyro is not None
+        assert live._estimation.run.parts.localizer.sources.gyro is not None
     after = [e for e in made if e.stamp_ns > START_NS + 4_000_000_000]
     assert {e.mode for e in after} == {Mode.OK}
     assert errors(world, after).max() < 0.06

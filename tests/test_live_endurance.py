@@ -14,10 +14,11 @@ from robot_world import CAMERA, START_NS, World, beacons, config, room
 
 from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
+from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
 from fgloc.relocalization.pose_fit import PoseFit
-from fgloc.types import Mode
+from fgloc.types import Mode, MotionEvent
 
 SECOND = 1_000_000_000
 STEPS, WARM_UP = 450, 250
@@ -55,19 +56,25 @@ def test_memory_and_what_is_kept_stay_as_they_are():
     made, sizes, objects = 0, [], []
     config_, map_ = circle_config(), circle_map()
     facts = LiveFacts(config_, None, None)
-    run = OnlineRun(config_, map_, facts)
+    run, poses = OnlineRun(config_, map_, facts), Extrapolator(config_)
     for k, event in enumerate(circle((STEPS + 20) / 5.0)):
         if run.parts is None:
             facts.topic_is_used(event)
             facts.note(event)
             if k == 20:
                 run.build()
+                poses.begin(run.anchors.parts)
             continue
         passed = run.check(event)
-        for _ in () if passed is None else run.use(passed):
+        if isinstance(passed, MotionEvent):
+            poses.add(passed)
+        for step, estimate in () if passed is None else run.use(passed):
+            if estimate is not None:
+                poses.anchor(run.anchor(step, estimate))
             made += 1
             if made in (WARM_UP, STEPS):
-                sizes.append(kept(run.parts) | {"anchors": len(run.extrapolator._anchors)})
+                events = {kind.__name__: len(some) for kind, some in poses._events.items()}
+                sizes.append(kept(run.parts) | {"anchors": len(poses._anchors)} | events)
                 gc.collect()
                 objects.append(len(gc.get_objects()))
     assert made >= STEPS

@@ -129,13 +129,13 @@ def test_what_was_learned_goes_on(world, tmp_path):
     path, roles = tmp_path / "state.json", (*ROLES, "imu")
     with live_in(world, state=path, roles=roles) as live:
         feed(live, sorted(events, key=lambda e: e.received_ns))
-        live._run.parts.localizer.association.modes.displacements[13] = np.array([0.4, -0.1])
-        gyro = live._run.parts.localizer.sources.gyro
-        installed = live._run.parts.localizer.estimator.installed
+        live._estimation.run.parts.localizer.association.modes.displacements[13] = np.array([0.4, -0.1])
+        gyro = live._estimation.run.parts.localizer.sources.gyro
+        installed = live._estimation.run.parts.localizer.estimator.installed
     assert gyro.bias > 0.02
     with live_in(world, state=path, roles=roles) as live:
         feed(live, [e for e in events if (e.received_ns - START_NS) * 1e-9 < 0.3])
-        parts = live._run.parts
+        parts = live._estimation.run.parts
         assert parts.localizer.sources.gyro.bias == pytest.approx(gyro.bias, abs=0.01)
         assert parts.localizer.association.modes.excludes(13)
         now = np.diag(parts.localizer.estimator.installed.cov)

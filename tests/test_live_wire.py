@@ -148,7 +148,7 @@ def played(path, config, rate):
     """Events that arrive when a recording is played, and the player."""
     events = []
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other, Player(path, one) as player:
-        topics = Intake(other, WireClock(other), config, events.append)
+        topics = Intake(other, WireClock(other), config, lambda event, _: events.append(event))
 
         def follow():
             while not ended.wait(0.05):

@@ -177,6 +177,46 @@ def test_a_pose_told_on_the_wire_moves_the_robot_and_its_odometry_frame(tmp_path
     assert np.hypot(poses[-1, 0] - 50.0, poses[-1, 1] + 7.0) < 3.0
 
 
+def test_two_publishers_of_one_topic_are_told_apart():
+    """A second node publishes an odometry that stands still, under the same name; when the first ends, it is used."""
+    topics = {"image": "none", "sightings": "none"}
+    config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (0.0, 0.0, 0.0)}})
+    odometry = "nav_msgs/msg/Odometry"
+    sent = 0
+    with Session(config) as session, Participant(DOMAIN) as base, Participant(DOMAIN) as ghost:
+        writers = [one.writer("/odom", odometry) for one in (base, ghost)]
+        assert wait_until(lambda: all(writer.readers for writer in writers))
+
+        def send(count, first):
+            """At 50 Hz: 1 m/s by the first, and 0 by the second, a millisecond later."""
+            nonlocal sent
+            for _ in range(count):
+                now, sent = time.time_ns(), sent + 1
+                for k, writer in enumerate(writers[0 if first else 1 :], 0 if first else 1):
+                    stamp = now + k * 1_000_000
+                    header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": f"odom_{k}"}
+                    place = {"pose": {"position": {"x": 0.02 * sent}, "orientation": {"w": 1.0}}} if k == 0 else {}
+                    speed = {"twist": {"linear": {"x": 1.0 - k}}}
+                    message = {"header": header, "child_frame_id": "base_link", "pose": place, "twist": speed}
+                    writer.write(base.messages.encode(odometry, message))
+                time.sleep(0.02)
+
+        send(200, first=True)
+        assert session.node.live.wait(10.0)
+        status = session.node.live.status()
+        moved = session.node.live.pose_at()
+        assert wait_until(lambda: any("/odom: two publishers" in sentence for sentence in session.told))
+        send(75, first=False)  # 1.5 s
+        assert session.node.live.wait(10.0)
+        dropped = session.node.live.status().dropped["odometry"] - status.dropped["odometry"]
+    count = status.topics["/odom"].count
+    assert count == status.dropped["odometry"] == pytest.approx(200, abs=2)
+    assert moved.pose[0] > 3.0
+    frames = {message.transforms[0].child_frame_id for _, message in session.heard["/tf"]}
+    assert frames == {"odom_0", "odom_1"}
+    assert 30 < dropped < 60  # as long as the first might still come
+
+
 def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
     told = []
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other:

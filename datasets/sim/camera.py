@@ -140,30 +140,45 @@ def exposures(scene: Scene, log: Log) -> Iterator[Exposure]:
     assert camera is not None
     rng = channel_rng(scene.seed, "camera")
     lens = Lens(camera)
-    hidden = _hidden(scene)
-    n = int((log.stamps_s[-1] - _FIRST_FRAME_S - camera.max_exposure_s) * camera.rate_hz) + 1
-    wanted = camera.exposure_s  # exposure times gain that the automatic exposure has reached
+    hidden = occluded(scene)
     renderer = Renderer(scene)
     try:
-        for k in range(n):
-            start = _FIRST_FRAME_S + k / camera.rate_hz
-            light = light_level(scene.scenario.world.light, start)
-            follow = 1.0 - math.exp(-1.0 / camera.rate_hz / camera.exposure_lag_s)
-            wanted *= (camera.exposure_s / light / wanted) ** follow if k > 0 else 1.0 / light
-            exposure = min(wanted, camera.max_exposure_s)
-            gain = min(max(wanted / exposure, 1.0), camera.max_gain)
-            covered = {m for ids, begin, end in hidden if begin <= start < end for m in ids}
+        for shot in shots(scene, log):
 
-            def take(start: float = start, exposure: float = exposure, gain: float = gain, light: float = light,
-                     covered: set[int] = covered) -> Image:  # fmt: skip
-                renderer.screen(covered)
-                image = lens.image(_expose(renderer, camera, log, start, exposure))
-                image *= light * gain * exposure / camera.exposure_s
-                return _sense(image, camera.noise, gain, rng)
+            def take(shot: Shot = shot) -> Image:
+                renderer.screen({m for ids, begin, end in hidden if begin <= shot.start_s < end for m in ids})
+                image = lens.image(_expose(renderer, camera, log, shot.start_s, shot.exposure_s))
+                image *= shot.light * shot.gain * shot.exposure_s / camera.exposure_s
+                return _sense(image, camera.noise, shot.gain, rng)
 
-            yield Exposure(start + 0.5 * exposure, exposure, gain, light, take)
+            yield Exposure(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s, shot.gain, shot.light, take)
     finally:
         renderer.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """When the shutter opens and what the automatic exposure has set."""
+
+    start_s: float
+    exposure_s: float
+    gain: float
+    light: float  # 1 is full
+
+
+def shots(scene: Scene, log: Log) -> Iterator[Shot]:
+    """All shots of a run, in order."""
+    camera = scene.scenario.camera
+    assert camera is not None
+    n = int((log.stamps_s[-1] - _FIRST_FRAME_S - camera.max_exposure_s) * camera.rate_hz) + 1
+    wanted = camera.exposure_s  # exposure times gain that the automatic exposure has reached
+    for k in range(n):
+        start = _FIRST_FRAME_S + k / camera.rate_hz
+        light = light_level(scene.scenario.world.light, start)
+        follow = 1.0 - math.exp(-1.0 / camera.rate_hz / camera.exposure_lag_s)
+        wanted *= (camera.exposure_s / light / wanted) ** follow if k > 0 else 1.0 / light
+        exposure = min(wanted, camera.max_exposure_s)
+        yield Shot(start, exposure, min(max(wanted / exposure, 1.0), camera.max_gain), light)
 
 
 def light_level(steps: tuple[LightStep, ...], t: float) -> float:
@@ -212,7 +227,7 @@ def _sense(image: NDArray[np.float32], noise: float, gain: float, rng: np.random
     return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
 
 
-def _hidden(scene: Scene) -> list[tuple[set[int], float, float]]:
+def occluded(scene: Scene) -> list[tuple[set[int], float, float]]:
     """Marker ids, start and end of each occlusion."""
     rng = channel_rng(scene.seed, "occlusions")
     ids = np.array(list(scene.landmarks.landmarks))

@@ -16,7 +16,7 @@ from datasets.bag import BagWriter
 from datasets.convert import write_robot
 from datasets.sim.installed import INSTALLED, write_installed
 from datasets.sim.mjcf import wheel_names
-from datasets.sim.physics import make_scene, simulate
+from datasets.sim.physics import Scene, make_scene, simulate
 from datasets.sim.positioning import gnss_settings, uwb_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import streams
@@ -24,7 +24,7 @@ from fgloc.files.atomic import atomic_folder
 from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # a folder that holds it is complete
-_FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
+RUN_FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
 
 
 def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progress: bool = False) -> Path:
@@ -48,22 +48,27 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
     """
     scene = make_scene(scenario, seed)
     log = simulate(scene)
-    with atomic_folder(out, own=_FILES) as stage:
+    with atomic_folder(out, own=RUN_FILES) as stage:
         with BagWriter(stage / "bag", compress=True) as bag:
-            merged = heapq.merge(*streams(scene, log, bag, camera), key=itemgetter(0))
+            merged = heapq.merge(*streams(scene, log, bag, "images" if camera else "nothing"), key=itemgetter(0))
             for _, write in tqdm(merged, unit="msg", disable=None if progress else True, leave=False):
                 write()
-        write_map(scene.surveyed, stage / "map.yaml")
-        write_installed(scene.installed, stage / INSTALLED)
-        write_robot(stage / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
-        (stage / DONE).write_text(describe(scenario, seed, camera), encoding="utf-8")
+        write_beside(stage, scene, scenario, camera)
     return out / "bag"
+
+
+def write_beside(folder: Path, scene: Scene, scenario: Scenario, camera: bool) -> None:
+    """Write what lies beside a run's bag."""
+    write_map(scene.surveyed, folder / "map.yaml")
+    write_installed(scene.installed, folder / INSTALLED)
+    write_robot(folder / "robot.yaml", robot_settings(scenario), f"Simulated robot of scenario {scenario.name}.")
+    (folder / DONE).write_text(describe(scenario, scene.seed, camera), encoding="utf-8")
 
 
 def is_recorded(scenario: Scenario, seed: int, out: Path, camera: bool) -> bool:
     """Whether ``out`` holds exactly this run, complete."""
     done = out / DONE
-    return all((out / name).exists() for name in _FILES) and done.read_text(encoding="utf-8") == describe(
+    return all((out / name).exists() for name in RUN_FILES) and done.read_text(encoding="utf-8") == describe(
         scenario, seed, camera
     )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 
 from datasets.bag import BagWriter
 from datasets.convert import Message
-from datasets.sim.camera import Exposure, exposures, light_level
+from datasets.sim.camera import Exposure, Shot, exposures, light_level, shots
+from datasets.sim.corners import CornerDetector
 from datasets.sim.installed import camera_jitter_s
 from datasets.sim.mjcf import wheel_names
 from datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
@@ -28,13 +30,15 @@ from datasets.sim.section import channel_rng
 from fgloc.frames import rpy_matrix
 from fgloc.types import FloatArray, IntArray
 
+Sees = Literal["images", "corners", "nothing"]
+"""What the camera sends."""
 EPOCH_NS = 1_760_000_000_000_000_000  # time 0 of every run
 FULL_LIGHT_LUX = 500.0
 _LIGHT_HZ = 10.0
 _ODOMETRY_VARIANCE = (4e-4, 2.5e-3)  # of v and ω: a constant that the driver sends, as drivers do
 
 
-def streams(scene: Scene, log: Log, bag: BagWriter, camera: bool) -> list[Iterator[Message]]:
+def streams(scene: Scene, log: Log, bag: BagWriter, camera: Sees) -> list[Iterator[Message]]:
     """All channels of a run, to be merged by receive times; a message is written before the next one is asked for."""
     channels: list[Iterator[Message]] = [
         _commands(scene, log, bag),
@@ -47,8 +51,8 @@ def streams(scene: Scene, log: Log, bag: BagWriter, camera: bool) -> list[Iterat
         channels.append(_ranges(scene, scene.scenario.uwb, log, bag))
     if scene.scenario.gnss is not None:
         channels.append(_fixes(scene, scene.scenario.gnss, log, bag))
-    if camera and scene.scenario.camera is not None:
-        channels += [_mounting(scene, bag), _images(scene, log, bag)]
+    if camera != "nothing" and scene.scenario.camera is not None:
+        channels += [_mounting(scene, bag), (_images if camera == "images" else _corners)(scene, log, bag)]
     return channels
 
 
@@ -211,34 +215,63 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
 
 
 def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
-    """Images and what is believed of their lens, received in order; the clock of the stamps may be late."""
-    camera, believed, installed = scene.scenario.camera, scene.installed.believed.camera, scene.installed.camera
+    """Images and what is believed of their lens."""
+    camera = scene.scenario.camera
     assert camera is not None
-    assert believed is not None
-    assert installed is not None
-    rng = channel_rng(scene.seed, "latency of camera")
-    jitter = camera_jitter_s(scene.scenario.installation, scene.seed, round(log.stamps_s[-1] * camera.rate_hz) + 1)
-    least, mean = scene.scenario.latency.camera
-    last = last_stamp = 0
     quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    for exposure, extra_s in zip(exposures(scene, log), jitter, strict=False):
-        taken = stamp_ns(exposure.stamp_s)
-        stamp = last_stamp = max(taken + round(1e9 * (installed.time_offset_s + extra_s)), last_stamp + 1)
-        received = taken + round(1e9 * (0.5 * exposure.exposure_s + least + rng.exponential(mean)))
-        received = last = max(received, last)
+    arrive = _Arrival(scene, log)
+    for exposure in exposures(scene, log):
+        stamp, received = arrive.of(exposure.stamp_s, exposure.exposure_s)
 
-        def write_info(stamp: int = stamp, received: int = received) -> None:
-            matrix, distortion = believed.matrix, believed.distortion
-            bag.camera_info(
-                "/camera/camera_info", stamp, camera.width, camera.height, matrix, distortion, received_ns=received
-            )
-
-        def write_image(exposure: Exposure = exposure, stamp: int = stamp, received: int = received) -> None:
+        def write(exposure: Exposure = exposure, stamp: int = stamp, received: int = received) -> None:
             data = cv2.imencode(".jpg", exposure.take(), quality)[1].tobytes()
             bag.compressed_image("/camera/image/compressed", stamp, data, received_ns=received)
 
-        yield received, write_info
-        yield received, write_image
+        yield received, partial(_write_lens, scene, bag, stamp, received)
+        yield received, write
+
+
+def _corners(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
+    """The corners that a detector finds in the images, and what is believed of their lens; nothing is rendered."""
+    detector, arrive = CornerDetector(scene, log), _Arrival(scene, log)
+    for shot in shots(scene, log):
+        stamp, received = arrive.of(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s)
+
+        def write(shot: Shot = shot, stamp: int = stamp, received: int = received) -> None:
+            bag.corners("/camera/corners", stamp, detector.find(shot), received_ns=received)
+
+        yield received, partial(_write_lens, scene, bag, stamp, received)
+        yield received, write
+
+
+class _Arrival:
+    """Stamps and receive times of a camera's messages: in order, and the clock of the stamps may be late."""
+
+    def __init__(self, scene: Scene, log: Log) -> None:
+        camera, installed = scene.scenario.camera, scene.installed.camera
+        assert camera is not None
+        assert installed is not None
+        self._rng = channel_rng(scene.seed, "latency of camera")
+        n = round(log.stamps_s[-1] * camera.rate_hz) + 1
+        self._late_s = iter(installed.time_offset_s + camera_jitter_s(scene.scenario.installation, scene.seed, n))
+        self._latency = scene.scenario.latency.camera
+        self._stamp = self._received = 0
+
+    def of(self, taken_s: float, exposure_s: float) -> tuple[int, int]:
+        """Stamp and receive time [ns] of the next exposure, by its middle and its length."""
+        taken, (least, mean) = stamp_ns(taken_s), self._latency
+        self._stamp = max(taken + round(1e9 * next(self._late_s)), self._stamp + 1)
+        received = taken + round(1e9 * (0.5 * exposure_s + least + self._rng.exponential(mean)))
+        self._received = max(received, self._received)
+        return self._stamp, self._received
+
+
+def _write_lens(scene: Scene, bag: BagWriter, stamp: int, received: int) -> None:
+    camera, believed = scene.scenario.camera, scene.installed.believed.camera
+    assert camera is not None
+    assert believed is not None
+    size = (camera.width, camera.height)
+    bag.camera_info("/camera/camera_info", stamp, *size, believed.matrix, believed.distortion, received_ns=received)
 
 
 def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:

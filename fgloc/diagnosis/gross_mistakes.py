@@ -20,6 +20,7 @@ from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.markers.remembered import Detections, RememberedDetections
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.types import FloatArray, LandmarkMap
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
@@ -113,7 +114,7 @@ class _Search:
         setup = recorded_setup(recording, self._map_path, self.config)[1]
         if setup.detector is None:
             return setup, None
-        memory = RememberedDetections(None, setup.detector, self.detections)
+        memory = RememberedDetections(None, TrackingDetector(setup.detector), self.detections)
         self.detections = memory.found
         return setup, memory
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections import Counter, deque
+from collections.abc import Iterable
 
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
-from fgloc.live.reception import Reception, role_of
+from fgloc.live.reception import role_of
 from fgloc.live.run import OnlineRun
+from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, RawEvent, Step
 
@@ -25,24 +27,28 @@ class Engine:
 
     Attributes:
         busy: held while the run is used; take it to look into the run.
-        changed: guards the queues, the reception and the counters; notified of every change.
-        reception: what has arrived.
+        changed: guards the queues and the counters; notified of every change.
+        dropped: events that were not used whatever they say, by role; images are counted by the worker.
+        notes: what the user should know, one sentence each.
         step_s, longest_s: wall time of an update: mean of the last ones, and the longest.
     """
 
-    def __init__(self, run: OnlineRun, startup_s: float, image_queue: int) -> None:
+    def __init__(self, run: OnlineRun, outlet: Outlet, startup_s: float, image_queue: int) -> None:
         """Start the threads.
 
         Args:
             run: what is to be fed.
+            outlet: takes what comes out.
             startup_s: how long its roles are waited for, by receive times.
             image_queue: images that may wait.
         """
         self.busy = threading.RLock()
         self.changed = threading.Condition()
-        self.reception = Reception()
+        self.dropped: Counter[str] = Counter()
+        self.notes: dict[str, None] = {}  # an ordered set
         self.step_s = self.longest_s = 0.0
         self._run = run
+        self._outlet = outlet
         self._startup_s = startup_s
         self._inbox: deque[Queued | PoseWithCovariance] = deque()
         self._line: deque[Queued] = deque()  # gated, in order; only the estimation thread changes it
@@ -50,28 +56,26 @@ class Engine:
         self._first_ns: int | None = None
         self._working = False
         self._closing = False
-        self._failed: Exception | None = None
-        self._subscribers: list[Callable[[Estimate], None]] = []
+        self._failed: FglocError | None = None
         self.worker = DetectionWorker(self.changed, image_queue)
         self._thread = threading.Thread(target=self._estimate, name="fgloc-estimation", daemon=True)
         self._thread.start()
 
     # --- any thread ---
 
-    def put(self, event: Event, publisher: str) -> None:
+    def put(self, event: Event) -> None:
         """Queue an event; of too many, the oldest is dropped."""
+        is_image = isinstance(event, RawEvent)
+        queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
         with self.changed:
             self.check_alive()
-            for passed in self.reception.receive(event, publisher):
-                is_image = isinstance(passed, RawEvent)
-                queued = Queued(passed, State.WAITING if is_image else State.READY, is_image)
-                if is_image:
-                    self.worker.arrived(queued)
-                self._inbox.append(queued)
+            if is_image:
+                self.worker.arrived(queued)
+            self._inbox.append(queued)
             while len(self._inbox) > _MOST_EVENTS:
                 lost = self._inbox.popleft()
                 if isinstance(lost, Queued) and lost.event is not None:
-                    self.reception.dropped[role_of(lost.event)] += 1
+                    self.dropped[role_of(lost.event)] += 1
                     self.worker.discard(lost)
             self.changed.notify_all()
 
@@ -81,11 +85,6 @@ class Engine:
             self.check_alive()
             self._inbox.append(belief)
             self.changed.notify_all()
-
-    def subscribe(self, callback: Callable[[Estimate], None]) -> None:
-        """Have a function called with every estimate."""
-        with self.changed:
-            self._subscribers.append(callback)
 
     def wait(self, timeout_s: float | None) -> bool:
         """Until everything queued has been used; False if it was not in time."""
@@ -121,10 +120,8 @@ class Engine:
 
     def check_failed(self) -> None:
         """Raises: FglocError: what ended the estimation thread."""
-        if isinstance(self._failed, FglocError):
-            raise self._failed
         if self._failed is not None:
-            raise EstimatorError(f"the live run failed: {self._failed!r}") from self._failed
+            raise self._failed
 
     def _idle(self) -> bool:
         return not (self._inbox or self._working or self._line)
@@ -146,10 +143,13 @@ class Engine:
                 self._use_line()
                 self._report(self._run.finish())
         except Exception as error:  # raised again by the next call from outside
+            failure = error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")
+            failure.__cause__ = error.__cause__ if failure is error else error
             with self.changed:
-                self._failed = error
+                self._failed = failure
                 self._working = False
                 self.changed.notify_all()
+            self._outlet.failed(failure)
 
     def _next_batch(self) -> list[Queued | PoseWithCovariance] | None:
         """What has come in, possibly nothing when only an image is done; None at the end."""
@@ -179,26 +179,32 @@ class Engine:
             return self._refuse(item, event)
         if self._run.parts is not None:
             if facts.is_news(event) and facts.note(event):
-                self.worker.detector = self._run.build().detector
+                self._build()
             return self._admit(item)
         facts.note(event)
         self._held.append(item)
         self._first_ns = event.received_ns if self._first_ns is None else self._first_ns
         if facts.complete((event.received_ns - self._first_ns) * 1e-9, self._startup_s):
-            self.worker.detector = self._run.build().detector
+            self._build()
             while self._held:
                 self._admit(self._held.popleft())
+
+    def _build(self) -> None:
+        detector = self._run.build().detector
+        self.worker.detector = None if detector is None else TrackingDetector(detector)
+        assert self._run.anchors is not None
+        self._outlet.built(self._run.anchors.parts)
 
     def _refuse(self, item: Queued, event: Event) -> None:
         """An event of another topic than the one that plays its role."""
         role = role_of(event)
         with self.changed:
             if not self._run.facts.is_configured(event):
-                self.reception.note(
+                self.notes.setdefault(
                     f"{event.topic}: a second topic of the role {role} is not used; choose one by "
                     f"recording.topics.{role}"
                 )
-            self.reception.dropped[role] += 1
+            self.dropped[role] += 1
             self.worker.discard(item)
 
     def _admit(self, item: Queued) -> None:
@@ -231,21 +237,11 @@ class Engine:
 
     def _report(self, steps: Iterable[tuple[Step, Estimate | None]]) -> None:
         began = time.perf_counter()
-        for _, estimate in steps:
+        for step, estimate in steps:
             took = time.perf_counter() - began
             with self.changed:
                 self.step_s += (took - self.step_s) / min(self._run.keyframes, _MEAN_OF)
                 self.longest_s = max(self.longest_s, took)
-                subscribers = list(self._subscribers)
             if estimate is not None:
-                for callback in subscribers:
-                    self._call(callback, estimate)
+                self._outlet.estimated(self._run.anchor(step, estimate), estimate)
             began = time.perf_counter()
-
-    def _call(self, callback: Callable[[Estimate], None], estimate: Estimate) -> None:
-        try:
-            callback(estimate)
-        except Exception as error:  # theirs: the robot still needs its pose
-            with self.changed:
-                self._subscribers.remove(callback)
-                self.reception.note(f"a subscriber failed and is not called any more: {type(error).__name__}: {error}")

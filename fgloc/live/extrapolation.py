@@ -6,44 +6,50 @@ import copy
 import threading
 from bisect import bisect_left, bisect_right, insort
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fgloc import se2
-from fgloc.assembly import Assembly
-from fgloc.graph.installation import InstallationBelief
+from fgloc.config import Config
+from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
+from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_fusion import MotionFusion
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.learned.forms import MotionModel
+from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Estimate, Event, FloatArray, InertialEvent, Mode, MotionEvent, Step
+from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, Step
 
 HISTORY_S = 5.0  # poses further back than this are not told
 _BEFORE_NS = 500_000_000  # motion events this long before a keyframe tell how it was moving then
 _PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
 _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
+
 _MOST_EVENTS = 8192  # of one kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Anchor:
-    """A keyframe to carry on from: the estimate, and the motion sources as they were then."""
+class _Means:
+    """What all anchors of one building of the parts are carried on by."""
 
-    stamp_ns: int
-    belief: PoseWithCovariance
-    known: InstallationBelief
-    added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
-    mode: Mode
-    blind_s: float
-    off: Mapping[str, str]
-    scale: float
-    gyro: Gyro | None
-    learned: LearnedMotion | None
-    wheels: WheelMotion  # has read the events that were asked for so far
+    joint: JointCalibration | None
+    model: MotionModel | None
+    factors: LandmarkFactors  # hold what is known of the installation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Held:
+    """An anchor, with wheels that have read the events which were asked for so far."""
+
+    anchor: Anchor
+    means: _Means
+    wheels: WheelMotion
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.anchor.stamp_ns
 
 
 class Extrapolator:
@@ -52,20 +58,26 @@ class Extrapolator:
     Every question is answered anew from the events themselves: nothing that was extrapolated enters the estimate.
     """
 
-    def __init__(self, parts: Assembly) -> None:
-        """Take the parts of the run."""
+    def __init__(self, config: Config) -> None:
+        """Nothing is known before `begin` and the first anchor."""
         self._lock = threading.Lock()  # of what is kept
-        self._asked = threading.Lock()  # of the model
-        self._parts = parts
-        self._model = None if parts.learned is None else copy.deepcopy(parts.learned.model)
-        self._config = parts.config
-        self._history_ns = round(parts.config.keyframes.history_s * 1e9)
+        self._asked = threading.Lock()  # of what carries on
+        self._config = config
+        self._means: _Means | None = None
+        self._history_ns = round(config.keyframes.history_s * 1e9)
         self._kept_ns = max(self._history_ns, _BEFORE_NS)
-        self._clock = ClockGuard(parts.config.gate)
+        self._clock = ClockGuard(config.gate)
         self._events: defaultdict[type[MotionEvent], list[MotionEvent]] = defaultdict(list)  # by class and stamp
-        self._anchors: deque[_Anchor] = deque()
+        self._anchors: deque[_Held] = deque()
         self._segment = -1
         self._newest_ns = 0
+
+    def begin(self, parts: MotionParts) -> None:
+        """The parts of the run have been built, or built again: the next anchor is the first of them."""
+        model = copy.deepcopy(parts.model)  # it writes into buffers of its own
+        with self._lock:
+            self._means = _Means(parts.joint, model, LandmarkFactors(None, parts.installation))
+            self._anchors.clear()
 
     def add(self, event: MotionEvent) -> None:
         """Take in a motion event that passed the gate."""
@@ -85,38 +97,15 @@ class Extrapolator:
             if len(events) > _MOST_EVENTS:  # no keyframe has come for long
                 del events[: _MOST_EVENTS // 2]
 
-    def anchor(self, step: Step, estimate: Estimate) -> None:
+    def anchor(self, anchor: Anchor) -> None:
         """Carry on from here."""
-        localizer = self._parts.localizer
-        estimator, installation = localizer.estimator, localizer.factors
-        frame = estimator.log.keyframes.get(estimator.k)
-        gyro, learned = localizer.sources.gyro, self._parts.learned
-        body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
-        if frame is not None and frame.stamp_ns == estimate.stamp_ns:
-            belief = frame.belief
-            known = belief.installation or installation.believed
-            off, scale = frame.off, frame.scale
-        else:
-            belief, known, off, scale = PoseWithCovariance(estimate.pose, body), installation.believed, {}, 1.0
-        made = _Anchor(
-            stamp_ns=estimate.stamp_ns,
-            belief=belief,
-            known=known,
-            added_cov=body - belief.cov,
-            mode=estimate.mode,
-            blind_s=localizer.blind_s,
-            off=off,
-            scale=scale,
-            gyro=None if gyro is None else gyro.fork(),
-            wheels=WheelMotion(self._config.wheels),
-            learned=None if learned is None or self._model is None else learned.fork(self._model),
-        )
         with self._lock:
-            if step.segment != self._segment:
+            assert self._means is not None
+            if anchor.segment != self._segment:
                 self._anchors.clear()
-                self._segment = step.segment
-            self._anchors.append(made)
-            while self._anchors[0].stamp_ns < made.stamp_ns - HISTORY_S * 1e9:
+                self._segment = anchor.segment
+            self._anchors.append(_Held(anchor, self._means, WheelMotion(self._config.wheels)))
+            while self._anchors[0].stamp_ns < anchor.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
             for events in self._events.values():
                 del events[: max(bisect_right(events, self._anchors[0].stamp_ns - self._kept_ns, key=_stamp) - 1, 0)]
@@ -131,21 +120,23 @@ class Extrapolator:
             k = bisect_right(self._anchors, at_ns, key=lambda a: a.stamp_ns) - 1
             if k < 0 or at_ns > newest + _FURTHEST_NS:
                 return None
-            anchor = self._anchors[k]
-            step = self._step(anchor.stamp_ns, at_ns)
+            held = self._anchors[k]
+            step = self._step(held.anchor, at_ns)
+        anchor = held.anchor
         with self._asked:
-            belief, mode = self._carried(anchor, step), anchor.mode
+            belief, mode = self._carried(held, step), anchor.mode
         blind_s = anchor.blind_s + step.dt
         if mode is Mode.OK and blind_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
         return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns)
 
-    def _step(self, start_ns: int, end_ns: int) -> Step:
-        """All motion events from a while before the start to the first one after the end."""
+    def _step(self, anchor: Anchor, end_ns: int) -> Step:
+        """All motion events from a while before the anchor to the first one after the end."""
+        start_ns = anchor.stamp_ns
         return Step(
             0,
-            0,
+            anchor.segment,
             start_ns,
             end_ns,
             {kind: self._window(kind, start_ns - self._back_ns(kind), end_ns) for kind in self._events},
@@ -163,15 +154,16 @@ class Extrapolator:
         first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
 
-    def _carried(self, anchor: _Anchor, step: Step) -> PoseWithCovariance:
-        parts, localizer = self._parts, self._parts.localizer
+    def _carried(self, held: _Held, step: Step) -> PoseWithCovariance:
+        anchor, means = held.anchor, held.means
+        means.factors.believed = anchor.known
         sources = MotionFusion(
             self._config,
-            anchor.wheels,
-            None if anchor.learned is None else anchor.learned.fork(anchor.learned.model),
-            localizer.sources.joint,
+            held.wheels,
+            None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),
+            means.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
-            localizer.factors,
+            means.factors,
         )
         belief, start_ns = anchor.belief, step.start_ns
         while start_ns < step.stamp_ns:
@@ -179,7 +171,7 @@ class Extrapolator:
             piece = _piece(step, start_ns, end_ns)
             readings = sources.read(piece, anchor.blind_s + (start_ns - step.start_ns) * 1e-9)
             motions = sources.combine(readings, anchor.off, anchor.scale) or [sources.unknown(piece, readings)]
-            belief = predict(belief, anchor.known, parts.localizer.factors.installation, motions)
+            belief = predict(belief, anchor.known, means.factors.installation, motions)
             start_ns = end_ns
         return belief
 
@@ -197,4 +189,4 @@ def _piece(step: Step, start_ns: int, end_ns: int) -> Step:
         if issubclass(kind, InertialEvent):
             first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
             motion[kind] = events[first : bisect_left(events, end_ns, key=_stamp) + 1]
-    return Step(0, 0, start_ns, end_ns, motion)
+    return Step(0, step.segment, start_ns, end_ns, motion)

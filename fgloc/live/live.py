@@ -5,33 +5,33 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 
 from fgloc.config import Config, Role
-from fgloc.errors import EstimatorError, OutputError
+from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.engine import Engine
+from fgloc.live.anchors import Anchor, MotionParts
+from fgloc.live.estimation import Estimation, Settings
 from fgloc.live.events import EventMaker
-from fgloc.live.facts import LiveFacts
-from fgloc.live.run import OnlineRun
-from fgloc.live.state import Resumed, fingerprint, read_state, write_state
+from fgloc.live.extrapolation import Extrapolator
+from fgloc.live.process import EstimationProcess
+from fgloc.live.reception import Reception
 from fgloc.live.status import LivePose, LiveStatus
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.maps import load_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
-
-_SAVE_EVERY_S = 1.0
 
 
 class Live(EventMaker):
     """Localizes a robot while it drives.
 
     Events may be pushed from any thread, in the order in which they arrive; `push` takes microseconds. One thread
-    estimates, one finds markers in images. Poses are the same as those of `fgloc online` on a recording of the events,
-    unless images had to be dropped.
+    estimates, one finds markers in images; with ``process`` both are in a process of their own. Poses are the same as
+    those of `fgloc online` on a recording of the events, unless images had to be dropped.
 
     The parts of the run are built when everything has come in that they are built from (see ``roles``).
 
@@ -54,6 +54,7 @@ class Live(EventMaker):
         camera: Camera | None = None,
         startup_s: float = 2.0,
         image_queue: int = 4,
+        process: bool | EstimationProcess = False,
     ) -> None:
         """Start the threads; nothing is estimated before events come in.
 
@@ -63,8 +64,12 @@ class Live(EventMaker):
             state: file that the state is saved to every second and at the end, and resumed from.
             roles: what will come in. The run begins when all of it is there; None: after ``startup_s``.
             camera: the calibrated and mounted camera, if no CameraInfo and transforms will tell it.
-            startup_s: how long roles are waited for, by receive times. What comes later joins later.
+            startup_s: how long [s] roles are waited for, by receive times. Without ``roles`` the run always begins this
+                long after the first event, with what has come; with them it begins earlier if all are there, and
+                without those that are not. What comes later joins later.
             image_queue: images that may wait for detection; of more the oldest is dropped.
+            process: estimate in another process (or in this one, which was started before), so that `push`, `pose_at`
+                and the caller's own threads never wait for an update. It costs some processor time for every event.
 
         Raises:
             MapError, ModelError: as their loaders have it.
@@ -74,15 +79,11 @@ class Live(EventMaker):
         if config.motion.use and config.motion.model is not None:
             load_model(config.motion.model)  # a file that cannot be used is refused now, not when the robot drives
         self._recording = config.recording
-        self._state = state
-        read = Resumed(None, "") if state is None else read_state(state, fingerprint(landmark_map))
-        self._run = OnlineRun(config, landmark_map, LiveFacts(config, roles, camera), read.state)
-        self._engine = Engine(self._run, startup_s, image_queue)
-        if read.note:
-            self._engine.reception.note(read.note)
-        self._saver = threading.Thread(target=self._save_regularly, name="fgloc-state", daemon=True)
-        if state is not None:
-            self._saver.start()
+        self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
+        self._reception = Reception(config)
+        self._results = _Results(config)
+        settings = Settings(config, landmark_map, state, roles, camera, startup_s, image_queue)
+        self._estimation = _begun(process, settings, self._results)
 
     def __enter__(self) -> Live:
         return self
@@ -92,18 +93,29 @@ class Live(EventMaker):
 
     # --- in ---
 
-    def push(self, event: Event, publisher: str = "") -> None:
+    def push(self, event: Event, publisher: str = "") -> tuple[Event, ...]:
         """Take an event, in order of receipt. Never waits for estimation or detection.
 
         Args:
             event: any that a recording has.
             publisher: tells publishers of one topic apart; only the first is used, until it has been silent for 1 s.
 
+        Returns:
+            What is used from now on: mostly the event itself; with a corrected stamp if the topic's clock was reset;
+            nothing if it is of a second publisher, or held back for a moment because its clock may have been reset.
+
         Raises:
             EstimatorError: `close` was called.
             FglocError: the run has failed: what it was fed cannot be used.
         """
-        self._engine.put(event, publisher)
+        with self._lock:
+            used = self._reception.receive(event, publisher)
+            for received in used:
+                motion = self._reception.motion(received)
+                if motion is not None:
+                    self._results.poses.add(motion)
+                self._estimation.put(received)
+        return tuple(used)
 
     def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = (0.5, 0.5, 0.26)) -> None:
         """Go on from a pose that somebody tells: x, y [m], yaw [rad] in the map, and their sigmas.
@@ -116,14 +128,14 @@ class Live(EventMaker):
         mean, spread = np.asarray(pose, dtype=float), np.asarray(sigmas, dtype=float)
         if not (mean.shape == spread.shape == (3,) and np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
             raise EstimatorError(f"pose {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0")
-        self._engine.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
+        self._estimation.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
-        """Have a function called with every keyframe's estimate, in the estimation thread: it should be quick.
+        """Have a function called with every keyframe's estimate, in the thread that has it: it should be quick.
 
         One that raises is not called again; `status` says so.
         """
-        self._engine.subscribe(callback)
+        self._results.subscribe(callback)
 
     # --- out ---
 
@@ -139,36 +151,17 @@ class Live(EventMaker):
         Raises:
             FglocError: the run has failed.
         """
-        self._engine.check_failed()
-        extrapolator = self._run.extrapolator
-        return None if extrapolator is None else extrapolator.pose_at(stamp_ns)
+        self._estimation.check_failed()
+        return self._results.poses.pose_at(stamp_ns)
 
     def status(self) -> LiveStatus:
         """How the run fares."""
-        run, engine = self._run, self._engine
-        with engine.busy:
-            newest, rejections, notes = run.newest, run.rejections, run.notes()
-            keyframes, running, waiting = run.keyframes, run.parts is not None, run.facts.waiting_for()
-            reordering_s = run.reordering_s
-        with engine.changed:
-            worker, reception = engine.worker, engine.reception
-            rejections += worker.rejections
-            return LiveStatus(
-                running=running,
-                mode=None if newest is None else newest.mode,
-                stamp_ns=None if newest is None else newest.stamp_ns,
-                keyframes=keyframes,
-                step_ms=engine.step_s * 1e3,
-                step_ms_max=engine.longest_s * 1e3,
-                reordering_s=reordering_s,
-                queued_events=engine.queued,
-                queued_images=worker.queued,
-                topics=reception.topics(),
-                dropped=dict(reception.dropped + Counter({"image": worker.dropped})),
-                rejections=dict(sorted(rejections.items())),
-                waiting_for=waiting,
-                notes=tuple(dict.fromkeys((*reception.notes, *notes))),
-            )
+        status = self._estimation.status()
+        with self._lock:
+            topics, notes = self._reception.topics(), self._reception.notes
+            dropped = dict(self._reception.dropped + Counter(status.dropped))
+        notes = tuple(dict.fromkeys((*notes, *self._results.notes, *status.notes)))
+        return replace(status, topics=topics, dropped=dropped, notes=notes)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until everything that was pushed has been used; False if it was not in time.
@@ -176,7 +169,7 @@ class Live(EventMaker):
         Raises:
             FglocError: the run has failed.
         """
-        return self._engine.wait(timeout_s)
+        return self._estimation.wait(timeout_s)
 
     # --- end ---
 
@@ -186,11 +179,7 @@ class Live(EventMaker):
         Raises:
             OutputError: the file cannot be written.
         """
-        with self._engine.busy:
-            snapshot = self._run.snapshot()
-        if snapshot is not None:
-            write_state(path, snapshot)
-        return snapshot is not None
+        return self._estimation.save(path)
 
     def close(self) -> None:
         """Use what waits but for images, save the state, and end the threads. May be called again.
@@ -198,18 +187,58 @@ class Live(EventMaker):
         Raises:
             OutputError: the state cannot be written.
         """
-        if self._engine.close() and self._state is not None:
-            self._saver.join()
-            self.save(self._state)
+        self._estimation.close()
 
     def _deliver(self, event: Event) -> None:
         self.push(event)
 
-    def _save_regularly(self) -> None:
-        while self._engine.pause(_SAVE_EVERY_S):
+
+def _begun(process: bool | EstimationProcess, settings: Settings, results: _Results) -> Estimation | EstimationProcess:
+    if process is False:
+        return Estimation(settings, results)
+    other = EstimationProcess() if process is True else process
+    other.begin(settings, results)
+    return other
+
+
+class _Results:
+    """What the estimation found: poses to be asked for, and callbacks.
+
+    Attributes:
+        poses: at any time.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.poses = Extrapolator(config)
+        self._lock = threading.Lock()
+        self._subscribers: list[Callable[[Estimate], None]] = []
+        self._notes: list[str] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        with self._lock:
+            return tuple(self._notes)
+
+    def subscribe(self, callback: Callable[[Estimate], None]) -> None:
+        with self._lock:
+            self._subscribers.append(callback)
+
+    def built(self, parts: MotionParts) -> None:
+        self.poses.begin(parts)
+
+    def failed(self, error: FglocError) -> None:
+        """The next call raises it."""
+
+    def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
+        self.poses.anchor(anchor)
+        with self._lock:
+            subscribers = list(self._subscribers)
+        for callback in subscribers:
             try:
-                assert self._state is not None
-                self.save(self._state)
-            except OutputError as error:
-                with self._engine.changed:
-                    self._engine.reception.note(str(error))
+                callback(estimate)
+            except Exception as error:  # theirs: the robot still needs its pose
+                failed = f"a subscriber failed and is not called any more: {type(error).__name__}: {error}"
+                with self._lock:
+                    self._subscribers.remove(callback)
+                    self._notes.append(failed)

@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fgloc.config import Config
 from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
+from fgloc.intake.validation import EventValidator
+from fgloc.live.facts import LiveFacts
 from fgloc.live.facts import role_of as known_role
 from fgloc.live.status import TopicMeter, TopicStatus
-from fgloc.types import Event
+from fgloc.types import Event, MotionEvent, TransformEvent
 
 _SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
 _SUCCESSION_NS = 1_000_000_000  # a publisher silent for this long has ended; another one of the topic is used
@@ -37,8 +40,10 @@ class Reception:
         dropped: events that are not used whatever they say, by role.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: Config) -> None:
         """Nothing has arrived."""
+        self._selection = LiveFacts(config, None, None)
+        self._gate = EventValidator(config.gate)
         self.dropped: Counter[str] = Counter()
         self._publishers: dict[Source, _Publisher] = {}
         self._meters: dict[str, TopicMeter] = {}
@@ -48,8 +53,7 @@ class Reception:
     def receive(self, event: Event, publisher: str) -> list[Event]:
         """The events that are to be used now: mostly this one; see `TopicClocks`."""
         role = role_of(event)
-        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
-        if not first.has_the_topic(publisher, event.received_ns):
+        if not isinstance(event, TransformEvent) and not self._is_of_its_publisher(event, publisher):
             self.dropped[role] += 1
             self.note(
                 f"{event.topic}: two publishers; only the messages of the first are used: stop or rename one of them"
@@ -59,6 +63,18 @@ class Reception:
             self._meters[event.topic] = TopicMeter(role)
         self._meters[event.topic].add(event.stamp_ns, event.received_ns)
         return self._clocks.correct(event)
+
+    def _is_of_its_publisher(self, event: Event, publisher: str) -> bool:
+        """Whether a message is of the one publisher that its topic should have; transforms have any number."""
+        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
+        return first.has_the_topic(publisher, event.received_ns)
+
+    def motion(self, event: Event) -> MotionEvent | None:
+        """An event that was received, if it is of the motion source to be used, and as the gate lets it through."""
+        if not isinstance(event, MotionEvent) or not self._selection.topic_is_used(event):
+            return None
+        passed = self._gate.check(event)
+        return passed if isinstance(passed, MotionEvent) else None
 
     def note(self, text: str) -> None:
         """Remember a sentence for the user."""

@@ -12,7 +12,7 @@ from fgloc import se2
 from fgloc.assembly import Assembly, assemble_stream
 from fgloc.config import Config
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.extrapolation import Extrapolator
+from fgloc.live.anchors import Anchor, Anchors
 from fgloc.live.facts import LiveFacts
 from fgloc.live.resume import carried_over, odometry_state
 from fgloc.live.state import (
@@ -38,7 +38,7 @@ class OnlineRun:
     Attributes:
         facts: what has come in.
         parts: of the run; None before they are built.
-        extrapolator: of the newest keyframes; None before.
+        anchors: of its estimates; None before.
         newest: the last estimate.
         keyframes: steps so far.
         reordering_s: how far the last keyframe was behind the newest stamp when it was made.
@@ -57,7 +57,7 @@ class OnlineRun:
         """
         self.facts = facts
         self.parts: Assembly | None = None
-        self.extrapolator: Extrapolator | None = None
+        self.anchors: Anchors | None = None
         self.newest: Estimate | None = None
         self.keyframes = 0
         self.reordering_s = 0.0
@@ -88,7 +88,7 @@ class OnlineRun:
         if self._resumed is not None:
             self._take_over(parts, self._resumed)
         self.parts = parts
-        self.extrapolator = Extrapolator(parts)
+        self.anchors = Anchors(parts)
         return parts
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
@@ -96,13 +96,9 @@ class OnlineRun:
         self._reset, self._resumed = belief, None
 
     def check(self, event: Event) -> Event | None:
-        """Through the gate: the event, a repaired copy, or None. Motion is known to the extrapolator from here on."""
+        """Through the gate: the event, a repaired copy, or None."""
         assert self.parts is not None
-        assert self.extrapolator is not None
-        passed = self.parts.gate.check(event)
-        if isinstance(passed, MotionEvent):
-            self.extrapolator.add(passed)
-        return passed
+        return self.parts.gate.check(event)
 
     def use(self, event: Event, detected: bool = False) -> Iterator[tuple[Step, Estimate | None]]:
         """Take the next event in order; ``detected``: markers found in an image that has passed the gate."""
@@ -125,9 +121,8 @@ class OnlineRun:
                 yield step, self._update(step)
 
     def _update(self, step: Step) -> Estimate | None:
-        parts, extrapolator = self.parts, self.extrapolator
+        parts = self.parts
         assert parts is not None
-        assert extrapolator is not None
         if self._reset is not None:
             parts.localizer.restart_at(self._reset)
         elif self._resumed is not None:
@@ -142,8 +137,12 @@ class OnlineRun:
         self._last_step = step
         if estimate is not None:
             self.newest = estimate
-            extrapolator.anchor(step, estimate)
         return estimate
+
+    def anchor(self, step: Step, estimate: Estimate) -> Anchor:
+        """To carry the newest estimate on from; ask before the next event is used."""
+        assert self.anchors is not None
+        return self.anchors.make(step, estimate)
 
     def _take_over(self, parts: Assembly, state: RunState) -> None:
         """What an earlier run found, but for the pose, which waits for the first step."""

@@ -33,15 +33,15 @@ class TopicStatus:
 class LiveStatus:
     """A live run at one time."""
 
-    running: bool  # its parts are built; before that it waits for what `waiting_for` names
-    mode: Mode | None  # of the last keyframe; None: no pose yet
-    stamp_ns: int | None  # of the last keyframe
-    keyframes: int
-    step_ms: float  # mean wall time of an update, lately
-    step_ms_max: float  # longest one so far
-    reordering_s: float  # how far the last keyframe was behind the newest stamp when it was made
-    queued_events: int
-    queued_images: int
+    running: bool = False  # its parts are built; before that it waits for what `waiting_for` names
+    mode: Mode | None = None  # of the last keyframe; None: no pose yet
+    stamp_ns: int | None = None  # of the last keyframe
+    keyframes: int = 0
+    step_ms: float = 0.0  # mean wall time of an update, lately
+    step_ms_max: float = 0.0  # longest one so far
+    reordering_s: float = 0.0  # how far the last keyframe was behind the newest stamp when it was made
+    queued_events: int = 0
+    queued_images: int = 0
     topics: Mapping[str, TopicStatus] = field(default_factory=dict)
     dropped: Mapping[str, int] = field(default_factory=dict)  # by role: for overload, not for what they said
     rejections: Mapping[str, int] = field(default_factory=dict)  # by "sensor.reason", as in reports

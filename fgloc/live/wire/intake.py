@@ -23,7 +23,7 @@ _TF_TOPICS = ("/tf", "/tf_static")
 
 
 class Intake:
-    """Selects topics as `Recording` does and pushes their events.
+    """Selects topics as `Recording` does and pushes their events, each with the name of its publisher.
 
     Attributes:
         roles: topic of each role; empty until those are there that a run needs.
@@ -32,7 +32,7 @@ class Intake:
     """
 
     def __init__(
-        self, participant: Participant, clock: WireClock, config: RecordingConfig, push: Callable[[Event], None]
+        self, participant: Participant, clock: WireClock, config: RecordingConfig, push: Callable[[Event, str], None]
     ) -> None:
         """Watch the wire; `find` looks for topics, `subscribe` reads them."""
         self._participant = participant
@@ -110,4 +110,4 @@ class Intake:
                 self.undecodable[sample.topic] += 1
             return
         for event in events:
-            self._push(event)
+            self._push(event, sample.publisher)

@@ -14,6 +14,7 @@ from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LiveStatus
+from fgloc.live.process import EstimationProcess
 from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.intake import Intake
 from fgloc.live.wire.odom_frame import OdomFrame
@@ -55,6 +56,7 @@ class Node:
             state: as `Live` has it.
         """
         self.live: Live | None = None
+        self._process = EstimationProcess()  # publishing does not wait for an update
         self._config = config
         self._landmarks = landmarks
         self._state = state
@@ -79,6 +81,7 @@ class Node:
         """End the run, and save its state."""
         if self.live is not None:
             self.live.close()
+        self._process.close()
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
         """As `Live.subscribe`; call it before `run`."""
@@ -123,20 +126,23 @@ class Node:
 
     def _start(self) -> None:
         """The topics are known: whose first messages come soon belongs to the run from its beginning."""
-        self.live = Live(self._config, self._landmarks, state=self._state, roles=self.intake.roles.keys())
+        roles = tuple(self.intake.roles)
+        self.live = Live(self._config, self._landmarks, state=self._state, roles=roles, process=self._process)
         self._recent = RecentPoses(self.live.pose_at)
         for callback in self._subscribers:
             self.live.subscribe(callback)
 
-    def _push(self, event: Event) -> None:
-        self._odom.add(event)
-        if self.watch is not None:
-            self.watch(event)
+    def _push(self, event: Event, publisher: str) -> None:
         assert self.live is not None  # nothing is read before
         try:
-            self.live.push(event)
+            used = self.live.push(event, publisher)
         except FglocError as error:
             self._failure = error
+            return
+        for one in used:
+            self._odom.add(one)
+            if self.watch is not None:
+                self.watch(one)
 
     def _on_estimate(self, estimate: Estimate) -> None:
         self._outputs.pose(estimate)

@@ -57,6 +57,7 @@ class Sample:
     message_type: str
     cdr: bytes
     source_ns: int  # when it was written, by its writer's clock
+    publisher: str = ""  # its writer: another one has another name, also on the same topic
 
 
 OnSample = Callable[[Sample], None]
@@ -240,8 +241,9 @@ class Participant:
             for (reader, _), publication, on_sample in self._readers:
                 for message in reader.take(_BATCH):
                     if message.sample_info.valid_data:
-                        source_ns = message.sample_info.source_timestamp
-                        sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns)
+                        info = message.sample_info
+                        source_ns, publisher = info.source_timestamp, str(info.publication_handle)  # stands for a GUID
+                        sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns, publisher)
                         found.append((source_ns, len(found), sample, on_sample))
             if len(found) == before:
                 break

@@ -1,0 +1,131 @@
+"""What poses are carried on from: a keyframe's estimate, and the motion sources as they were then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.assembly import Assembly
+from fgloc.config import Config
+from fgloc.errors import FglocError
+from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.sensors.gyro.rate import Gyro
+from fgloc.sensors.learned.forms import MotionModel
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.types import Estimate, FloatArray, IntArray, Mode, Step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionParts:
+    """Of a run: what its motion sources are made of. Can be pickled."""
+
+    config: Config
+    installation: Installation  # the parameters that motions may depend on
+    joint: JointCalibration | None
+    model: MotionModel | None  # of the learned motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """A keyframe to carry on from. Can be pickled."""
+
+    segment: int
+    stamp_ns: int
+    belief: PoseWithCovariance  # with the installation of `MotionParts`
+    known: InstallationBelief  # likewise
+    added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
+    mode: Mode
+    blind_s: float
+    off: Mapping[str, str]
+    scale: float
+    gyro: Gyro | None
+    learned: LearnedMotion | None  # without its model
+
+
+class Outlet(Protocol):
+    """Takes what a live run finds; called in its estimation thread."""
+
+    def built(self, parts: MotionParts) -> None:
+        """The parts of the run have been built, perhaps not for the first time."""
+        ...
+
+    def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
+        """A keyframe has been estimated."""
+        ...
+
+    def failed(self, error: FglocError) -> None:
+        """The run cannot go on."""
+        ...
+
+
+class Anchors:
+    """Makes the anchors of a run's estimates.
+
+    Attributes:
+        parts: what goes with all of them.
+    """
+
+    def __init__(self, parts: Assembly) -> None:
+        """Take the parts of the run."""
+        installation = parts.localizer.factors.installation
+        self._run = parts
+        self._rows = _rows_of_motion(installation)
+        sigmas = {installation.names[i]: float(installation.sigmas[i]) for i in self._rows}
+        model = None if parts.learned is None else parts.learned.model
+        self.parts = MotionParts(parts.config, Installation(sigmas), parts.localizer.sources.joint, model)
+
+    def make(self, step: Step, estimate: Estimate) -> Anchor:
+        """The anchor of the estimate that the run's last step led to."""
+        localizer = self._run.localizer
+        estimator, installation = localizer.estimator, localizer.factors
+        frame = estimator.log.keyframes.get(estimator.k)
+        gyro, learned = localizer.sources.gyro, self._run.learned
+        body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
+        if frame is not None and frame.stamp_ns == estimate.stamp_ns:
+            belief = frame.belief
+            known = belief.installation or installation.believed
+            off, scale = frame.off, frame.scale
+        else:
+            belief, known, off, scale = PoseWithCovariance(estimate.pose, body), installation.believed, {}, 1.0
+        return Anchor(
+            segment=step.segment,
+            stamp_ns=estimate.stamp_ns,
+            belief=self._of_motion(belief),
+            known=self._belief_of_motion(known),
+            added_cov=body - belief.cov,
+            mode=estimate.mode,
+            blind_s=localizer.blind_s,
+            off=dict(off),
+            scale=scale,
+            gyro=None if gyro is None else gyro.fork(),
+            learned=None if learned is None else _without_model(learned),
+        )
+
+    def _of_motion(self, belief: PoseWithCovariance) -> PoseWithCovariance:
+        cross = None if belief.cross is None else belief.cross[:, self._rows]
+        return PoseWithCovariance(belief.pose, belief.cov, cross)
+
+    def _belief_of_motion(self, known: InstallationBelief) -> InstallationBelief:
+        return InstallationBelief(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])
+
+
+def _rows_of_motion(installation: Installation) -> IntArray:
+    """Rows of the parameters that are of no sighting: neither of a landmark nor of what sees it."""
+    of_sightings = {
+        first + i for first, count in (*installation.blocks.values(), *installation.landmarks.values())
+        for i in range(count)
+    }  # fmt: skip
+    return np.array([i for i in range(len(installation)) if i not in of_sightings], dtype=np.int64)
+
+
+def _without_model(learned: LearnedMotion) -> LearnedMotion:
+    """A copy to be forked with a model again: the model is large, and always the same."""
+    copied = learned.fork(learned.model)
+    del copied.model
+    return copied

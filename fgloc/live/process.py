@@ -1,0 +1,279 @@
+"""The estimation of a live run in a process of its own, so that nothing in this one waits for it.
+
+Python runs one thread of a process at a time. An update that computes for 10 ms, or that other processes interrupt,
+would hold up the threads that receive messages and publish poses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import Counter, deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from fgloc.errors import EstimatorError, FglocError
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.live.anchors import Anchor, MotionParts, Outlet
+from fgloc.live.estimation import Estimation, Settings
+from fgloc.live.reception import role_of
+from fgloc.live.status import LiveStatus
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Estimate, Event
+
+_START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
+_MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
+_STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
+_END_S = 10.0  # that it may take to use what it has and to save its state
+_ANSWERING = 4  # its threads that answer questions
+
+_Question: TypeAlias = tuple[int, str, tuple[Any, ...]]  # number, method of `Estimation`, arguments
+
+
+class EstimationProcess:
+    """`Estimation` in a child process, which ends when this one does. Give it to `Live`, or `close` it."""
+
+    def __init__(self) -> None:
+        """Start the process; it imports what it needs while this one goes on."""
+        self._connection, theirs = Pipe()
+        self._child = subprocess.Popen(
+            [sys.executable, "-c", _START, str(theirs.fileno()), json.dumps(sys.path)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+            process_group=0,  # Ctrl-C is for this process, which then ends the other
+        )
+        theirs.close()
+        self._changed = threading.Condition()  # guards all that follows
+        self._waiting: deque[Event | PoseWithCovariance | _Question] = deque()
+        self._images = 0  # among them
+        self._most_images = 0
+        self._dropped: Counter[str] = Counter()
+        self._numbers = itertools.count()
+        self._asked: dict[int, Future[Any]] = {}
+        self._status = LiveStatus()
+        self._failed: FglocError | None = None
+        self._closing = False
+        self._threads: list[threading.Thread] = []
+
+    def begin(self, settings: Settings, outlet: Outlet) -> None:
+        """Set up the run; otherwise as `Estimation`."""
+        self._most_images = settings.image_queue
+        self._connection.send(settings)
+        for name, work in (("send", self._send), ("receive", lambda: self._receive(outlet))):
+            thread = threading.Thread(target=work, name=f"fgloc-{name}", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def put(self, event: Event) -> None:
+        """As `Estimation.put`."""
+        with self._changed:
+            self._queue(event)
+            if isinstance(event, ImageEvent):
+                self._images += 1
+                if self._images > self._most_images:
+                    self._drop(next(e for e in self._waiting if isinstance(e, ImageEvent)))
+            if len(self._waiting) > _MOST_WAITING:
+                self._drop(next(e for e in self._waiting if isinstance(e, Event)))
+
+    def reset_pose(self, belief: PoseWithCovariance) -> None:
+        """As `Estimation.reset_pose`."""
+        with self._changed:
+            self._queue(belief)
+
+    def check_failed(self) -> None:
+        """As `Estimation.check_failed`."""
+        if self._failed is not None:
+            raise self._failed
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """As `Estimation.wait`."""
+        return bool(self._ask("wait", timeout_s).result())
+
+    def status(self) -> LiveStatus:
+        """As `Estimation.status`; what is known already if the process is busy or has ended."""
+        if not self._closing and self._failed is None:
+            with suppress(TimeoutError, FglocError):
+                self._status = self._ask("status").result(_STATUS_S)
+        return replace(self._status, dropped=dict(self._dropped + Counter(self._status.dropped)))
+
+    def save(self, path: Path) -> bool:
+        """As `Estimation.save`."""
+        return bool(self._ask("save", path).result())
+
+    def close(self) -> None:
+        """As `Estimation.close`; ends the process too."""
+        with self._changed:
+            if self._closing:
+                return
+            ending = self._ask("close") if self._threads and self._failed is None else None
+            self._closing = True
+            self._changed.notify_all()
+        try:
+            if ending is not None:
+                self._status = ending.result(_END_S)
+        except TimeoutError:
+            raise EstimatorError(
+                f"the process of the estimation did not end within {_END_S:g} s: ended without saving its last state"
+            ) from None
+        finally:
+            self._child.kill()  # it has nothing more to do
+            self._child.wait()
+            for thread in self._threads:
+                thread.join()
+            self._connection.close()
+
+    # --- under the condition ---
+
+    def _queue(self, item: Event | PoseWithCovariance | _Question) -> None:
+        self.check_failed()
+        if self._closing:
+            raise EstimatorError("the live run is closed; make a new Live")
+        self._waiting.append(item)
+        self._changed.notify_all()
+
+    def _drop(self, event: Event) -> None:
+        self._waiting.remove(event)
+        self._images -= isinstance(event, ImageEvent)
+        self._dropped[role_of(event)] += 1
+
+    def _ask(self, method: str, *arguments: Any) -> Future[Any]:
+        """Its answer comes after all that what was put before has led to."""
+        with self._changed:
+            number, answer = next(self._numbers), Future[Any]()
+            self._queue((number, method, arguments))
+            self._asked[number] = answer
+        return answer
+
+    # --- threads ---
+
+    def _send(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closing or self._failed is not None)
+                batch = list(self._waiting)
+                self._waiting.clear()
+                self._images = 0
+            if not batch:
+                return
+            try:
+                self._connection.send(batch)
+            except OSError:  # the process has ended: `_receive` tells
+                return
+
+    def _receive(self, outlet: Outlet) -> None:
+        while True:
+            try:
+                kind, *content = self._connection.recv()
+            except (EOFError, OSError):
+                return self._ended()
+            if kind == "built":
+                outlet.built(*content)
+            elif kind == "estimated":
+                outlet.estimated(*content)
+            elif kind == "failed":
+                self._fail(*content)
+            else:
+                number, result = content
+                with self._changed:
+                    answer = self._asked.pop(number, None)
+                if answer is None:  # the run has failed meanwhile
+                    continue
+                if isinstance(result, Exception):
+                    answer.set_exception(result)
+                else:
+                    answer.set_result(result)
+
+    def _ended(self) -> None:
+        code = self._child.wait()
+        if not self._closing:
+            self._fail(
+                EstimatorError(
+                    f"the process of the estimation ended with exit code {code} (negative: the signal that ended it); "
+                    "start again: with a state file (`--state`) it goes on from there"
+                )
+            )
+
+    def _fail(self, error: FglocError) -> None:
+        with self._changed:
+            self._failed = self._failed or error
+            asked, self._asked = self._asked, {}
+            self._changed.notify_all()
+        for answer in asked.values():
+            answer.set_exception(error)
+
+
+# --- The other process ------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Of the child process: do what comes through the pipe."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager ends the parent too, which ends this one in order
+    _Worker(Connection(int(sys.argv[1]))).run()
+
+
+class _Worker:
+    """Feeds an `Estimation` from a pipe, and answers through it."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()
+
+    def built(self, parts: MotionParts) -> None:
+        self._tell("built", parts)
+
+    def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
+        self._tell("estimated", anchor, estimate)
+
+    def failed(self, error: FglocError) -> None:
+        self._tell("failed", error)
+
+    def run(self) -> None:
+        """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
+        try:
+            estimation = Estimation(self._connection.recv(), self)
+            with ThreadPoolExecutor(_ANSWERING) as pool:
+                while True:
+                    for item in self._connection.recv():
+                        if isinstance(item, tuple):
+                            pool.submit(self._answer, estimation, *item)
+                        else:
+                            self._use(estimation, item)
+        except (EOFError, OSError):
+            os._exit(1)
+        except Exception as error:
+            self._tell("failed", _told(error))  # the settings cannot be used
+
+    def _use(self, estimation: Estimation, item: Event | PoseWithCovariance) -> None:
+        with suppress(FglocError):  # it has failed, and has told so
+            if isinstance(item, PoseWithCovariance):
+                estimation.reset_pose(item)
+            else:
+                estimation.put(item)
+
+    def _answer(self, estimation: Estimation, number: int, method: str, arguments: tuple[Any, ...]) -> None:
+        try:
+            result = getattr(estimation, method)(*arguments)
+            if method == "close":
+                result = estimation.status()
+        except Exception as error:
+            result = _told(error)
+        self._tell("answer", number, result)
+
+    def _tell(self, *message: Any) -> None:
+        with self._sending:
+            self._connection.send(message)
+
+
+def _told(error: Exception) -> FglocError:
+    return error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")
