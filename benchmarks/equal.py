@@ -15,7 +15,8 @@ from typing import Annotated
 import typer
 
 from fgloc.config import load_config
-from fgloc.runner import RunMode, run
+from fgloc.replay.options import RunMode
+from fgloc.runner import run
 from fgloc.types import RunResult
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"

@@ -32,7 +32,8 @@ from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
 from fgloc.diagnosis.gross_mistakes import inspect_all
 from fgloc.errors import FglocError
-from fgloc.runner import RunMode, run
+from fgloc.replay.options import RunMode
+from fgloc.runner import run
 
 RECORDINGS = 3
 QUICK = ("size_0.95", "joints_swapped", "dictionary")

@@ -19,13 +19,13 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parent.parent / "fgloc"
 DECIDING = (
     "localizer.py",
-    "smoothing.py",
+    "replay/smoothing.py",
     "stats.py",
     "robust/*.py",
     "relocalization/*.py",
     "sensors/learned/joint.py",
     "sensors/gyro/rate.py",
-    *(f"graph/{name}.py" for name in ("batch", "isam2", "joint")),
+    *(f"graph/{name}.py" for name in ("batch", "isam2", "joint", "noise_budget")),
 )
 SECTIONS = ("WeightsConfig", "GateConfig", "EstimatorConfig")
 _NOT_COUNTED = (0.0, 0.5, 1.0, 2.0)

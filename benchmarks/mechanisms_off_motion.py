@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from benchmarks.mechanisms_switch import (
@@ -14,22 +15,24 @@ from benchmarks.mechanisms_switch import (
     Switch,
     called,
 )
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.types import FloatArray
 
 _TRUST = "fgloc.robust.motion_faults"
 _GYRO = "fgloc.sensors.gyro.rate"
+_BUDGET = "fgloc.graph.noise_budget"
 
 
 def _unscaled(real: Function) -> Function:
-    return lambda self, readings, off=None, scale=1.0: real(self, readings, off)
+    return lambda budget, readings, rules: real(replace(budget, scale=1.0), readings, rules)
 
 
-def _scaled(result: Any, before: Any, sources: Any, readings: Any, off: Any = None, scale: float = 1.0) -> bool:
-    return scale > 1.0
+def _scaled(result: Any, before: Any, budget: NoiseBudget, *args: Any) -> bool:
+    return budget.scale > 1.0
 
 
-def _without_wheels(result: Any, before: Any, sources: Any, readings: Any, off: Any = None, *args: Any) -> bool:
-    return "wheels" in (off or {})
+def _without_wheels(result: Any, before: Any, budget: NoiseBudget, *args: Any) -> bool:
+    return "wheels" in budget.rejected
 
 
 def _learned_alone(real: Function) -> Function:
@@ -55,9 +58,9 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_scale",
         "Covariances of motion sources that disagree are scaled before the alarm.",
-        ("robust/glr_test.py", "robust/motion_fusion.py"),
-        (Switch("fgloc.robust.motion_fusion:MotionFusion.combine", _unscaled),),
-        Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _scaled),
+        ("robust/glr_test.py", "graph/noise_budget.py"),
+        (Switch(f"{_BUDGET}:NoiseBudget.combine", _unscaled),),
+        Probe(f"{_BUDGET}:NoiseBudget.combine", _scaled),
         batch=True,
     ),
     Mechanism(
@@ -71,17 +74,17 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
-        ("robust/motion_noise.py",),
-        (Switch("fgloc.robust.motion_noise:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
-        Probe("fgloc.robust.motion_fusion:MotionFusion.combine", _without_wheels),
+        ("graph/noise_budget.py",),
+        (Switch(f"{_BUDGET}:_LEARNED_BESIDE_WRONG_WHEELS", Constant(1.0)),),
+        Probe(f"{_BUDGET}:NoiseBudget.combine", _without_wheels),
         batch=True,
     ),
     Mechanism(
         "onset_reweighing",
         "Steps between the likeliest onset of a fault and its detection are weighed again.",
-        ("localizer.py", "graph/estimator.py", "graph/isam2.py"),
-        (Switch("fgloc.localizer:Localizer._revise", Returns([])),),
-        Probe("fgloc.localizer:Localizer._revise", lambda result, _, self, k, trust: trust.span > 1),
+        ("robust/motion_judge.py", "graph/estimator.py", "graph/isam2.py"),
+        (Switch("fgloc.robust.motion_judge:MotionJudge._revise", Returns(())),),
+        Probe("fgloc.robust.motion_judge:MotionJudge._revise", lambda result, _, self, verdict: verdict.span > 1),
         batch=True,
     ),
     Mechanism(
@@ -94,15 +97,15 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "doubtful_wheels",
         "Flagged wheels that nothing replaces stay, with a covariance that allows for the fault.",
-        ("robust/motion_fusion.py",),
-        (Switch("fgloc.robust.motion_fusion:MotionFusion._doubtful", Argument(1)),),
-        Probe("fgloc.robust.motion_fusion:MotionFusion._doubtful", called),
+        ("graph/noise_budget.py",),
+        (Switch(f"{_BUDGET}:NoiseBudget._with_slip", Argument(1)),),
+        Probe(f"{_BUDGET}:NoiseBudget._with_slip", called),
         batch=True,
     ),
     Mechanism(
         "source_correlation",
         "Errors of wheels and learned motion are taken as correlated, as calibrated.",
-        ("sensors/learned/joint.py", "robust/motion_fusion.py"),
+        ("sensors/learned/joint.py", "graph/noise_budget.py"),
         (
             Switch("fgloc.sensors.learned.joint:JointCalibration.decorrelate", _learned_alone),
             Switch("fgloc.sensors.learned.joint:JointCalibration.difference_cov", _summed),

@@ -102,7 +102,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "overruled_prediction",
         "Refused sightings of two landmarks that agree on a place nearby widen the motion and are fused.",
-        ("robust/association.py", "localizer.py"),
+        ("robust/association.py", "robust/sighting_judge.py"),
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
         batch=True,
@@ -110,9 +110,9 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "blur_noise",
         "Noise of corners grows with the speed of the image.",
-        ("sensors/landmarks.py", "graph/corner_batch.py"),
-        (Switch("fgloc.sensors.landmarks:LandmarkSensor._corner", _unblurred),),
-        Probe("fgloc.sensors.landmarks:LandmarkSensor._corner", called),
+        ("sensors/markers/measure.py", "graph/corner_batch.py"),
+        (Switch("fgloc.sensors.markers.measure:CornerMeasurer._corner", _unblurred),),
+        Probe("fgloc.sensors.markers.measure:CornerMeasurer._corner", called),
         batch=True,
     ),
 )

@@ -17,7 +17,7 @@ from benchmarks.mechanisms_switch import (
 )
 
 _GATE = "fgloc.robust.association"
-_SEARCH = "fgloc.relocalization.global_search"
+_SEARCH = "fgloc.relocalization.place_search"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
@@ -39,7 +39,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "place_search",
         "While every sighting is refused, another place that explains them is searched for on the map.",
-        ("relocalization/tracking_state.py", "relocalization/global_search.py"),
+        ("relocalization/tracking_state.py", "relocalization/global_search.py", "relocalization/place_search.py"),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
         batch=True,
@@ -55,7 +55,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "lift",
         "A robot that rises, or turns though it stands, is carried: no source knows its motion.",
-        ("robust/lift.py", "localizer.py"),
+        ("robust/lift.py", "robust/motion_judge.py"),
         (Switch("fgloc.robust.lift:LiftMonitor.observe", Returns([])),),
         Probe("fgloc.robust.lift:LiftMonitor.observe", something),
         batch=True,
@@ -63,7 +63,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "given_pose_held",
         "A given first pose holds against sightings that contradict it from the start.",
-        ("relocalization/tracking_state.py", "localizer.py"),
+        ("relocalization/tracking_state.py", "robust/sighting_judge.py"),
         (Switch(f"{_WHERE}.keeps_initial_pose", _never),),
         Probe(f"{_WHERE}.gate_initial_pose", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,
@@ -78,14 +78,14 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "start_leave_one_out",
         "A place found from beacons must hold without any one of them.",
-        ("relocalization/global_search.py",),
-        (Switch(f"{_SEARCH}:GlobalSearch._checked", Returns(True)),),
-        Probe(f"{_SEARCH}:GlobalSearch._checked", lambda checked, *_: not checked),
+        ("relocalization/place_search.py",),
+        (Switch(f"{_SEARCH}:PlaceSearch._checked", Returns(True)),),
+        Probe(f"{_SEARCH}:PlaceSearch._checked", lambda checked, *_: not checked),
     ),
     Mechanism(
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
-        ("relocalization/global_search.py",),
+        ("relocalization/place_search.py",),
         (Switch(f"{_SEARCH}:_TRIMS", Constant(0)),),
     ),
     Mechanism(
@@ -120,9 +120,9 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
     Mechanism(
         "batch_learned_again",
         "Batch: the learned motion is evaluated again at the smoothed velocities.",
-        ("smoothing.py",),
-        (Switch("fgloc.smoothing:_measure_again", Returns({})),),
-        Probe("fgloc.smoothing:_measure_again", something),
+        ("replay/smoothing.py",),
+        (Switch("fgloc.replay.smoothing:_measure_again", Returns({})),),
+        Probe("fgloc.replay.smoothing:_measure_again", something),
         batch=True,
     ),
 )

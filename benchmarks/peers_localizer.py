@@ -156,14 +156,14 @@ class Localizer:
 
     def _poses(self, event: CornersEvent) -> list[tuple[FloatArray, float]]:
         """Poses of the base that an image tells, each with the distance of the nearest marker [m]."""
-        seen = [s for s in event.sightings if s.marker_id in self._landmarks]
+        seen = [s for s in event.sightings if s.landmark_id in self._landmarks]
         if self._kind == "marker_poses":
             return [found for s in seen if (found := self._of_marker(s)) is not None]
         found = self._of_all(seen)
         return [] if found is None else [found]
 
     def _of_marker(self, seen: MarkerCorners) -> tuple[FloatArray, float] | None:
-        landmark = self._landmarks[seen.marker_id]
+        landmark = self._landmarks[seen.landmark_id]
         corners = undistort_points(self._camera, seen.corners_px)
         candidates = marker_pose_candidates(self._pinhole, corners, landmark.size_m)
         if not candidates:
@@ -177,7 +177,7 @@ class Localizer:
     def _of_all(self, seen: Sequence[MarkerCorners]) -> tuple[FloatArray, float] | None:
         if not seen:
             return None
-        points = np.concatenate([self._landmarks[s.marker_id].corners() for s in seen])
+        points = np.concatenate([self._landmarks[s.landmark_id].corners() for s in seen])
         pixels = np.concatenate([undistort_points(self._camera, s.corners_px) for s in seen])
         cv2.setRNGSeed(0)
         good, rvec, tvec, inliers = cv2.solvePnPRansac(

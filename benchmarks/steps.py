@@ -28,6 +28,7 @@ from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
@@ -127,7 +128,9 @@ class _Chain:
         model = load_model(_MODEL)
         wheels, landmarks = WheelMotion(config.wheels), LandmarkSensor(config, world.map, world.camera, None)
         learned = LearnedMotion(model, config.motion)
-        self.localizer = Localizer(config, world.map, wheels, landmarks, learned, model.joint)
+        self.localizer = Localizer(
+            config, world.map, MotionSensors(wheels, learned, model.joint), PoseSensors(landmarks)
+        )
         self.localizer.stopwatch = Stopwatch(keep=keep_times)
         self.config = config
 

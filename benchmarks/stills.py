@@ -85,7 +85,7 @@ class Outcome:
 def outcomes(folder: Path) -> Iterator[Outcome]:
     """Detect in each photograph below the folder marker_images."""
     for still in STILLS:
-        found = Counter(s.marker_id for s in _detector(still, folder).detect(_image(folder / still.file)).sightings)
+        found = Counter(s.landmark_id for s in _detector(still, folder).detect(_image(folder / still.file)).sightings)
         listed = Counter(still.ids)
         yield Outcome(still, tuple((listed - found).elements()), tuple((found - listed).elements()))
 

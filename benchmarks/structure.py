@@ -97,7 +97,8 @@ def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 def is_command(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     """Whether it is an entry point of a command line: each parameter is annotated as an option or argument of typer."""
     return all(
-        a.annotation and re.search("Annotated|Option|Bag", ast.unparse(a.annotation)) for a in function.args.args
+        a.annotation and re.search(r"Annotated|Option|Bag|\bOut\b", ast.unparse(a.annotation))
+        for a in function.args.args
     )
 
 

@@ -15,6 +15,7 @@ from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
 from fgloc.sensors.base import Sensor
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.source import LearnedMotion
@@ -45,9 +46,9 @@ class Assembly:
     @property
     def rejections(self) -> Counter[str]:
         """Everything refused by any part so far, by reason."""
-        localizer, gyro = self.localizer, self.localizer.sources.gyro
+        localizer, gyro = self.localizer, self.localizer.motion.sources.gyro
         counters = [self.gate.rejections, self.detections.rejections, self.stepper.rejections, self.wheels.rejections]
-        counters += [self.landmarks.rejections, localizer.rejections, localizer.association.rejections]
+        counters += [self.landmarks.rejections, localizer.rejections]
         counters += [] if self.learned is None else [self.learned.rejections]
         counters += [] if gyro is None else [gyro.rejections]
         total: Counter[str] = Counter()
@@ -101,6 +102,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
     gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
+    motion = MotionSensors(wheels, learned, joint, gyro)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen_by: Role = "sightings" if setup.detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
@@ -117,7 +119,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
         camera=camera,
         learned=learned,
         sensors=sensors,
-        localizer=Localizer(config, landmark_map, wheels, landmarks, learned, joint, keep_all, gyro, sensors),
+        localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
         diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up),
         notes=setup.notes,
     )

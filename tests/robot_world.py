@@ -14,6 +14,7 @@ from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
@@ -172,13 +173,16 @@ def _within(t: float, spans: Iterable[tuple[float, float]]) -> bool:
 class Chain:
     """Gate, stepper and localizer, joined as the runner joins them."""
 
-    def __init__(self, settings: Config, landmark_map: LandmarkMap | None, learned=None, keep_all=False) -> None:
+    def __init__(self, settings: Config, landmark_map: LandmarkMap | None, keep_all=False, **motion) -> None:
+        """``motion``: what `MotionSensors` has beside the wheels."""
         self.gate = EventValidator(settings.gate, None if landmark_map is None else set(landmark_map.landmarks))
         self.stepper = KeyframeBuilder(settings.keyframes, settings.gate, settings.estimator.lag_s)
         self.wheels = WheelMotion(settings.wheels)
         markers = landmark_map is not None and any(m.size_m for m in landmark_map.landmarks.values())
         sensor = LandmarkSensor(settings, landmark_map, CAMERA if markers else None, None)
-        self.localizer = Localizer(settings, landmark_map, self.wheels, sensor, learned, None, keep_all)
+        self.localizer = Localizer(
+            settings, landmark_map, MotionSensors(self.wheels, **motion), PoseSensors(sensor), keep_all
+        )
         self.estimates: list[Estimate] = []
         self.steps = 0
 

@@ -134,14 +134,14 @@ def test_a_sensor_without_transform_is_taken_to_be_at_the_base_and_that_is_said(
 def test_the_learned_model_is_loaded_only_if_it_is_used(tmp_path, motion_model):
     used = build(tmp_path, {"motion": {"model": motion_model}})
     assert used.learned is not None
-    assert used.localizer.sources.joint is not None
+    assert used.localizer.motion.sources.rules.joint is not None
     (tmp_path / "again").mkdir()
     unused = build(tmp_path / "again", {"motion": {"model": motion_model, "use": False}})
     assert unused.learned is None
     (tmp_path / "third").mkdir()
     apart = build(tmp_path / "third", {"motion": {"model": motion_model, "correlation": "independent"}})
     assert apart.learned is not None
-    assert apart.localizer.sources.joint is None
+    assert apart.localizer.motion.sources.rules.joint is None
 
 
 @pytest.fixture

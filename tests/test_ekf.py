@@ -64,7 +64,7 @@ def test_wrong_sightings_do_not_pass_the_gates(kind):
         return event
 
     chain, estimates = follow("ekf", world_map, (misread(e) for e in world.events()))
-    assert chain.localizer.association.rejections["sightings.gate"] > 10
+    assert chain.localizer.rejections["sightings.gate"] > 10
     assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates) < 0.2
 
 

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
-from robot_world import CAMERA, SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
+from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
 
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
-from fgloc.localizer import Localizer
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Kinematics
 from fgloc.sensors.learned.source import LearnedMotion
@@ -52,16 +50,13 @@ def failing(world: World, tell, witness: str):
 def chain(tmp_path, witness: str, keep_all: bool = False, kinematics: Kinematics | None = None, **weights) -> Chain:
     settings = config(weights=weights)
     settings = settings.model_copy(update={"wheels": settings.wheels.model_copy(update={"track": TRACK})})
-    made, world_map, learned = Chain(settings, room()), room(), None
+    learned = None
     if witness == "learned":  # the robot does what it is told to
         card = make_card("naive").model_copy(update={"kinematics": kinematics or Kinematics()})
         save_model(tmp_path / "m.safetensors", make_tensors(card, np.random.default_rng(0)), card)
         learned = LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
     gyro = Gyro(GyroConfig()) if witness == "gyro" else None
-    camera = CAMERA
-    sensor = LandmarkSensor(settings, world_map, camera, None)
-    made.localizer = Localizer(settings, world_map, made.wheels, sensor, learned, None, keep_all, gyro)
-    return made
+    return Chain(settings, room(), keep_all, learned=learned, gyro=gyro)
 
 
 def in_the_dark(world, estimates) -> list[float]:

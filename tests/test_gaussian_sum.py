@@ -142,5 +142,5 @@ def test_sightings_within_a_metre_begin_where_the_robot_is_and_accuse_nobody(see
     estimates = chain.run(near(world, 1.0))
     first = [e for e in estimates if e.mode is not Mode.UNCONFIRMED]
     assert position_error(first[0], world.truth(first[0].stamp_ns)) < 0.3
-    assert not chain.localizer.association.modes.displacements
+    assert not chain.localizer.sightings.modes.displacements
     assert np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates]) / 3.0 < 2.0

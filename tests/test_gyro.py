@@ -163,7 +163,7 @@ def test_the_variance_over_a_blind_time_does_not_depend_on_how_it_is_cut():
     for dt in (0.05, 0.2, 1.0):
         gyro, variance = known(Gyro(config), 0.001, 0.003), 0.0
         for i in range(round(10.0 / dt)):
-            variance += gyro.measure(step(i * dt, (i + 1) * dt, lambda t: 0.2), DRIVING, blind_s=i * dt).variance
+            variance += gyro.measure(step(i * dt, (i + 1) * dt, lambda t: 0.2), DRIVING, since_fix_s=i * dt).variance
         sums.append(variance)
     white, bias = config.yaw_per_sqrt_s**2 * 10.0, (0.003 * 10.0) ** 2
     assert sums == pytest.approx([white + bias] * 3, rel=1e-6)
@@ -176,7 +176,9 @@ def test_the_variance_covers_what_a_wrong_bias_does():
         bias = rng.normal(0.0, sigma)
         gyro, yaw, variance = known(Gyro(GyroConfig(bias_walk=0.0)), 0.0, sigma), 0.0, 0.0
         for i in range(20):
-            turn = gyro.measure(step(0.5 * i, 0.5 * i + 0.5, lambda t, b=bias: b, hz=20.0), DRIVING, blind_s=0.5 * i)
+            turn = gyro.measure(
+                step(0.5 * i, 0.5 * i + 0.5, lambda t, b=bias: b, hz=20.0), DRIVING, since_fix_s=0.5 * i
+            )
             yaw, variance = yaw + turn.yaw, variance + turn.variance
         values.append(yaw**2 / variance)
     assert 0.6 < np.mean(values) < 1.5

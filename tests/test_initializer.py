@@ -48,6 +48,7 @@ class Search:
     """An initializer fed with steps of equal motion."""
 
     def __init__(self, the_map: LandmarkMap, **sections) -> None:
+        self.map = the_map
         self.initializer = GlobalSearch(config(**sections), the_map, LandmarkFactors(the_map))
         self.pose, self.stamp_ns = TRUTH, 0
 
@@ -125,7 +126,7 @@ def test_marker_poses_give_the_pose_if_their_yaw_is_used():
 
 
 def search_map(search: Search, number: int) -> Landmark:
-    return search.initializer._map.landmarks[number]
+    return search.map.landmarks[number]
 
 
 def test_one_wrong_sighting_among_many_does_not_spoil_the_place():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from exact import EXACT, exact
 from robot_world import (
-    CAMERA,
     NOISE,
     SPEED,
     START_NS,
@@ -33,11 +32,10 @@ from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationB
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.localizer import Localizer
-from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -249,7 +247,8 @@ def readings_with(theta: dict[str, float], later_s: float = 0.0, **gains):
     installation = Installation(dict.fromkeys(theta, 0.01))
     factors = LandmarkFactors(None, installation)
     factors.believed = replace(factors.believed, mean=np.array(list(theta.values())))
-    some = MotionFusion(settings, WheelMotion(settings.wheels), gyro=Gyro(GyroConfig()), factors=factors)
+    sensors = MotionSensors(WheelMotion(settings.wheels), gyro=Gyro(GyroConfig()))
+    some = MotionSources(settings, sensors, factors)
     some.read(turning(0, later_s=later_s))
     return some.read(turning(1, later_s=later_s))
 
@@ -344,12 +343,7 @@ class Wobbling(World):
 
 def found_in(world: World, settings: Config, name: str, gyro: bool = True):
     """What is found of a parameter and its sigma, online and by the batch; the chain and its estimates."""
-    chain = Chain(settings, world.map, keep_all=True)
-    markers = any(m.size_m for m in world.map.landmarks.values())
-    sensor = LandmarkSensor(settings, world.map, CAMERA if markers else None, None)
-    chain.localizer = Localizer(
-        settings, world.map, chain.wheels, sensor, None, None, True, Gyro(settings.gyro) if gyro else None
-    )
+    chain = Chain(settings, world.map, keep_all=True, gyro=Gyro(settings.gyro) if gyro else None)
     estimates = chain.run(world.events())
     factors = chain.localizer.factors
     online = factors.believed
@@ -400,7 +394,7 @@ def test_a_marker_that_hangs_elsewhere_by_centimetres_is_found():
     for name, truth in (("map.7.x_m", 0.012), ("map.7.y_m", -0.01)):
         pairs, prior, chain, _ = found_in(world, settings, name, gyro=False)
         check_found(pairs, truth, prior)
-    assert not chain.localizer.association.modes.displacements
+    assert not chain.localizer.sightings.modes.displacements
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -444,4 +438,4 @@ def test_an_exact_installation_runs_without_states(kind, landmarks):
     solver = BatchSmoother(localizer.estimator.log, localizer.factors, BatchConfig(), 0.9999)
     assert len(solver.installed().mean) == 0
     assert np.isfinite(solver.result().covs).all()
-    assert set(EXACT) <= set(type(localizer.config).model_fields)
+    assert set(EXACT) <= set(Config.model_fields)

@@ -55,7 +55,7 @@ def of_beacons(world: LandmarkMap, shown: LandmarkMap | None, seed: int, **landm
 
 
 def named(chain: Chain) -> dict[int, np.ndarray]:
-    return chain.localizer.association.modes.displacements
+    return chain.localizer.sightings.modes.displacements
 
 
 @pytest.mark.parametrize("landmark_id", [0, 5])
@@ -65,7 +65,7 @@ def test_fault_51_a_beacon_moved_by_less_than_a_sighting_shows_is_named_and_its_
     assert named(chain)[landmark_id] == pytest.approx((0.4, -0.3), abs=0.15)
     (told,) = [d for e in estimates for d in e.decisions if d.reason == "landmark_moved"]
     assert told.landmark_id == landmark_id
-    assert chain.localizer.association.rejections["sightings.gate"] < 5  # it was not the gate that found it
+    assert chain.localizer.rejections["sightings.gate"] < 5  # it was not the gate that found it
     late = [position_error(e, made.truth(e.stamp_ns)) for e in estimates if e.stamp_ns > told.stamp_ns]
     assert np.mean(late) < 0.07
     log = chain.localizer.estimator.log.keyframes.values()
@@ -105,7 +105,7 @@ def test_fault_49_markers_that_are_misread_name_nobody():
     world = room()
     chain = Chain(exact(), world)
     chain.run(misread(World(world, seed=5, rate=5).events(), sorted(world.landmarks), 0.3, seed=5))
-    assert chain.localizer.association.rejections["sightings.misread"] > 20
+    assert chain.localizer.rejections["sightings.misread"] > 20
     assert not named(chain)
 
 
@@ -164,7 +164,7 @@ def test_what_a_displacement_does_to_the_estimate_is_predicted():
     there, here = Chain(settings, moved(world, 3, dx=shift[0], dy=shift[1])), Chain(settings, world)
     events = made.events()
     right, wrong = there.run(events)[-1], here.run(events)[-1]
-    modes = here.localizer.association.modes
+    modes = here.localizer.sightings.modes
     error = se2.log(se2.between(wrong.pose, right.pose))
     told = modes.sensitivity(3)[:3] @ shift
     assert np.abs(error).max() > 1e-3

@@ -274,7 +274,7 @@ def test_a_gyro_that_begins_later_joins_without_losing_the_pose():
     with live_in(world) as live:
         made = feed(live, sorted(events, key=lambda e: e.received_ns))
         status = live.status()
-        assert live._estimation.run.parts.localizer.sources.gyro is not None
+        assert live._estimation.run.parts.localizer.motion.sources.gyro is not None
     after = [e for e in made if e.stamp_ns > START_NS + 4_000_000_000]
     assert {e.mode for e in after} == {Mode.OK}
     assert errors(world, after).max() < 0.06

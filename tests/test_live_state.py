@@ -129,15 +129,15 @@ def test_what_was_learned_goes_on(world, tmp_path):
     path, roles = tmp_path / "state.json", (*ROLES, "imu")
     with live_in(world, state=path, roles=roles) as live:
         feed(live, sorted(events, key=lambda e: e.received_ns))
-        live._estimation.run.parts.localizer.association.modes.displacements[13] = np.array([0.4, -0.1])
-        gyro = live._estimation.run.parts.localizer.sources.gyro
+        live._estimation.run.parts.localizer.sightings.modes.displacements[13] = np.array([0.4, -0.1])
+        gyro = live._estimation.run.parts.localizer.motion.sources.gyro
         installed = live._estimation.run.parts.localizer.estimator.installed
     assert gyro.bias > 0.02
     with live_in(world, state=path, roles=roles) as live:
         feed(live, [e for e in events if (e.received_ns - START_NS) * 1e-9 < 0.3])
         parts = live._estimation.run.parts
-        assert parts.localizer.sources.gyro.bias == pytest.approx(gyro.bias, abs=0.01)
-        assert parts.localizer.association.modes.excludes(13)
+        assert parts.localizer.motion.sources.gyro.bias == pytest.approx(gyro.bias, abs=0.01)
+        assert parts.localizer.sightings.modes.excludes(13)
         now = np.diag(parts.localizer.estimator.installed.cov)
         assert (now <= np.diag(installed.cov) * (1.0 + 1e-6) + 1e-12).all()
 

@@ -120,7 +120,7 @@ def test_an_unknown_map_is_estimated_up_to_the_first_pose():
     errors = [position_error(e, se2.between(start, world.truth(e.stamp_ns))) for e in estimates]
     assert np.mean(errors) < 0.1
     sightings = chain.localizer.counts["range_bearing"]
-    early = chain.localizer.association.rejections["sightings.seen_too_seldom"]
+    early = chain.localizer.rejections["sightings.seen_too_seldom"]
     assert early == (settings.landmarks.min_sightings - 1) * len(truth)
     assert sightings + early == 2 * 18 * 10
 
@@ -215,7 +215,7 @@ def test_fault_33_a_network_that_returns_nan_leaves_the_wheels(tmp_path):
     save_model(tmp_path / "wild.safetensors", tensors, card)
     learned = LearnedMotion(load_model(tmp_path / "wild.safetensors"), MotionConfig())
     world = World(room(), seconds=6.0)
-    with_nan, without = Chain(config(), room(), learned), Chain(config(), room())
+    with_nan, without = Chain(config(), room(), learned=learned), Chain(config(), room())
     a, b = with_nan.run(world.events()), without.run(world.events())
     assert np.allclose([e.pose for e in a], [e.pose for e in b], atol=1e-6)  # the scale of a silent model is a state
     assert with_nan.localizer.counts["learned"] == 0
@@ -258,10 +258,10 @@ def test_fault_51_a_moved_marker_among_others_is_refused_and_does_no_harm():
     refused = [d.landmark_id for e in estimates for d in e.decisions if d.reason and d.kind == "corners"]
     assert refused.count(2) > 50
     assert len(refused) - refused.count(2) < 4  # one in ten thousand
-    counts = chain.localizer.association.rejections
+    counts = chain.localizer.rejections
     assert sum(counts[f"sightings.{why}"] for why in ("gate", "contradicts_others", "quarantined")) == len(refused)
     assert counts["sightings.quarantined"] > 40
-    moved_by = chain.localizer.association.modes.displacements
+    moved_by = chain.localizer.sightings.modes.displacements
     assert list(moved_by) == [2]
     assert np.allclose(moved_by[2], (0.0, 0.4), atol=0.05)
     assert any("marker 2 does not stand where" in note for note in chain.localizer.notes)

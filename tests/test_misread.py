@@ -59,7 +59,7 @@ def test_a_misread_marker_is_used_as_what_hangs_there():
     told = [d for e in estimates for d in e.decisions]
     wrong = [d for d in told if d.reason == "misread"]
     assert len(wrong) > 100
-    assert chain.localizer.association.rejections["sightings.misread"] == len(wrong)
+    assert chain.localizer.rejections["sightings.misread"] == len(wrong)
     believed = {(d.stamp_ns, d.landmark_id) for d in told if d.kind == "corners" and not d.reason}
     hung = {(stamp, i) for (stamp, _), were in truth.items() for i in were}
     assert len(believed - hung) <= 0.01 * len(believed)  # what is believed was seen

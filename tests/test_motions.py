@@ -17,15 +17,15 @@ from fgloc.config import Config, GyroConfig, MotionConfig
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse, predict
-from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.localizer import Localizer
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.decision_log import motion_decisions
 from fgloc.robust.motion_faults import FaultVerdict
-from fgloc.robust.motion_fusion import MotionFusion
-from fgloc.robust.motion_noise import with_noise
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.robust.source_difference import source_difference
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
@@ -52,9 +52,13 @@ def learned_motion(tmp_path, kind="displacement", **card) -> LearnedMotion:
     return LearnedMotion(load_model(tmp_path / "m.safetensors"), MotionConfig())
 
 
-def sources(learned=None, joint=None, gyro=None, **sections) -> MotionFusion:
+def sources(learned=None, joint=None, **sections) -> MotionSources:
     settings = Config.model_validate(sections)
-    return MotionFusion(settings, WheelMotion(settings.wheels), learned, joint, gyro)
+    return MotionSources(settings, MotionSensors(WheelMotion(settings.wheels), learned, joint))
+
+
+def combined(some: MotionSources, readings: MotionReadings, *budget, **named) -> list[MotionMeasurement]:
+    return NoiseBudget(*budget, **named).combine(readings, some.rules)
 
 
 def names(motions) -> list[str]:
@@ -64,7 +68,7 @@ def names(motions) -> list[str]:
 def test_the_pair_says_what_the_joint_gaussian_says(tmp_path):
     """Of all unbiased combinations of two measurements with correlated errors the best one, to the last digit."""
     both = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
-    motion, cov = fuse(both.combine(MotionReadings(WHEELS, LEARNED)))
+    motion, cov = fuse(combined(both, MotionReadings(WHEELS, LEARNED)))
     # the conditional of the joint, written out: x from [z_w; z_n] = [I; I] x + [e_w; e_n]
     P = np.linalg.inv(np.block([[W, C.T], [C, N]]))
     H = np.vstack([np.eye(3), np.eye(3)])
@@ -73,7 +77,7 @@ def test_the_pair_says_what_the_joint_gaussian_says(tmp_path):
     expected = se2.compose(WHEELS.motion, se2.exp(expected_cov @ H.T @ P @ np.concatenate([np.zeros(3), d])))
     assert motion == pytest.approx(expected, abs=1e-12)
     assert cov == pytest.approx(expected_cov, rel=1e-9)
-    independent, too_small = fuse(sources(learned_motion(tmp_path)).combine(MotionReadings(WHEELS, LEARNED)))
+    independent, too_small = fuse(combined(sources(learned_motion(tmp_path)), MotionReadings(WHEELS, LEARNED)))
     assert np.linalg.det(too_small) < 0.7 * np.linalg.det(expected_cov)
     assert np.abs(independent - expected).max() > 1e-4
 
@@ -89,7 +93,7 @@ def test_the_pair_is_honest_over_samples(tmp_path):
             replace(LEARNED, motion=se2.compose(truth, se2.exp(e[3:]))),
         )
         for name, which in made.items():
-            motion, cov = fuse(which.combine(readings))
+            motion, cov = fuse(combined(which, readings))
             error = se2.log(se2.between(motion, truth))
             values[name].append(error @ np.linalg.solve(cov, error))
     low, high = chi2.ppf([0.001, 0.999], 3 * 400)
@@ -100,44 +104,44 @@ def test_the_pair_is_honest_over_samples(tmp_path):
 def test_what_enters_when_a_source_is_not_believed(tmp_path):
     all_say = MotionReadings(WHEELS, LEARNED, GYRO)
     some = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
-    assert names(some.combine(all_say)) == ["wheels", "learned", "gyro"]
-    dead = some.combine(all_say, {"wheels": "frozen"})
+    assert names(combined(some, all_say)) == ["wheels", "learned", "gyro"]
+    dead = combined(some, all_say, {"wheels": "frozen"})
     assert names(dead) == ["learned", "gyro"]
     assert dead[0].motion == pytest.approx(LEARNED.motion)  # plain: there is nothing left that it is correlated with
     assert dead[0].cov == pytest.approx(4.0 * LEARNED.cov)  # what makes wheels wrong is not all in a model
-    without = some.combine(all_say, {"learned": "distrusted"})
+    without = combined(some, all_say, {"learned": "distrusted"})
     assert names(without) == ["wheels", "gyro"]
     assert without[0] is WHEELS
-    assert names(some.combine(all_say, {"gyro": "distrusted"})) == ["wheels", "learned"]
+    assert names(combined(some, all_say, {"gyro": "distrusted"})) == ["wheels", "learned"]
 
 
 def test_sources_that_disagree_are_known_less_well_together(tmp_path):
     pair = MotionReadings(WHEELS, LEARNED)
     some = sources(learned_motion(tmp_path), JointCalibration(W, N, C))
-    motion, cov = fuse(some.combine(pair, scale=3.0))
-    as_usual, usual = fuse(some.combine(pair))
+    motion, cov = fuse(combined(some, pair, scale=3.0))
+    as_usual, usual = fuse(combined(some, pair))
     assert cov == pytest.approx(3.0 * usual)
     assert motion == pytest.approx(as_usual)  # between the two as before
-    wheels, learned = sources(learned_motion(tmp_path)).combine(pair, scale=100.0)
+    wheels, learned = combined(sources(learned_motion(tmp_path)), pair, scale=100.0)
     assert wheels.cov == pytest.approx(100.0 * WHEELS.cov)
     assert learned.cov == pytest.approx(4.0 * LEARNED.cov)  # it is the wheels that slip
 
 
 def test_wheels_that_alone_know_the_way_are_kept_with_room_for_a_slip():
-    kept = sources().combine(MotionReadings(WHEELS, None, GYRO), {"wheels": "slip"})
+    kept = combined(sources(), MotionReadings(WHEELS, None, GYRO), {"wheels": "slip"})
     assert names(kept) == ["wheels", "gyro"]
     assert (np.diag(kept[0].cov) > 10.0 * np.diag(W)).all()
     assert kept[1].motion == pytest.approx([*WHEELS.motion[:2], GYRO.motion[2]])
     _, cov = fuse(kept)
     assert cov[2, 2] < 1.1e-5  # the gyro knows the turn still
-    assert sources().combine(MotionReadings(None, None, GYRO)) == []  # and no more than that
+    assert combined(sources(), MotionReadings(None, None, GYRO)) == []  # and no more than that
 
 
 def test_a_gyro_that_the_model_reads_does_not_enter_again(tmp_path):
     reading = sources(learned_motion(tmp_path, inputs=("commands", "gyro")))
-    assert names(reading.combine(MotionReadings(WHEELS, LEARNED, GYRO))) == ["wheels", "learned"]
-    assert names(reading.combine(MotionReadings(WHEELS, None, GYRO))) == ["wheels", "gyro"]
-    assert names(reading.combine(MotionReadings(WHEELS, LEARNED, GYRO), {"learned": "distrusted"})) == [
+    assert names(combined(reading, MotionReadings(WHEELS, LEARNED, GYRO))) == ["wheels", "learned"]
+    assert names(combined(reading, MotionReadings(WHEELS, None, GYRO))) == ["wheels", "gyro"]
+    assert names(combined(reading, MotionReadings(WHEELS, LEARNED, GYRO), {"learned": "distrusted"})) == [
         "wheels",
         "gyro",
     ]
@@ -158,11 +162,11 @@ def test_commands_that_stand_in_for_wheels_are_left_out_beside_a_model_that_read
     alone, beside = sources(wheels={"source": "command"}), sources(learned, wheels={"source": "command"})
     for which in (alone, beside):
         which.read(step(0, 0.1))
-    assert names(alone.combine(alone.read(step(1, 0.1)))) == ["wheels"]
+    assert names(combined(alone, alone.read(step(1, 0.1)))) == ["wheels"]
     readings = beside.read(step(1, 0.1))
     assert readings.wheels is not None
-    assert names(beside.combine(readings)) == ["learned"]
-    assert beside.disagreement(readings) is None  # they are no witness of each other
+    assert names(combined(beside, readings)) == ["learned"]
+    assert source_difference(readings, beside) is None  # both are made of the commands
 
 
 def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> PoseWithCovariance:
@@ -172,7 +176,7 @@ def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> PoseWithCovariance:
     if len(factors.installation):
         factors.believed = replace(factors.believed, mean=np.array(off))
     settings = Config.model_validate({"wheels": {"source": "command", "noise": {}}})
-    some = MotionFusion(settings, WheelMotion(settings.wheels), factors=factors)
+    some = MotionSources(settings, MotionSensors(WheelMotion(settings.wheels)), factors)
     belief = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
     for i in range(round(10.0 / dt)):
         readings = some.read(step(i, dt))
@@ -194,29 +198,22 @@ def test_systematic_errors_of_the_wheels_grow_with_the_way_however_it_is_cut():
 
 
 def test_factors_made_again_keep_what_sightings_said_against_them():
-    extra_cov = np.diag([0.01, 0.0, 0.04])
-    frame = Keyframe(
-        1,
-        0,
-        0.1,
-        PoseWithCovariance(np.zeros(3), np.eye(3)),
-        readings=MotionReadings(WHEELS),
-        scale=4.0,
-        extra_cov=extra_cov,
-    )
-    (made,) = sources().combine_again(frame)
-    assert made.cov == pytest.approx(4.0 * W + extra_cov)
-    assert with_noise(WHEELS).cov == pytest.approx(W)
+    overruled_cov = np.diag([0.01, 0.0, 0.04])
+    (made,) = combined(sources(), MotionReadings(WHEELS), scale=4.0, overruled_cov=overruled_cov)
+    assert made.cov == pytest.approx(4.0 * W + overruled_cov)
+    (as_read,) = combined(sources(), MotionReadings(WHEELS))
+    assert as_read.cov == pytest.approx(W)
 
 
 @pytest.mark.parametrize(
-    ("off", "scale", "weights"),
+    ("rejected", "scale", "weights"),
     [({}, 1.0, (1.0, 1.0)), ({}, 9.0, (1 / 9, 1 / 4)), ({}, 0.25, (4.0, 2.0)), ({"wheels": "slip"}, 9.0, (0.0, 1 / 4))],
 )
-def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, off, scale, weights):
+def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, rejected, scale, weights):
     readings = MotionReadings(WHEELS, LEARNED)
-    made = sources(learned_motion(tmp_path)).combine(readings, off, scale)
-    rows = {d.kind: d for d in motion_decisions(3, made, readings, off, "", FaultVerdict(scale=scale))}
+    budget = NoiseBudget(rejected, scale)
+    made = budget.combine(readings, sources(learned_motion(tmp_path)).rules)
+    rows = {d.kind: d for d in motion_decisions(3, made, readings, budget, FaultVerdict(budget))}
     assert (rows["wheels"].weight, rows["learned"].weight) == pytest.approx(weights)
     for m in made:
         given = {"wheels": W, "learned": N}[m.source]
@@ -247,13 +244,9 @@ def blind_covs(tmp_path, max_interval_s: float, kind: str | None, gyro: bool, **
     settings = exact(keyframes={"max_interval_s": max_interval_s}, weights={"adaptive": adaptive}, landmarks=kernels)
     settings = settings.model_copy(update={"wheels": settings.wheels.model_copy(update=wheels)})
     world_map = beacons()
-    chain = Chain(settings, world_map)
     learned = None if kind is None else learned_motion(tmp_path, kind)
     joint = None if learned is None else JointCalibration(np.eye(3), np.eye(3), np.diag([0.4, 0.5, 0.7]))
-    sensor = LandmarkSensor(settings, world_map, None, None)
-    chain.localizer = Localizer(
-        settings, world_map, chain.wheels, sensor, learned, joint, gyro=Gyro(GyroConfig()) if gyro else None
-    )
+    chain = Chain(settings, world_map, learned=learned, joint=joint, gyro=Gyro(GyroConfig()) if gyro else None)
     world = WithGyro(world_map, seconds=12.01, blind=((4.01, 13.0),))
     estimates = chain.run(world.events())
     for source, used in (("learned", learned is not None), ("gyro", gyro)):

@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
-import fgloc.relocalization.global_search
+import fgloc.relocalization.place_search
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.localizer import Localizer
 from fgloc.relocalization.global_search import GlobalSearch
 from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     Estimate,
@@ -61,7 +62,7 @@ class Beacons:
 
 def localizer(**estimator) -> Localizer:
     settings = Config.model_validate({"estimator": estimator})
-    return Localizer(settings, MAP, Wheels(), Beacons())
+    return Localizer(settings, MAP, MotionSensors(Wheels()), PoseSensors(Beacons()))
 
 
 def step(index: int, truth, ids: tuple[int, ...], segment: int = 0, shift_ns: int = 0) -> Step:
@@ -114,7 +115,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     config = Config()
     initializer = GlobalSearch(config, standing, LandmarkFactors(standing))
     fits = []
-    search = fgloc.relocalization.global_search
+    search = fgloc.relocalization.place_search
     monkeypatch.setattr(search, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
     for k in range(40):
         at = step(k, np.zeros(3), ())

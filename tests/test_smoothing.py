@@ -12,9 +12,9 @@ from fgloc import se2
 from fgloc.assembly import assemble
 from fgloc.config import RecordingConfig
 from fgloc.recording.reader import open_recording
+from fgloc.replay.smoothing import smooth_run, smoothed_velocities
 from fgloc.sensors.learned.load import save_model
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.smoothing import smooth_run, smoothed_velocities
 
 STEP_NS = 100_000_000
 
@@ -64,7 +64,7 @@ def replayed(bag, settings):
         if parts.learned is not None:
             listening = Listening(parts.learned.model, settings.motion)
             listening.heard = {}
-            parts.localizer.sources._learned = listening
+            parts.localizer.motion.sources._learned = listening
         for event in recording.events():
             passed = parts.gate.check(event)
             for step in parts.stepper.push(passed) if passed is not None else ():
@@ -79,7 +79,7 @@ def test_only_a_model_that_reads_velocity_is_asked_again_at_the_smoothed_one(tmp
     bag = write_world(tmp_path, World(beacons(), seconds=8.0))
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
     estimates = smooth_run(parts).estimates
-    heard = parts.localizer.sources._learned.heard
+    heard = parts.localizer.motion.sources._learned.heard
     if kind == "displacement":
         assert not heard
         return
@@ -97,7 +97,7 @@ def test_no_velocity_leads_across_a_jump(tmp_path):
     bag = write_world(tmp_path, World(beacons(), seconds=5.0), second)
     parts = replayed(bag, config(motion={"model": tmp_path / "model.safetensors", "correlation": "independent"}))
     estimates = smooth_run(parts).estimates
-    heard = np.array(list(parts.localizer.sources._learned.heard.values()))
+    heard = np.array(list(parts.localizer.motion.sources._learned.heard.values()))
     assert len(heard) == len(estimates) - 2
     assert np.abs(heard[:, 0]).max() < 2 * SPEED
     assert heard[:, 0].min() > 0.0

@@ -33,6 +33,7 @@ from training.config import (
 from training.controls import controls, draw_controls
 from training.data import Run
 from training.export import card_of, tensors_of
+from training.members import new_net
 from training.models import DisplacementNet
 from training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
 
@@ -56,7 +57,7 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
     torch.manual_seed(1)
     network = NetworkConfig(kind=kind, hidden=(32, 32), inputs=inputs, dt_s=0.1)
     config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, leave_one_out=True, network=network)
-    net = training.new_net(network, list(runs.values()))
+    net = new_net(network, list(runs.values()))
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape))
@@ -86,7 +87,7 @@ def test_the_variance_starts_from_the_sizes_of_changes(tmp_path: Path) -> None:
     network = NetworkConfig(
         hidden=(32, 32), inputs=("commands", "effort"), edges_s=(0.0, 0.1, 0.3, 0.5), signal_edges_s=(0.0, 0.1, 0.35)
     )
-    net = training.new_net(network, [run])
+    net = new_net(network, [run])
     assert isinstance(net, DisplacementNet)
     assert isinstance(net.variance, torch.nn.Sequential)
     features = net.samples([run]).features
@@ -99,7 +100,7 @@ def test_the_variance_starts_from_the_sizes_of_changes(tmp_path: Path) -> None:
 
 def test_the_variance_does_not_follow_a_velocity_that_it_was_never_told(runs: dict[str, Run]) -> None:
     network = NetworkConfig(hidden=(16, 16), edges_s=(0.0, 0.1, 0.3, 0.5), inputs=("commands", "velocity"))
-    net = training.new_net(network, list(runs.values()))
+    net = new_net(network, list(runs.values()))
     assert isinstance(net, DisplacementNet)
     config = OptimizationConfig(variance_iterations=5, batch=16, variance_horizon_s=1.0)
     optimize.train_variance(net, list(runs.values()), [], config)
@@ -122,7 +123,7 @@ def test_torch_and_numpy_agree_on_measured_signals(
     network = NetworkConfig(hidden=(32, 32), inputs=inputs, signal_edges_s=edges)
     split = Split(train=("run0",), validation=("run1",))
     config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, split=split, network=network)
-    net = training.new_net(network, [runs["run0"]])
+    net = new_net(network, [runs["run0"]])
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape))

@@ -22,7 +22,7 @@ from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fi
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig
 from training.data import Run, cut, load_run, make_run
 from training.losses import composed_nll, end_errors, rollout_loss
-from training.models import integrate, relative
+from training.planar import integrate, relative
 from training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 
 

@@ -11,7 +11,8 @@ import pytest
 from fgloc.config import Config, WeightsConfig
 from fgloc.robust.glr_test import GlrTest
 from fgloc.robust.motion_faults import MotionFaultMonitor
-from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import MotionMeasurement, MotionReadings, Step
 
@@ -118,7 +119,7 @@ class Witness:
 
 def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> MotionFaultMonitor:
     config = Config.model_validate({"weights": {"distrust": distrust, **weights}})
-    sources = MotionFusion(config, WheelMotion(config.wheels), Witness() if learned else None)
+    sources = MotionSources(config, MotionSensors(WheelMotion(config.wheels), Witness() if learned else None))
     trust = MotionFaultMonitor(config.weights, sources, track)
     trust.begin(Step(0, 0, 10**18, 10**18))
     return trust
@@ -157,10 +158,10 @@ LEFT, RIGHT = SPEED - 0.5 * TRACK * TURN, SPEED + 0.5 * TRACK * TURN
 )
 def test_fault_31_a_stuck_or_slipping_wheel_is_told_apart(told, reason):
     trust = trust_in()
-    assert not any(t.off for t in run(trust, 20, sides(LEFT, RIGHT)))
+    assert not any(t.budget.rejected for t in run(trust, 20, sides(LEFT, RIGHT)))
     found = run(trust, 20, told, first=20)
-    assert found[-1].off == {"wheels": reason}
-    raised = [i for i, t in enumerate(found) if t.off]
+    assert found[-1].budget.rejected == {"wheels": reason}
+    raised = [i for i, t in enumerate(found) if t.budget.rejected]
     assert raised[0] * DT < 0.5
     assert found[raised[0]].span <= raised[0] + 1 + 3
     assert sum(trust.flags.values()) == 1
@@ -173,31 +174,31 @@ def test_a_failure_whose_kind_shows_later_is_one_failure():
     run(trust, 20, sides(LEFT, RIGHT))
     run(trust, 8, sides(1.5 * LEFT, 1.5 * RIGHT), first=20)
     found = run(trust, 30, sides(0.0, RIGHT), first=28)
-    assert found[-1].off == {"wheels": "left_wheel_dead"}
+    assert found[-1].budget.rejected == {"wheels": "left_wheel_dead"}
     assert trust.flags == Counter({"wheels.left_wheel_dead": 1})
 
 
 def test_without_the_track_no_wheel_is_accused():
     found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
-    assert found[-1].off == {"wheels": "slip"}
+    assert found[-1].budget.rejected == {"wheels": "slip"}
 
 
 def test_the_gyro_alone_witnesses_a_wrong_turn():
     trust = trust_in(learned=False)
-    assert not any(t.off for t in run(trust, 20, (SPEED, TURN), witness="gyro"))
+    assert not any(t.budget.rejected for t in run(trust, 20, (SPEED, TURN), witness="gyro"))
     found = run(trust, 20, (SPEED, TURN + 0.4), first=20, witness="gyro")
-    assert found[-1].off == {"wheels": "slip"}
+    assert found[-1].budget.rejected == {"wheels": "slip"}
     forward = run(trust_in(learned=False), 40, (2.0 * SPEED, TURN), witness="gyro")
-    assert not any(t.off for t in forward)  # of the way it knows nothing
+    assert not any(t.budget.rejected for t in forward)  # of the way it knows nothing
 
 
 def test_without_a_witness_or_without_adaptation_nothing_is_flagged():
     wild = sides(0.0, 3.0 * RIGHT)
-    assert not any(t.off for t in run(trust_in(adaptive=False), 20, wild))
+    assert not any(t.budget.rejected for t in run(trust_in(adaptive=False), 20, wild))
     alone = trust_in()
     for i in range(20):
         wheels = reading("wheels", i, *wild)
-        assert not alone.judge(Step(i, 0, wheels.start_ns, wheels.stamp_ns), MotionReadings(wheels)).off
+        assert not alone.judge(Step(i, 0, wheels.start_ns, wheels.stamp_ns), MotionReadings(wheels)).budget.rejected
 
 
 def test_known_failures_are_believed_in_their_intervals_alone():
@@ -206,23 +207,23 @@ def test_known_failures_are_believed_in_their_intervals_alone():
     )
     found = run(trust, 20, (SPEED, TURN))
     off = {
-        source: [i for i, t in enumerate(found) if t.off.get(source) == "distrusted"]
+        source: [i for i, t in enumerate(found) if t.budget.rejected.get(source) == "distrusted"]
         for source in ("learned", "wheels")
     }
     assert off == {"learned": [5, 6, 7, 8, 9], "wheels": [7]}
-    assert not any(reason != "distrusted" for t in found for reason in t.off.values())
+    assert not any(reason != "distrusted" for t in found for reason in t.budget.rejected.values())
 
 
 def test_a_new_segment_begins_without_a_flag():
     trust = trust_in()
-    assert run(trust, 20, sides(0.0, RIGHT))[-1].off
+    assert run(trust, 20, sides(0.0, RIGHT))[-1].budget.rejected
     trust.reset()
-    assert not any(t.off for t in run(trust, 20, (SPEED, TURN), first=20))
+    assert not any(t.budget.rejected for t in run(trust, 20, (SPEED, TURN), first=20))
 
 
 def test_a_witness_known_to_be_wrong_accuses_nobody():
     trust = trust_in([{"source": "learned", "start_s": 0.0, "end_s": 2.0}])
-    assert {tuple(t.off) for t in run(trust, 20, (SPEED, TURN), did=(0.0, 0.0))} == {("learned",)}
+    assert {tuple(t.budget.rejected) for t in run(trust, 20, (SPEED, TURN), did=(0.0, 0.0))} == {("learned",)}
     assert not trust.flags
 
 
@@ -231,8 +232,8 @@ def test_wheels_known_to_be_wrong_are_not_found_out_again():
     trust = trust_in([{"source": "wheels", "start_s": 1.0, "end_s": 2.0}])
     before, during = run(trust, 10, (SPEED, TURN)), run(trust, 10, (0.0, 0.0), first=10)
     after = run(trust, 10, (SPEED, TURN), first=20)
-    assert [t.off for t in (*before, *after)] == [{}] * 20
-    assert [t.off for t in during] == [{"wheels": "distrusted"}] * 10
+    assert [t.budget.rejected for t in (*before, *after)] == [{}] * 20
+    assert [t.budget.rejected for t in during] == [{"wheels": "distrusted"}] * 10
     assert not trust.flags
 
 
@@ -241,8 +242,8 @@ def test_wheels_that_differ_by_less_than_an_alarm_are_worth_less_back_to_the_ons
     trust = trust_in()
     run(trust, 40, (SPEED, TURN))
     found = run(trust, 6, (SPEED + 0.03, TURN), first=40)
-    assert not any(t.off for t in found)
+    assert not any(t.budget.rejected for t in found)
     assert [t.span for t in found] == [1, 2, 3, 4, 5, 6]
-    assert [t.scale for t in found] == sorted(t.scale for t in found)
-    assert found[0].scale < 1.0
-    assert 4.0 < found[-1].scale < 5.0
+    assert [t.budget.scale for t in found] == sorted(t.budget.scale for t in found)
+    assert found[0].budget.scale < 1.0
+    assert 4.0 < found[-1].budget.scale < 5.0

@@ -57,7 +57,7 @@ def test_fault_52_a_map_shifted_as_a_whole_against_the_given_first_pose(kind):
     (told,) = [d for d in decisions if d.kind == "place"]
     assert told.reason == "contradicts initial_pose"
     assert told.weight == 0.0
-    assert math.hypot(*chain.localizer._tracking.initial_pose_conflict[:2]) == pytest.approx(
+    assert math.hypot(*chain.localizer.tracking.initial_pose_conflict[:2]) == pytest.approx(
         np.hypot(*SHIFT[:2]), abs=0.1
     )
     (note,) = chain.localizer.notes  # of single markers that seem to be moved not a word

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from training.config import OptimizationConfig
-from training.models import relative
+from training.planar import relative
 
 
 def rollout_loss(predicted: Tensor, truth: Tensor, dt_s: float, config: OptimizationConfig) -> Tensor:

@@ -2,106 +2,20 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from torch import Tensor, nn
-from tqdm import tqdm
+from torch import Tensor
 
 from fgloc.errors import FglocError
 from training.checkpoint import Checkpoint, Curve
 from training.config import OptimizationConfig
 from training.data import Run
+from training.descent import Plan, descend
 from training.losses import composed_nll, end_errors, rollout_loss
-from training.models import DisplacementNet, MotionNet, Samples, relative
+from training.models import DisplacementNet, MotionNet, Samples
+from training.planar import relative
 
 _VARIANCE_EVERY = 25  # iterations between validations of the variance
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """How long a descent goes on and how often it is judged."""
-
-    name: str
-    iterations: int
-    learning_rate: float
-    validate_every: int
-    patience: int | None  # validations without improvement after which to stop
-    anneal: bool  # lower the rate to nothing, as a cosine
-
-
-def descend(
-    plan: Plan,
-    module: nn.Module,
-    loss_of_batch: Callable[[torch.Generator], Tensor],
-    score: Callable[[], float] | None,
-    seed: int,
-    checkpoint: Checkpoint,
-) -> Curve:
-    """Adam on a module's parameters. Keeps the state with the least score, or the last if nothing is scored.
-
-    Interrupted and begun again with the same arguments it gives the same weights, bit for bit.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.Adam(module.parameters(), lr=plan.learning_rate)
-    half_wave = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, plan.iterations) if plan.anneal else None
-    best, best_state, waited, first = np.inf, copy.deepcopy(module.state_dict()), 0, 1
-    curve = Curve()
-
-    # 1. Go on where an earlier run was stopped
-    if (kept := checkpoint.load()) is not None:
-        module.load_state_dict(kept["module"])
-        optimizer.load_state_dict(kept["optimizer"])
-        if half_wave is not None:
-            half_wave.load_state_dict(kept["schedule"])
-        rng.set_state(kept["rng"])
-        best, best_state, waited, first = kept["best"], kept["best_state"], kept["waited"], kept["iteration"] + 1
-        curve = Curve(kept["losses"], [(int(i), float(s)) for i, s in kept["scores"]])
-
-    # 2. Descend, judge now and then, and note where we are
-    bar = tqdm(total=plan.iterations, initial=first - 1, desc=plan.name, disable=None, leave=False)
-    for i in range(first, plan.iterations + 1):
-        loss = loss_of_batch(rng)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(module.parameters(), 5.0)
-        optimizer.step()
-        if half_wave is not None:
-            half_wave.step()
-        curve.losses.append(float(loss.detach()))
-        bar.update()
-        if i % plan.validate_every and i < plan.iterations:
-            continue
-        if score is not None:
-            curve.scores.append((i, score()))
-            bar.set_postfix(validation=f"{curve.scores[-1][1]:.3f}")
-            waited += 1
-            if curve.scores[-1][1] < best:
-                best, best_state, waited = curve.scores[-1][1], copy.deepcopy(module.state_dict()), 0
-        tired = plan.patience is not None and waited >= plan.patience
-        checkpoint.save(
-            {
-                "iteration": plan.iterations if tired else i,
-                "module": module.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "schedule": {} if half_wave is None else half_wave.state_dict(),
-                "rng": rng.get_state(),
-                "best": best,
-                "best_state": best_state,
-                "waited": waited,
-                "losses": curve.losses,
-                "scores": curve.scores,
-            }
-        )
-        if tired:
-            break
-    bar.close()
-    if score is not None:
-        module.load_state_dict(best_state)
-    return curve
 
 
 def train_mean(

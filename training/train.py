@@ -20,25 +20,22 @@ except ModuleNotFoundError as missing:
     raise SystemExit("error: torch is not installed; in the repository: pip install -e '.[train]'") from missing
 from tqdm import tqdm
 
-from fgloc.errors import ConfigError, FglocError, RecordingError
+from fgloc.errors import ConfigError, FglocError
 from fgloc.files.atomic import atomic_folder, check_out
-from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
+from fgloc.sensors.learned.card import ModelCard, Split
 from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
-from fgloc.sensors.learned.signals import Signal
 from training.adapt import adapted
-from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
+from training.calibrate import fit_joint, fit_noise, fit_variance, noise_covs
 from training.checkpoint import Checkpoints, Curve
-from training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
+from training.config import CalibrationConfig, TrainConfig, load_train_config
 from training.controls import controls, draw_controls
 from training.data import Run, load_runs
 from training.evaluate import STEP_S, card_figures
 from training.export import card_of, tensors_of
-from training.models import DisplacementNet, MotionNet, NaiveNet, VelocityNet
-from training.optimize import train_mean, train_variance
+from training.members import train_member
 from training.plots import draw_losses
 from training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
 
-_SEEDS_APART = 1_000  # between the members of an ensemble
 _NOTHING_KEPT = Checkpoints()
 
 
@@ -133,44 +130,6 @@ def cross_rollouts(
         found += held_out_rollouts(scratch, card, [runs[name]])
         scratch.unlink()
     return found
-
-
-def train_member(
-    config: TrainConfig, split: Split, runs: dict[str, Run], member: int, checkpoints: Checkpoints
-) -> tuple[MotionNet, dict[str, Curve]]:
-    """One network and how its stages went; the members of an ensemble differ by their seed."""
-    optimization = config.optimization.model_copy(update={"seed": config.optimization.seed + _SEEDS_APART * member})
-    training, validation = ([runs[name] for name in names] for names in (split.train, split.validation))
-    kept = {stage: checkpoints.of(config, split, runs, member, stage) for stage in ("mean", "variance")}
-    torch.manual_seed(optimization.seed)
-    net = new_net(config.network, training)
-    curves = {}
-    if not isinstance(net, NaiveNet) and any(True for _ in net.parameters()):
-        curves["mean"] = train_mean(net, training, validation, optimization, kept["mean"])
-    if isinstance(net, DisplacementNet):
-        curves["variance"] = train_variance(net, training, validation, optimization, kept["variance"])
-    return net, curves
-
-
-def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
-    """An untrained network on top of what is known of these recordings' robot."""
-    if config.kind == "naive":
-        return NaiveNet(config)
-    kinematics = fit_kinematics(training)
-    if config.kind in ("displacement", "gru"):
-        wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
-        return DisplacementNet(config, kinematics, wheel_kinematics, training)
-    lag = None if config.kind == "rate" else fit_lag(training, kinematics)
-    return VelocityNet(config, kinematics, lag, training)
-
-
-def _wheels_of(run: Run) -> Signal:
-    wheels = run.heard.signals(("wheels",), run.origin_ns).wheels
-    if wheels is None:
-        raise RecordingError(
-            f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"
-        )
-    return wheels
 
 
 def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: CalibrationConfig) -> ModelCard:

@@ -14,7 +14,7 @@ from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.files.settings_file import Settings, sentences
 from fgloc.recording.files import find_beside
-from fgloc.runner import RunMode
+from fgloc.replay.options import RunMode
 
 _MOST_RUNS = 1_000_000
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]

@@ -15,7 +15,9 @@ from fgloc.diagnosis.image_checks import fitting_dictionary
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.runner import Progress
+from fgloc.replay.options import Progress
+from fgloc.replay.smoothing import smooth_run
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.marker_pose.events import MarkerPosesEvent
 from fgloc.sensors.markers.detector import detect_stream
@@ -23,7 +25,6 @@ from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.motion_compensation import MotionCompensation
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.smoothing import smooth_run
 from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement
 
 _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
@@ -59,7 +60,8 @@ class Drive:
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
         sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
-        moved = MotionCompensation(sensor, wheels, self.parts.localizer.sources.gyro, config.camera.time_jitter_s)
+        motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
+        moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[PixelMeasurement]] = []
         for frame in self.frames:
             found = []

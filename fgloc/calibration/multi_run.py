@@ -12,7 +12,8 @@ from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.recording.files import find_beside
-from fgloc.runner import Progress, run
+from fgloc.replay.options import Progress
+from fgloc.runner import run
 from fgloc.sensors import registry
 from fgloc.types import InstallationFound, RunResult, Setting
 

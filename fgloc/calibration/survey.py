@@ -20,7 +20,7 @@ from fgloc.calibration.found import Found, found_values
 from fgloc.calibration.survey_graph import Distance, Leg, SurveyGraph
 from fgloc.config import Config
 from fgloc.errors import MapError, RecordingError
-from fgloc.runner import Progress
+from fgloc.replay.options import Progress
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 _KNOWN_M, _KNOWN_RAD = 0.1, 0.2  # sigmas of a marker that is not known yet

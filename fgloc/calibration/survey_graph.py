@@ -183,7 +183,7 @@ class SurveyGraph:
         return True
 
     def _installation(self) -> Installation:
-        has_gyro = any(leg.drive.parts.localizer.sources.gyro is not None for leg in self._legs)
+        has_gyro = any(leg.drive.parts.localizer.motion.sources.gyro is not None for leg in self._legs)
         made = installation_of(self._config, self.landmark_map, True, has_gyro, len(self.landmark_map))
         for d in self._distances:
             made.measured(self._along(d, made), d.metres - d.of(self.landmark_map.landmarks), d.sigma_m)

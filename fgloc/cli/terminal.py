@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from fgloc.runner import Progress
+    from fgloc.replay.options import Progress
     from fgloc.types import RunResult
 
 EXIT_BAD_INPUT = 1

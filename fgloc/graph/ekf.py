@@ -36,7 +36,7 @@ class ExtendedKalmanFilter(Estimator):
         known = frame.belief.installation or self.installed
         if frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
-            corrected = correct(frame.belief, known, measurements, self._factors)
+            corrected = correct(frame.belief, known, measurements, self.factors)
             if corrected is not None:
                 frame.belief = corrected[0]
         if frame.belief.installation is None:

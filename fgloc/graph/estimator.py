@@ -18,6 +18,7 @@ class Estimator(ABC):
     """Poses of the newest keyframes, one update a step.
 
     Attributes:
+        factors: makes the factors of landmarks; it has what is known of the installation.
         log: every measurement of the window (or of the run, if ``keep_all``).
         belief: the newest pose.
         rebuilt: how often what the estimator held had to be built again from the log.
@@ -25,7 +26,7 @@ class Estimator(ABC):
 
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
         self._config = config
-        self._factors = factors
+        self.factors = factors
         self.log = MeasurementLog(config.lag_s, keep_all or config.kind == "isam2")
         self.rebuilt = 0
         self.belief: PoseWithCovariance | None = None
@@ -41,17 +42,22 @@ class Estimator(ABC):
     @property
     def installation(self) -> Installation:
         """The parameters beside the pose."""
-        return self._factors.installation
+        return self.factors.installation
 
     @property
     def installed(self) -> InstallationBelief:
         """What is known of the installation now."""
-        return self._factors.believed
+        return self.factors.believed
 
     @property
     def k(self) -> int:
         """Index of the newest keyframe, -1 before the first."""
         return self._k
+
+    @property
+    def newest(self) -> Keyframe:
+        """The newest keyframe."""
+        return self.log.keyframes[self._k]
 
     def start(
         self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LandmarkFactor] = ()
@@ -70,7 +76,7 @@ class Estimator(ABC):
         """
         if self.belief is None or not motions:
             raise EstimatorError("predict needs a started estimator and at least one motion measurement")
-        return predict(self.belief, self.installed, self._factors.installation, motions)
+        return predict(self.belief, self.installed, self.factors.installation, motions)
 
     def update(
         self,
@@ -108,7 +114,7 @@ class Estimator(ABC):
             self.log.keyframes[k].motions = tuple(changed)
         if motions and self.belief is not None:
             self._solve_again(sorted(motions))
-            self._adopt(self.log.keyframes[self._k].belief)
+            self._adopt(self.newest.belief)
 
     def correct(self, belief: PoseWithCovariance, landmark_id: int) -> None:
         """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
@@ -117,7 +123,7 @@ class Estimator(ABC):
             if of_it:
                 frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
                 frame.refused = (*frame.refused, *of_it)
-        newest = self.log.keyframes[self._k]
+        newest = self.newest
         newest.belief, self._corrected = belief, self._k
         self._begin_at(newest)
         self._adopt(newest.belief)
@@ -135,7 +141,7 @@ class Estimator(ABC):
     def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief
         if belief.installation is not None:
-            self._factors.believed = belief.installation
+            self.factors.believed = belief.installation
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
@@ -144,7 +150,7 @@ class Estimator(ABC):
             if before is None or frame.prior is not None:
                 continue
             known = before.belief.installation or self.installed
-            frame.belief = predict(before.belief, known, self._factors.installation, frame.motions)
+            frame.belief = predict(before.belief, known, self.factors.installation, frame.motions)
             self._solve(frame)
 
     @abstractmethod

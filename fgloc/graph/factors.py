@@ -173,6 +173,11 @@ class LandmarkFactors:
         self._remembered = np.zeros(3), {}
 
     @property
+    def time_offset_s(self) -> float:
+        """How late stamps of sightings are, as far as is known."""
+        return self.installation.time_offset(self.believed)
+
+    @property
     def known(self) -> bool:
         """Whether the map is given; otherwise landmarks are variables."""
         return self._known is not None

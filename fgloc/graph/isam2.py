@@ -96,16 +96,16 @@ class IncrementalEstimator(Estimator):
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
         """Where to linearize: at the prediction or, far from linear, at what it and the sightings make likeliest."""
-        if not frame.sightings or not self._factors.known or is_linear(frame.belief):
+        if not frame.sightings or not self.factors.known or is_linear(frame.belief):
             return frame.belief
         known = frame.belief.installation or self.installed
         measurements = [s.measurement for s in frame.sightings]
-        corrected = correct(frame.belief, known, measurements, self._factors)
+        corrected = correct(frame.belief, known, measurements, self.factors)
         return frame.belief if corrected is None else corrected[0]
 
     def _newest(self, k: int) -> PoseWithCovariance:
         assert self._backend is not None
-        belief = self._backend.belief(k, len(self._factors.installation))
+        belief = self._backend.belief(k, len(self.factors.installation))
         if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
             raise ValueError("estimate is not finite")
         return belief
@@ -179,7 +179,7 @@ class IncrementalEstimator(Estimator):
         before = self.log.keyframes.get(frame.k - 1)
         installed = self._config.motion_kernel == "none" and before is not None
         return [
-            installed_motion_factor(frame.k, m, before.at, self._factors.installation)
+            installed_motion_factor(frame.k, m, before.at, self.factors.installation)
             if installed and before is not None
             else motion_factor(frame.k, m, self._config.motion_kernel)
             for m in frame.motions
@@ -201,12 +201,12 @@ class IncrementalEstimator(Estimator):
         else:
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
         self._fresh = False
-        if self._factors.known and frame.sightings:
+        if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
-            if known is self._factors.believed:
-                lines = self._factors.linearize(measurements, initial.pose)
+            if known is self.factors.believed:
+                lines = self.factors.linearize(measurements, initial.pose)
             else:
-                lines = self._factors.observe(measurements).linearize(initial.pose, known.mean)
+                lines = self.factors.observe(measurements).linearize(initial.pose, known.mean)
             kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
             if kept:
                 sightings, ahead = zip(*kept, strict=True)
@@ -220,7 +220,7 @@ class IncrementalEstimator(Estimator):
 
     def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
         """Give a first value to a landmark that is a variable and not yet in the graph."""
-        if self._factors.known or m.landmark_id in self._landmarks:
+        if self.factors.known or m.landmark_id in self._landmarks:
             return
         key = landmark_key(m.landmark_id)
         if isinstance(m, PointMeasurement):
@@ -262,7 +262,7 @@ class IncrementalEstimator(Estimator):
 
     def _new_backend(self) -> Backend:
         self._fresh = True
-        installed = len(self._factors.installation) if self._factors.known else 0
+        installed = len(self.factors.installation) if self.factors.known else 0
         careful = math.isfinite(self._careful_until_s)
         if self._config.kind == "fixed_lag":
             return FixedLag(self._config, installed, careful)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, MotionReadings, Step
 
 
@@ -52,10 +53,8 @@ class Keyframe:
     refused: tuple[LandmarkFactor, ...] = ()  # rejected online; for the cost of the batch
     step: Step | None = None  # its events, to be measured again
     mode: Mode = Mode.OK
-    readings: MotionReadings = field(default_factory=MotionReadings)  # of the motion sources ...
-    off: Mapping[str, str] = field(default_factory=dict)  # ... and which of them were rejected, and why
-    scale: float = 1.0  # on the covariances of sources that disagree
-    extra_cov: FloatArray | None = None  # added to the covariances of the motions that these make
+    readings: MotionReadings = field(default_factory=MotionReadings)  # what the motions were made of ...
+    budget: NoiseBudget = field(default_factory=NoiseBudget)  # ... and with which noise
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +13,7 @@ from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationBelief
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
@@ -41,9 +41,8 @@ class Anchor:
     known: InstallationBelief  # likewise
     added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
     mode: Mode
-    blind_s: float
-    off: Mapping[str, str]
-    scale: float
+    since_fix_s: float
+    budget: NoiseBudget
     gyro: Gyro | None
     learned: LearnedMotion | None  # without its model
 
@@ -78,21 +77,22 @@ class Anchors:
         self._rows = _rows_of_motion(installation)
         sigmas = {installation.names[i]: float(installation.sigmas[i]) for i in self._rows}
         model = None if parts.learned is None else parts.learned.model
-        self.parts = MotionParts(parts.config, Installation(sigmas), parts.localizer.sources.joint, model)
+        self.parts = MotionParts(parts.config, Installation(sigmas), parts.localizer.motion.sources.rules.joint, model)
 
     def make(self, step: Step, estimate: Estimate) -> Anchor:
         """The anchor of the estimate that the run's last step led to."""
         localizer = self._run.localizer
         estimator, installation = localizer.estimator, localizer.factors
         frame = estimator.log.keyframes.get(estimator.k)
-        gyro, learned = localizer.sources.gyro, self._run.learned
+        gyro, learned = localizer.motion.sources.gyro, self._run.learned
         body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
         if frame is not None and frame.stamp_ns == estimate.stamp_ns:
             belief = frame.belief
             known = belief.installation or installation.believed
-            off, scale = frame.off, frame.scale
+            budget = replace(frame.budget, overruled_cov=None)  # of that step alone
         else:
-            belief, known, off, scale = PoseWithCovariance(estimate.pose, body), installation.believed, {}, 1.0
+            belief, known = PoseWithCovariance(estimate.pose, body), installation.believed
+            budget = NoiseBudget()
         return Anchor(
             segment=step.segment,
             stamp_ns=estimate.stamp_ns,
@@ -100,9 +100,8 @@ class Anchors:
             known=self._belief_of_motion(known),
             added_cov=body - belief.cov,
             mode=estimate.mode,
-            blind_s=localizer.blind_s,
-            off=dict(off),
-            scale=scale,
+            since_fix_s=localizer.tracking.since_fix_s,
+            budget=budget,
             gyro=None if gyro is None else gyro.fork(),
             learned=None if learned is None else _without_model(learned),
         )

@@ -16,7 +16,8 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
-from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -125,8 +126,8 @@ class Extrapolator:
         anchor = held.anchor
         with self._asked:
             belief, mode = self._carried(held, step), anchor.mode
-        blind_s = anchor.blind_s + step.dt
-        if mode is Mode.OK and blind_s > self._config.estimator.dead_reckoning_after_s:
+        since_fix_s = anchor.since_fix_s + step.dt
+        if mode is Mode.OK and since_fix_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
         return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns)
@@ -157,20 +158,19 @@ class Extrapolator:
     def _carried(self, held: _Held, step: Step) -> PoseWithCovariance:
         anchor, means = held.anchor, held.means
         means.factors.believed = anchor.known
-        sources = MotionFusion(
-            self._config,
+        sensors = MotionSensors(
             held.wheels,
             None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),
             means.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
-            means.factors,
         )
+        sources = MotionSources(self._config, sensors, means.factors)
         belief, start_ns = anchor.belief, step.start_ns
         while start_ns < step.stamp_ns:
             end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
             piece = _piece(step, start_ns, end_ns)
-            readings = sources.read(piece, anchor.blind_s + (start_ns - step.start_ns) * 1e-9)
-            motions = sources.combine(readings, anchor.off, anchor.scale) or [sources.unknown(piece, readings)]
+            readings = sources.read(piece, anchor.since_fix_s + (start_ns - step.start_ns) * 1e-9)
+            motions = anchor.budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
             belief = predict(belief, anchor.known, means.factors.installation, motions)
             start_ns = end_ns
         return belief

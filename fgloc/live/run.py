@@ -146,14 +146,14 @@ class OnlineRun:
 
     def _take_over(self, parts: Assembly, state: RunState) -> None:
         """What an earlier run found, but for the pose, which waits for the first step."""
-        localizer, gyro = parts.localizer, parts.localizer.sources.gyro
+        localizer, gyro = parts.localizer, parts.localizer.motion.sources.gyro
         known = installation_of_state(state, localizer.factors.installation)
         if known is not None:
             localizer.factors.believed = known
         if gyro is not None and state.gyro is not None:
             gyro.resume(state.gyro.bias, state.gyro.bias_variance)
         for landmark_id, displacement in state.excluded.items():
-            localizer.association.modes.displacements[landmark_id] = np.array(displacement)
+            localizer.sightings.modes.displacements[landmark_id] = np.array(displacement)
         self._fastest = state.fastest
 
     def snapshot(self) -> RunState | None:
@@ -161,14 +161,14 @@ class OnlineRun:
         parts, step, estimate = self.parts, self._last_step, self.newest
         if parts is None or step is None or estimate is None or estimate.mode is Mode.UNCONFIRMED:
             return None
-        localizer, gyro = parts.localizer, parts.localizer.sources.gyro
+        localizer, gyro = parts.localizer, parts.localizer.motion.sources.gyro
         twist = parts.wheels.twist(step, step.stamp_ns)
         self._fastest = (
             max(self._fastest[0], float(np.hypot(twist[0], twist[1]))),
             max(self._fastest[1], abs(float(twist[2]))),
         )
         installed = localizer.estimator.installed
-        moved = localizer.association.modes.displacements
+        moved = localizer.sightings.modes.displacements
         return RunState(
             map_fingerprint=self._fingerprint,
             saved_ns=time.time_ns(),

@@ -65,7 +65,7 @@ class PoseFit:
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.believed.mean, factors.believed.cov
-        self._k = np.array([m.cauchy_k for m in sightings])
+        self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray, iterations: int) -> Fit | None:
@@ -130,6 +130,11 @@ def sighting_costs(
 ) -> tuple[FloatArray, IntArray]:
     """Robust cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
     return PoseFit(sightings, factors, config).costs(pose)
+
+
+def cauchy_k(m: LandmarkMeasurement) -> float:
+    """Cauchy constant of a sighting in a fit, in units of its sigma."""
+    return m.cauchy_k
 
 
 def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:

@@ -96,14 +96,14 @@ class Tracking:
         self._clock_s += seconds
 
     @property
-    def blind_s(self) -> float:
+    def since_fix_s(self) -> float:
         """Time since the last fix [s]."""
         return self._clock_s - self._fix_s
 
     @property
     def dead_reckoning(self) -> bool:
         """Whether the last fix is so long ago that the robot is dead reckoning."""
-        return self.blind_s > self._config.dead_reckoning_after_s
+        return self.since_fix_s > self._config.dead_reckoning_after_s
 
     @property
     def waiting(self) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.motion_faults import FaultVerdict
-from fgloc.robust.motion_noise import noise_scales
 from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
 
 JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...
@@ -25,41 +25,34 @@ _REASONS = {
 
 
 def motion_decisions(
-    k: int,
-    motions: Sequence[MotionMeasurement],
-    readings: MotionReadings,
-    off: Mapping[str, str],
-    reason: str,
-    verdict: FaultVerdict | None = None,
+    k: int, motions: Sequence[MotionMeasurement], readings: MotionReadings, budget: NoiseBudget, verdict: FaultVerdict
 ) -> list[Decision]:
     """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
 
     That of the wheels is the statistic of the GLR test of the ``verdict``, and its threshold the alarm.
 
-    Rejected sources (``off``: and why) have weight 0. A ``reason`` gives why the covariance of all the
-    others was inflated; their weight is then 0 too, as they no longer hold the pose. Otherwise the weight is one over
-    the factor on the covariance (`noise_scales` of the scale). A step that was judged again has more than one row for a
-    source; the last one holds.
+    Rejected sources have weight 0, and so have all the others where sightings overruled them, as they no longer hold
+    the pose. Otherwise the weight is one over the factor on the covariance. A step that was judged again has more than
+    one row for a source; the last one holds.
     """
     rows = []
-    verdict = verdict or FaultVerdict()
-    scales = noise_scales(off, verdict.scale)
+    overruled = "" if budget.overruled_cov is None else OVERRULED
     used = {m.source: m for m in motions}
     for source in ("wheels", "learned", "gyro", "unknown"):
         reading = getattr(readings, source, None) or used.get(source)
-        why = off.get(source, reason)
+        why = budget.rejected.get(source, overruled)
         if reading is None or (source not in used and not why):
             continue
         nis, threshold, shift = 0.0, math.nan, math.nan
-        witness = readings.learned if source == "wheels" else readings.wheels
+        reference = readings.learned if source == "wheels" else readings.wheels
         if source == "wheels" and math.isfinite(verdict.nis):
             nis, threshold = verdict.nis, verdict.threshold
-        if witness is not None:
-            difference: FloatArray = se2.log(se2.between(witness.motion, reading.motion))
+        if reference is not None:
+            difference: FloatArray = se2.log(se2.between(reference.motion, reading.motion))
             shift = math.nan if source == "gyro" else float(difference[0])
             if source != "wheels":
-                nis = float(difference @ np.linalg.solve(witness.cov + reading.cov, difference))
-        weight = 0.0 if why else 1.0 / scales.get(source, 1.0)
+                nis = float(difference @ np.linalg.solve(reference.cov + reading.cov, difference))
+        weight = 0.0 if why else 1.0 / budget.scales.get(source, 1.0)
         rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why, threshold, shift))
     return rows
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fgloc.config import WeightsConfig
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.glr_test import GlrTest
-from fgloc.robust.motion_fusion import MotionFusion
+from fgloc.robust.motion_sources import MotionSources
+from fgloc.robust.source_difference import source_difference
 from fgloc.types import FloatArray, MotionReadings, Step
 
 _MOVED = 0.25  # of the reference source's travel: a wheel that turned less than this while it did more stood still
@@ -21,20 +22,18 @@ _EVIDENCE_S = 1.0  # of travel from which the kind of failure is determined
 
 @dataclass(frozen=True, slots=True)
 class FaultVerdict:
-    """What is thought of the motion sources.
+    """What the test makes of the motion sources.
 
     Attributes:
-        off: source -> why it is rejected.
-        span: for how many of the newest steps, this one included, that or the scale holds.
-        nis: of the disagreement between wheels and reference source over the least likely window; NaN without one.
-        scale: on their covariances where neither is left out.
+        budget: which of them are rejected and why, or the scale on their covariances.
+        span: for how many of the newest steps, this one included, it holds.
+        nis: of the difference of wheels and reference source over the least likely window; NaN without one.
         threshold: that ``nis`` is held against.
     """
 
-    off: Mapping[str, str] = field(default_factory=dict)
+    budget: NoiseBudget = field(default_factory=NoiseBudget)
     span: int = 1
     nis: float = math.nan
-    scale: float = 1.0
     threshold: float = math.nan
 
 
@@ -45,7 +44,7 @@ class MotionFaultMonitor:
         flags: how often each source was flagged, by "source.reason".
     """
 
-    def __init__(self, config: WeightsConfig, sources: MotionFusion, track_m: float | None) -> None:
+    def __init__(self, config: WeightsConfig, sources: MotionSources, track_m: float | None) -> None:
         """Set up.
 
         Args:
@@ -75,19 +74,20 @@ class MotionFaultMonitor:
 
     def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
         """Take in the readings of a step that follows the last one."""
-        off = self._known_failures(step)
-        if "wheels" in off:  # nothing to be found out
+        rejected = self._known_failures(step)
+        if "wheels" in rejected:  # nothing to be found out
             self.reset()
-        readings = replace(readings, **dict.fromkeys(off))
-        difference = self._sources.disagreement(readings) if self._config.adaptive else None
+        readings = replace(readings, **dict.fromkeys(rejected))
+        difference = source_difference(readings, self._sources) if self._config.adaptive else None
         if difference is None:
-            return FaultVerdict(off)
+            return FaultVerdict(NoiseBudget(rejected))
         verdict = self._glr.judge(
             step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
         )
         self._travelled(step.dt, readings)
         if not verdict.flagged:
-            return FaultVerdict(off, verdict.span, verdict.nis, verdict.scale, self._config.alarm)
+            budget = NoiseBudget(rejected, verdict.scale)
+            return FaultVerdict(budget, verdict.span, verdict.nis, self._config.alarm)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -96,7 +96,8 @@ class MotionFaultMonitor:
             if not verdict.since:  # the same failure, seen better now
                 self.flags -= Counter({f"wheels.{self._reason}": 1})
             self._reason = reason
-        return FaultVerdict({"wheels": reason, **off}, max(verdict.since, 1), verdict.nis, threshold=self._config.alarm)
+        budget = NoiseBudget({"wheels": reason, **rejected})
+        return FaultVerdict(budget, max(verdict.since, 1), verdict.nis, self._config.alarm)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.sensors.base import Sensor
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,
@@ -70,17 +66,11 @@ def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r
 class MotionCompensation:
     """Moves sightings from their exposure to the keyframe, by the wheels and, where it is heard, the gyro's turn."""
 
-    def __init__(
-        self,
-        landmarks: LandmarkSensor,
-        wheels: WheelMotion,
-        gyro: Gyro | None,
-        jitter_s: float,
-        sensors: Sequence[Sensor] = (),
-    ) -> None:
+    def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
         """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
-        self._landmarks, self._wheels, self._gyro, self._jitter_s = landmarks, wheels, gyro, jitter_s
-        self._sensor_of = {stream.event: sensor for sensor in sensors for stream in sensor.streams}
+        self._landmarks, self._jitter_s = poses.landmarks, jitter_s
+        self._wheels, self._gyro = motion.wheels, motion.gyro
+        self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
 
     def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
         """All sightings of a step as if made at its end.

@@ -74,14 +74,14 @@ class Gyro:
         """Go on from what an earlier run learned of the bias [rad/s], [rad²/s²]."""
         self.bias, self.bias_variance = bias, min(bias_variance, self._config.bias_sigma**2)
 
-    def measure(self, step: Step, wheels: ArrayLike | None, blind_s: float = 0.0) -> Turn | None:
+    def measure(self, step: Step, wheels: ArrayLike | None, since_fix_s: float = 0.0) -> Turn | None:
         """Turn over the step.
 
         Args:
             step: with the IMU's messages.
             wheels: ``(3,)`` what the wheels say of the step: where they stand, the bias shows.
-            blind_s: how long before the step nothing but motion has told the yaw. A wrong bias turns all steps alike,
-                so that its variance grows with the square of that time, however it is cut into steps.
+            since_fix_s: how long before the step nothing but motion has told the yaw. A wrong bias turns all steps
+                alike, so that its variance grows with the square of that time, however it is cut into steps.
 
         Returns:
             None if the gyro was silent; once it has spoken, that is counted.
@@ -97,7 +97,7 @@ class Gyro:
         self.bias_variance += self._config.bias_walk**2 * dt
         self._watch_rest(raw / dt, dt, wheels)
         yaw = raw - self.bias * dt
-        drift = self.bias_variance * ((blind_s + dt) ** 2 - blind_s**2)
+        drift = self.bias_variance * ((since_fix_s + dt) ** 2 - since_fix_s**2)
         noise = self._config.yaw_per_sqrt_s**2 * dt
         return Turn(yaw, noise + drift)
 

@@ -65,14 +65,14 @@ def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[Mo
     """Evaluate the learned motion at the velocities of the smoothed trajectory."""
     stamps, poses = solver.stamps_ns(), solver.poses()
     starts = [i for i, frame in enumerate(solver.frames) if frame.prior is not None]
-    sources, again = parts.localizer.sources, {}
+    sources, again = parts.localizer.motion.sources, {}
     for start, end in pairwise([*starts, len(stamps)]):  # no motion leads from one stretch to the next
         velocities = smoothed_velocities(stamps[start:end], poses[start:end])
         for frame, velocity in zip(solver.frames[start + 1 : end], velocities[1:], strict=True):
             if frame.step is None:
                 continue
             readings = sources.read_again(frame.readings, frame.step, velocity)
-            if motions := sources.combine_again(frame, readings):
+            if motions := frame.budget.combine(readings, sources.rules):
                 again[frame.k] = tuple(motions)
     return again
 

@@ -1,101 +1,71 @@
-"""The motion sources side by side, and what of them enters the graph."""
+"""The motion sources of a robot, each read as if it were alone, with the installation as it is known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.robust.motion_noise import add_slip_noise, is_commanded_to_move, noise_scales, turned_by, with_noise
-from fgloc.sensors.gyro.rate import Gyro, Turn
-from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import FusionRules, with_yaw
+from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro.rate import Turn
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
-_SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
+_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 
 
-_OF_MOTION = (
-    "wheels.radius",
-    "wheels.track",
-    "wheels.yaw_per_m",
-    "wheels.slowdown",
-    "wheels.delay_s",
-    "learned.scale",
-    "gyro.scale",
-    "wheels.time_offset_s",
-)
+class MotionSources:
+    """Reads wheels, learned motion and gyro, and follows what is known of their drift."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Difference:
-    """Of two motion sources over a step, in the body frame.
-
-    Attributes:
-        value: ``(3,)``.
-        cov: ``(3, 3)`` if both are right, of what differs from step to step.
-        by_installation: ``(3, p)`` derivative by the parameters of the sources, whose error is always the same ...
-        installation_cov: ... and their covariance ``(p, p)``.
-    """
-
-    value: FloatArray
-    cov: FloatArray
-    by_installation: FloatArray
-    installation_cov: FloatArray
-
-
-class MotionFusion:
-    """Wheels, learned motion and gyro."""
-
-    def __init__(
-        self,
-        config: Config,
-        wheels: WheelMotion,
-        learned: LearnedMotion | None = None,
-        joint: JointCalibration | None = None,
-        gyro: Gyro | None = None,
-        factors: LandmarkFactors | None = None,
-    ) -> None:
-        """Take the sources.
+    def __init__(self, config: Config, sensors: MotionSensors, factors: LandmarkFactors | None = None) -> None:
+        """Take the sensors.
 
         Args:
             config: of all of them.
-            wheels: wheel odometry.
-            learned: the learned motion, if any.
-            joint: its correlation with the wheels; None: the two are taken as independent.
-            gyro: the gyro, if any.
+            sensors: to be read.
             factors: hold what is known of the installation; None: motions are taken as they are reported.
         """
         self._config = config
-        self._factors = LandmarkFactors(None) if factors is None else factors
-        self._wheels = wheels
-        self._learned = learned
-        self.joint = joint
-        self.gyro = gyro
+        self.factors = LandmarkFactors(None) if factors is None else factors
+        self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
+        self.gyro = sensors.gyro
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
         self._untold_s = 0.0  # how long fixes have told the yaw along the way only, at most the lag
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
 
     @property
-    def gyro_is_read(self) -> bool:
-        """Whether the learned motion has the gyro in it already."""
+    def rules(self) -> FusionRules:
+        """How the sources depend on each other."""
+        return FusionRules(
+            wheels_are_commands=self._wheels.from_commands,
+            learned_has_gyro=self._learned_has_gyro,
+            joint=self._joint,
+            stopped_speed=_LIKELY * self._config.gate.max_speed,
+            stopped_turn=_LIKELY * self._config.gate.max_yaw_rate,
+        )
+
+    @property
+    def learned_is_independent(self) -> bool:
+        """Whether the learned motion can be held against the wheels: it does not read them."""
+        return self._learned is not None and not self._learned.model.card.reads_wheels
+
+    @property
+    def _learned_has_gyro(self) -> bool:
         return self._learned is not None and "gyro" in self._learned.model.card.inputs
 
-    def read(self, step: Step, blind_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
+    def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
         """Ask every source once.
 
         Args:
             step: its events.
-            blind_s: time before the step without a fix.
+            since_fix_s: time before the step without a fix.
             velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
         if step.dt <= 0.0:
@@ -103,18 +73,18 @@ class MotionFusion:
         wheels = self._wheels.measure(step)
         if wheels is not None:
             change = None
-            if not self._factors.installation.index.keys().isdisjoint(("wheels.time_offset_s", "wheels.delay_s")):
+            if not self.factors.installation.index.keys().isdisjoint(("wheels.time_offset_s", "wheels.delay_s")):
                 start, end = self._wheels.twist(step, step.start_ns), self._wheels.twist(step, step.stamp_ns)
                 change = end - se2.adjoint(se2.inverse(wheels.motion)) @ start
             wheels = self._installed(wheels, change=change)
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
-            untold_s = max(blind_s, self._untold_s)
-            turn = self.gyro.measure(step, None if wheels is None or is_commanded_to_move(step) else motion, untold_s)
+            untold_s = max(since_fix_s, self._untold_s)
+            turn = self.gyro.measure(step, None if wheels is None or _is_commanded_to_move(step) else motion, untold_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
-                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, turned_by(motion, turn.yaw), cov)
+                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, with_yaw(motion, turn.yaw), cov)
                 gyro = self._installed(gyro, turn)
                 self._turn = turn
         readings = MotionReadings(wheels, self._with_drift(self._measure_learned(step, velocity), step), gyro)
@@ -124,7 +94,7 @@ class MotionFusion:
 
     def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
         """The learned motion with the drift of the gyro that it reads, where no fix tells the yaw by itself."""
-        if learned is None or self._turn is None or not self.gyro_is_read or self._untold_s == 0.0:
+        if learned is None or self._turn is None or not self._learned_has_gyro or self._untold_s == 0.0:
             return learned
         drift = max(self._turn.variance - self._config.gyro.yaw_per_sqrt_s**2 * step.dt, 0.0)
         return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
@@ -156,7 +126,7 @@ class MotionFusion:
             derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
         if turn is not None:
             derivatives["gyro.scale"] = phi * by_turn
-        index, mean = self._factors.installation.index, self._factors.believed.mean
+        index, mean = self.factors.installation.index, self.factors.believed.mean
         kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
@@ -180,83 +150,7 @@ class MotionFusion:
         scale = self._config.motion.scale
         if scale != 1.0:
             m = replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
-        return self._installed(m, self._turn if self.gyro_is_read else None)
-
-    def combine(
-        self, readings: MotionReadings, off: Mapping[str, str] | None = None, scale: float = 1.0
-    ) -> list[MotionMeasurement]:
-        """Factors of a step, independent of each other.
-
-        Args:
-            readings: of the sources.
-            off: rejected sources, and why. The wheels' factor is then left out or, if nothing else
-                knows the distance, kept with room for a slip.
-            scale: as `noise_scales` takes it.
-        """
-        off = off or {}
-        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
-        scales = noise_scales(off, scale)
-        if wheels is not None:
-            wheels = with_noise(wheels, scales.get("wheels", 1.0))
-        learned = None if learned is None or "learned" in off else with_noise(learned, scales["learned"])
-        if gyro is None or "gyro" in off or (learned is not None and self.gyro_is_read):
-            gyro = None
-        if wheels is not None and "wheels" in off:
-            wheels = None if learned is not None else self._doubtful(wheels, off["wheels"])
-        elif wheels is not None and learned is not None:
-            if self._wheels.from_commands:  # made of the very commands that the model reads
-                wheels = None
-            elif self.joint is not None:
-                learned = self.joint.decorrelate(wheels, learned)
-        known = [m for m in (wheels, learned) if m is not None]
-        if gyro is not None and known:
-            known.append(replace(gyro, motion=turned_by(known[0].motion, float(gyro.motion[2]))))
-        return known
-
-    def _doubtful(self, wheels: MotionMeasurement, why: str) -> MotionMeasurement:
-        """Rejected wheels, where no other source measures the motion: with slip noise."""
-        if why == "slip":
-            return add_slip_noise(wheels, _SLIP_SPEED, _SLIP_TURN)
-        return add_slip_noise(wheels, _LIKELY * self._config.gate.max_speed, _LIKELY * self._config.gate.max_yaw_rate)
-
-    def combine_again(self, frame: Keyframe, readings: MotionReadings | None = None) -> list[MotionMeasurement]:
-        """Factors of a keyframe as its readings (or better ones) and what is thought of them now make them."""
-        made = self.combine(readings or frame.readings, frame.off, frame.scale)
-        return [with_noise(m, extra_cov=frame.extra_cov) for m in made]
-
-    def disagreement(self, readings: MotionReadings) -> Difference | None:
-        """How far the wheels and their reference source are apart over the step.
-
-        Returns:
-            None where there is no reference source: a model that reads the wheels is none, nor is one of the commands
-            that replace wheels.
-        """
-        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
-        if wheels is None or self._wheels.from_commands:
-            return None
-        if learned is not None and self._learned is not None and not self._learned.model.card.reads_wheels:
-            d = se2.log(se2.between(wheels.motion, learned.motion))
-            cov = wheels.cov + learned.cov
-            if self.joint is not None:
-                cov = self.joint.difference_cov(wheels.cov, learned.cov)
-            return Difference(d, cov, *self._systematic(wheels, learned))
-        if gyro is None:
-            return None
-        d = np.array([0.0, 0.0, se2.wrap(float(gyro.motion[2] - wheels.motion[2]))])
-        cov = np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
-        return Difference(d, cov, *self._systematic(wheels, gyro))
-
-    def _systematic(self, a: MotionMeasurement, b: MotionMeasurement) -> tuple[FloatArray, FloatArray]:
-        """Derivative ``(3, p)`` of ``b`` less ``a`` by the parameters of the sources, and their covariance."""
-        index = self._factors.installation.index
-        names = [name for name in _OF_MOTION if name in index]
-        D = np.zeros((3, len(names)))
-        for i, name in enumerate(names):
-            for m, sign in ((a, -1.0), (b, 1.0)):
-                if name in m.depends_on:
-                    D[:, i] += sign * m.depends_on[name][0]
-        rows = [index[name] for name in names]
-        return D, self._factors.believed.cov[np.ix_(rows, rows)]
+        return self._installed(m, self._turn if self._learned_has_gyro else None)
 
     def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
         """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
@@ -269,7 +163,7 @@ class MotionFusion:
         cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
-            motion, cov[2, 2] = turned_by(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+            motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
     def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, tells_yaw: bool = True) -> None:
@@ -301,3 +195,9 @@ class MotionFusion:
         self._silent_s = self._untold_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
+
+
+def _is_commanded_to_move(step: Step) -> bool:
+    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
+    since = step.start_ns - _COMMANDED_NS
+    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.controls)

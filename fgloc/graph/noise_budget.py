@@ -1,0 +1,117 @@
+"""The noise of one step's motion factors: which sources are left out, and what is added to the covariance of the rest.
+
+All changes of a motion's covariance are made here, from one frozen object, so that a step can be combined again later:
+by the revision of past steps, and by the batch smoother.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
+
+_SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
+_WRONG_LASTS_S = 1.0  # ... for this long in one direction
+_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusionRules:
+    """How the motion sources depend on each other: the same for all steps of a run.
+
+    Attributes:
+        wheels_are_commands: there are no wheels, and the commands that stand in for them are what the model reads.
+        learned_has_gyro: the learned motion has the gyro in it already.
+        joint: correlation of the errors of wheels and learned motion; None: independent.
+        stopped_speed: that wheels may be wrong by, if their encoders stopped [m/s].
+        stopped_turn: likewise [rad/s].
+    """
+
+    wheels_are_commands: bool = False
+    learned_has_gyro: bool = False
+    joint: JointCalibration | None = None
+    stopped_speed: float = 0.0
+    stopped_turn: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseBudget:
+    """What one step's motion sources are worth.
+
+    Attributes:
+        rejected: sources that are left out, and why.
+        scale: on the covariance of the wheels, as they and the other sources differ. The learned motion's follows.
+        overruled_cov: ``(3, 3)`` added to each factor, as sightings found the motion wrong; None: they did not.
+    """
+
+    rejected: Mapping[str, str] = field(default_factory=dict)
+    scale: float = 1.0
+    overruled_cov: FloatArray | None = None
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """Factors on the covariances of wheels and learned motion, where they are not left out.
+
+        That of the learned motion follows the wheels' up to what it is worth beside wrong wheels; below 1 by the root,
+        as it is not known which of the two has too large a covariance.
+        """
+        if "wheels" in self.rejected:
+            return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
+        scale = self.scale
+        learned = min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)
+        return {"wheels": scale, "learned": learned}
+
+    def combine(self, readings: MotionReadings, rules: FusionRules) -> list[MotionMeasurement]:
+        """Factors of a step, independent of each other; none where no source that is left measured the distance.
+
+        Rejected wheels are left out or, if nothing else knows the distance, kept with room for a slip.
+
+        Args:
+            readings: of the sources.
+            rules: how they depend on each other.
+        """
+        wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
+        scales = self.scales
+        if wheels is not None:
+            wheels = _scaled(wheels, scales.get("wheels", 1.0))
+        learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
+        if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
+            gyro = None
+        if wheels is not None and "wheels" in self.rejected:
+            wheels = None if learned is not None else self._with_slip(wheels, rules)
+        elif wheels is not None and learned is not None:
+            if rules.wheels_are_commands:
+                wheels = None
+            elif rules.joint is not None:
+                learned = rules.joint.decorrelate(wheels, learned)
+        known = [m for m in (wheels, learned) if m is not None]
+        if gyro is not None and known:
+            known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
+        return [self.overruled(m) for m in known]
+
+    def overruled(self, m: MotionMeasurement) -> MotionMeasurement:
+        """A motion with what sightings that found it wrong add to its covariance."""
+        return m if self.overruled_cov is None else replace(m, cov=m.cov + self.overruled_cov)
+
+    def _with_slip(self, wheels: MotionMeasurement, rules: FusionRules) -> MotionMeasurement:
+        """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip."""
+        slips = self.rejected["wheels"] == "slip"
+        speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
+        seconds = max((wheels.stamp_ns - wheels.start_ns) * 1e-9, 1e-3)
+        speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds
+        density = np.square([max(speed_of_wheels, speed), 0.3 * max(speed_of_wheels, speed), max(turned, turn)])
+        return replace(wheels, cov=wheels.cov + np.diag(density * _WRONG_LASTS_S * seconds))
+
+
+def with_yaw(motion: FloatArray, yaw: float) -> FloatArray:
+    """The motion ``(3,)`` with another rotation [rad]."""
+    return np.array([motion[0], motion[1], yaw])
+
+
+def _scaled(m: MotionMeasurement, scale: float) -> MotionMeasurement:
+    return m if scale == 1.0 else replace(m, cov=m.cov * scale)

@@ -1,0 +1,97 @@
+"""The estimate that is reported of each keyframe: its mode, its covariance, and the rows of ``steps.csv``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.measurement_log import Keyframe
+from fgloc.relocalization.tracking_state import Tracking
+from fgloc.robust.decision_log import mode_decisions, segment_decision
+from fgloc.robust.motion_judge import MotionJudge
+from fgloc.robust.sensor_measurements import kind_of
+from fgloc.robust.sighting_judge import SightingJudge
+from fgloc.sensors.motion_compensation import MotionCompensation
+from fgloc.types import Decision, Estimate, Mode, Step
+
+
+class Recorder:
+    """Adds to the graph's covariance what the graph does not know: clock, kidnapping, the whole map where lost.
+
+    Attributes:
+        counts: factors added, by kind.
+        rejections: what was not used, by reason, beside what the judges rejected.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        tracking: Tracking,
+        motion: MotionJudge,
+        sightings: SightingJudge,
+        compensation: MotionCompensation,
+    ) -> None:
+        """Take the parts that know it."""
+        self.counts: Counter[str] = Counter()
+        self.rejections: Counter[str] = Counter()
+        self._clock_sigma_s = config.recording.clock_sigma_s
+        self._dead_reckoning_after_s = config.estimator.dead_reckoning_after_s
+        self._tracking, self._motion, self._sightings, self._compensation = tracking, motion, sightings, compensation
+        self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
+
+    def count(self, frame: Keyframe) -> None:
+        """Count the factors of a new keyframe."""
+        self.counts.update(() if frame.prior is None else ("prior",))
+        self.counts.update(m.source for m in frame.motions)
+        self.counts.update(kind_of(s.measurement) for s in frame.sightings)
+
+    def clock_jumped(self, k: int, step: Step) -> None:
+        """Note a new segment, to be reported with its first estimate."""
+        self._clock_jumps.append(segment_decision(k, step.start_ns))
+
+    def record(self, step: Step, frame: Keyframe, decisions: Sequence[Decision]) -> Estimate:
+        """The estimate of the newest keyframe; its mode and added covariance are kept in the log for the smoother."""
+        tracking, belief = self._tracking, frame.belief
+        frame.step, frame.mode = step, tracking.mode
+        if self._motion.is_carried and frame.mode is Mode.OK and tracking.since_fix_s > 0.0:
+            frame.mode = Mode.DEAD_RECKONING
+        twist = self._compensation.twist(step, step.stamp_ns)
+        by_clock = np.asarray(np.outer(twist, twist) * self._clock_sigma_s**2)
+        frame.added_cov = by_clock + tracking.kidnapped_cov(self._sightings.contradicting, belief)
+        if frame.mode is Mode.LOST:
+            frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
+        modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)
+        before, self._clock_jumps = [*self._clock_jumps, *self._motion.take_signs()], []
+        cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
+        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes))
+
+    def unconfirmed(self, k: int, step: Step) -> Estimate | None:
+        """The pose before the sightings are enough to begin the graph with; None: they hardly tell it."""
+        belief = self._tracking.unconfirmed()
+        if belief is None:
+            return None
+        cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+        rows = mode_decisions(k, step.stamp_ns, Mode.UNCONFIRMED, self._tracking.since_fix_s, np.nan)
+        return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED, rows)
+
+    def never_confirmed(self, estimates: Sequence[Estimate], frames: Sequence[Keyframe], mode: Mode) -> list[Estimate]:
+        """Estimates of a segment whose first pose was never found, in the mode that says so.
+
+        Args:
+            estimates: as recorded from the likeliest place on.
+            frames: their keyframes.
+            mode: ``UNCONFIRMED``; or ``LOST``, with a covariance that allows for the whole map.
+        """
+        for frame in frames:
+            if mode is Mode.LOST is not frame.mode:
+                frame.added_cov = frame.added_cov + self._tracking.lost_cov(frame.belief)
+            frame.mode = mode
+        if mode is not Mode.LOST:
+            return [replace(e, mode=mode) for e in estimates]
+        covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
+        return [replace(e, mode=mode, cov=covs.get(e.stamp_ns, e.cov)) for e in estimates]

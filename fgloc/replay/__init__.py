@@ -1,0 +1,1 @@
+"""Recorded events through the loop, and the smoothing of what came out."""

@@ -1,0 +1,76 @@
+"""What a replay found besides poses, and the sentences that say so."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fgloc.assembly import Assembly
+from fgloc.config import Role
+from fgloc.diagnosis.gross_mistakes import Mistakes
+from fgloc.diagnosis.image_checks import image_hints
+from fgloc.diagnosis.unused_sightings import unused_sightings
+from fgloc.recording.reader import Recording
+from fgloc.replay.replay import Replay
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the replay found besides poses: read while the recording is open.
+
+    Attributes:
+        roles: topics by role.
+        rejections: everything refused anywhere, by reason.
+        mistakes: of the set-up, gross and sure; before the run and after it.
+        hints: what surely does not fit together.
+        untried: what seems to be wrong with the clocks, and was not tried.
+        notes: what the user should know of the replay.
+    """
+
+    roles: Mapping[Role, str]
+    rejections: Counter[str]
+    mistakes: tuple[str, ...]
+    hints: tuple[str, ...]
+    untried: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, recording: Recording, parts: Assembly, replay: Replay, wrong: Mistakes) -> Outcome:
+        """Collect it from the parts of a run."""
+        hints, untried = _hints(recording, parts, replay)
+        notes = (*hints, *recording.notes, *replay.clocks.notes, *parts.sentences)
+        rejections = replay.rejections()
+        rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
+        seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
+        mistakes = (*wrong.sentences, *unused_sightings(rejections, recording.roles, seen))
+        return cls(recording.roles, rejections, mistakes, tuple(hints), tuple(untried), notes)
+
+    def failed(self, why: str) -> str:
+        """Message of a run that failed: what is wrong with the set-up, why it failed, what may be the cause."""
+        return " ".join([*self.mistakes, why, *self.hints, *self.untried])
+
+
+def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[str], list[str]]:
+    """What does not fit together: surely, and what of the clocks is still to be tried."""
+    hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.activity.missing()]
+    untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
+    if parts.detector is not None and not parts.localizer.counts["corners"]:
+        hints = [*image_hints(recording, parts.detector)[0], *hints]
+    return hints, untried
+
+
+def sentence(note: str) -> str:
+    """With a capital, unless it begins with a name (of a topic, a file), and with a full stop."""
+    first = note.split(maxsplit=1)[0]
+    return (note[0].upper() + note[1:] if first.isalpha() else note) + ("" if note.endswith((".", "?", "!")) else ".")
+
+
+def never_found(replay: Replay, rejections: Counter[str]) -> str:
+    """Message of a run without any pose: what was received and what was rejected."""
+    heard = ", ".join(f"{topic} {span.count}" for topic, span in replay.spans().items()) or "nothing"
+    why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
+    return (
+        f"the first pose was never found in {len(replay.step_ms)} steps. Heard: {heard}. Rejected: {why}. "
+        "Check the map's ids and sizes, or give estimator.initial_pose."
+    )

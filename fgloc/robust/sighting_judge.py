@@ -1,0 +1,158 @@
+"""Which sightings enter the graph, and what the others mean: a moved or misread landmark, a wrong motion, a wrong pose.
+
+The chi-square gate and its better explanations are in `Association`, moved landmarks in `LandmarkModes`, the search of
+the map in `Tracking`; here they are asked in turn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.graph.estimator import Estimator
+from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
+from fgloc.robust.association import Association
+from fgloc.robust.decision_log import OVERRULED, moved_notes, place_decision
+from fgloc.robust.landmark_modes import ALARM, LandmarkModes
+from fgloc.robust.motion_judge import JudgedMotion
+from fgloc.types import Decision, LandmarkMeasurement, PoseMeasurement, Step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedSightings:
+    """The sightings of one step as they enter the graph.
+
+    Attributes:
+        accepted: to be fused.
+        rejected: not to be fused.
+        logged: those of them that the batch smoother and the landmark modes may know of.
+        decisions: rows of ``steps.csv``, one per sighting.
+        places: rows for places that sightings tell beside the predicted one.
+        predicted: the pose that they were held against.
+        elsewhere: where on the map the robot is instead; None: it is where it was predicted.
+    """
+
+    accepted: Sequence[LandmarkFactor]
+    rejected: Sequence[LandmarkFactor]
+    logged: Sequence[LandmarkFactor]
+    decisions: Sequence[Decision]
+    predicted: PoseWithCovariance
+    places: Sequence[Decision] = ()
+    elsewhere: PoseWithCovariance | None = None
+
+    @property
+    def tells_yaw(self) -> bool:
+        """Whether any accepted one tells the yaw by itself."""
+        return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.tells_yaw for s in self.accepted)
+
+    def dropped(self, reason: str) -> JudgedSightings:
+        """The same where the graph could not take any of them."""
+        decisions = [replace(d, weight=0.0, reason=d.reason or reason) for d in self.decisions]
+        return replace(self, accepted=(), decisions=decisions)
+
+
+class SightingJudge:
+    """Holds the sightings of each step against the predicted pose."""
+
+    def __init__(self, config: Config, estimator: Estimator, tracking: Tracking) -> None:
+        """Take what knows the pose, and where else the robot may be."""
+        self._estimator = estimator
+        self._tracking = tracking
+        self._association = Association(config, estimator.factors)
+        self._rejections: Counter[str] = Counter()
+
+    @property
+    def modes(self) -> LandmarkModes:
+        """Which landmarks were moved."""
+        return self._association.modes
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What was not used so far, by reason."""
+        return self._rejections + self._association.rejections
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of landmarks, one sentence each."""
+        return tuple(moved_notes(self.modes.displacements))
+
+    @property
+    def contradicting(self) -> int:
+        """How many landmarks were rejected since a sighting was accepted."""
+        return self._association.contradicting
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of when landmarks were seen last."""
+        self._association.begin_segment()
+
+    def restart(self) -> None:
+        """The robot was found at another place."""
+        self._association.forget_contradictions()
+
+    def judge(
+        self, step: Step, sightings: Sequence[LandmarkMeasurement], motion: JudgedMotion
+    ) -> tuple[JudgedMotion, JudgedSightings]:
+        """Sort the sightings of a step; the motion is returned too, with more noise where they found it to be wrong."""
+        predicted = self._estimator.predict(motion.factors)
+        seen = self.associate(step, sightings, predicted)
+        if seen.accepted:
+            return motion, seen
+        outliers = [s.measurement for s in seen.rejected if not self.modes.excludes(s.measurement.landmark_id)]
+        place = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
+        if place is not None and self._tracking.keeps_initial_pose:
+            self._tracking.record_conflict(predicted, place)
+            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, place, CONTRADICTS)
+            return motion, replace(seen, places=(row,))
+        if place is not None or self._tracking.keeps_initial_pose:
+            return motion, replace(seen, elsewhere=place)
+        fit = self._association.nearby_consensus(seen.rejected, seen.decisions, predicted)
+        if fit is None:
+            return motion, seen
+        nearby = PoseWithCovariance(fit.pose, fit.cov)
+        row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, nearby, OVERRULED)
+        self._rejections["motion.overruled"] += 1
+        motion = motion.overruled(np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2))
+        seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
+        return motion, replace(seen, places=(row,))
+
+    def associate(
+        self, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> JudgedSightings:
+        """Accept or reject each sighting against one pose; against a given first pose that holds, reject all."""
+        judged = self._association.judge(self._estimator.k + 1, step.stamp_ns, sightings, predicted)
+        accepted, rejected, decisions = self._tracking.gate_initial_pose(*judged)
+        if held := sum(d.reason == CONTRADICTS for d in decisions):
+            self._rejections["sightings.contradict_initial_pose"] += held
+        if self._tracking.keeps_initial_pose:
+            self.modes.forget()  # they all seem moved from there
+        logged = () if self._tracking.keeps_initial_pose else rejected
+        return JudgedSightings(accepted, rejected, logged, decisions, predicted)
+
+    def begin_graph(self, seen: JudgedSightings, belief: PoseWithCovariance) -> None:
+        """The graph begins with these sightings, which made a pose of the predicted one."""
+        self.modes.restart()
+        self.modes.observe((), seen.predicted, belief, seen.accepted)
+
+    def exclude_moved(self, step: Step, motion: JudgedMotion, seen: JudgedSightings) -> tuple[list[Decision], bool]:
+        """Leave out a landmark that was moved; take back what it did to the newest pose.
+
+        Returns:
+            The rows of ``steps.csv``, and whether the pose was set anew.
+        """
+        k = self._estimator.k
+        belief = self._estimator.log.keyframes[k].belief
+        moved = self.modes.observe(motion.factors, seen.predicted, belief, seen.accepted, seen.logged)
+        if moved is None:
+            return [], False
+        without, nis = self.modes.exclude(moved, belief)
+        if without is not belief:
+            self._estimator.correct(without, moved)
+        row = Decision(k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", ALARM)
+        return [row], without is not belief
