@@ -7,15 +7,16 @@ docs/adding-a-sensor.md goes through one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum, StrEnum
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.field_checks import FieldChecks
 from fgloc.sensors.topic_checks import Collector, TimingOnly
-from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement
+from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement, Setting
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
@@ -79,12 +80,96 @@ class Joined(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Turn:
+    """How far the robot turned over a step.
+
+    Attributes:
+        yaw: [rad], rid of the bias.
+        variance: [rad²], of the noise and of what the bias may be off.
+        noise: [rad²], of the noise alone.
+    """
+
+    yaw: float
+    variance: float
+    noise: float = 0.0
+
+
+class MotionRole(StrEnum):
+    """What a motion source is to the others."""
+
+    ODOMETER = "odometer"  # always there, and what others are compared to
+    MODEL = "model"  # predicts the motion from control inputs
+    RATE = "rate"  # measures the turn alone
+
+
+class Rank(IntEnum):
+    """Where a parameter of the installation stands in the state."""
+
+    GAIN = 0
+    CLOCK = 1
+    MODEL = 2
+
+
+class Parameter(NamedTuple):
+    """A parameter of the installation that motions depend on.
+
+    Attributes:
+        name: ``sensor.parameter``.
+        sigma: of the prior; 0: it is exact.
+        rank: its place among the parameters of all sensors.
+    """
+
+    name: str
+    sigma: float
+    rank: Rank = Rank.GAIN
+
+
+class FoundRow(NamedTuple):
+    """A value of ``metrics.json`` that a parameter makes: ``at + gain * parameter``."""
+
+    name: str
+    parameter: str
+    at: float
+    gain: float
+
+
+class InstallationState(Protocol):
+    """What a run has found of the installation."""
+
+    def value(self, name: str) -> float:
+        """Of a parameter; 0 if it is no state."""
+
+    def setting(self, name: str, given: float, found: float, gains: Mapping[str, float]) -> Iterator[Setting]:
+        """A setting that depends on parameters with these derivatives; none if it depends on no state."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionInstallation:
+    """The parameters of one motion source.
+
+    Attributes:
+        parameters: with their priors, from all settings and the roles that there are.
+        found: rows of ``metrics.json``, from all settings.
+        settings: the lines of ``robot.yaml`` that a run makes of what it found.
+        sigmas: the setting that takes the sigma of another one back, by that one.
+    """
+
+    parameters: Callable[[Config, Collection[MotionRole]], tuple[Parameter, ...]]
+    found: Callable[[Config], tuple[FoundRow, ...]]
+    settings: Callable[[InstallationState, Config], Iterator[Setting]]
+    sigmas: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class BuiltIn:
     """What a sensor of fgloc itself brings: as much of `Sensor` as it shares with those of other packages.
 
     Attributes:
         name: of its rows in ``steps.csv``, and in the counts.
         streams: what it reads.
+        title: in sentences; "": its name.
+        role: as a motion source; None: it is none.
+        installation: what it is off by; of a motion source.
         failing_as: by what name failures call it; "": by its own.
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
@@ -97,6 +182,9 @@ class BuiltIn:
 
     name: str
     streams: tuple[Stream, ...] = ()
+    title: str = ""
+    role: MotionRole | None = None
+    installation: MotionInstallation | None = None
     failing_as: str = ""
     failures: Callable[[], tuple[type[Any], ...]] = tuple
     carried: Callable[[Any], Callable[[Event], Event]] | None = None

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fgloc.extensions import outside_sensors
-from fgloc.sensors.base import BuiltIn, Context, Converter, Joined, Sensor, Stream
+from fgloc.sensors.base import (
+    BuiltIn,
+    Context,
+    Converter,
+    Joined,
+    MotionInstallation,
+    MotionRole,
+    Parameter,
+    Sensor,
+    Stream,
+)
 from fgloc.types import Event, LandmarkSighting
 
 if TYPE_CHECKING:
-    from fgloc.config import Section
+    from fgloc.config import Config, Section
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
 
@@ -21,12 +31,13 @@ def built_in() -> tuple[BuiltIn, ...]:
     """The built-in sensors: one line each."""
     from fgloc.sensors.commands import COMMANDS
     from fgloc.sensors.gyro.sensor import GYRO
+    from fgloc.sensors.learned.sensor import LEARNED
     from fgloc.sensors.marker_pose.sensor import MARKER_POSE
     from fgloc.sensors.markers.sensor import MARKERS
     from fgloc.sensors.range_bearing.sensor import RANGE_BEARING
     from fgloc.sensors.wheels.sensor import WHEELS
 
-    return (WHEELS, COMMANDS, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
+    return (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
 
 
 def sensors() -> tuple[type[Sensor], ...]:
@@ -97,6 +108,39 @@ def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
         if sensor.carried is not None:
             made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.carried(carriage))
     return made
+
+
+class MotionNames(NamedTuple):
+    """Names of the motion sources: of their measurements, in ``steps.csv``, of their sections of the installation."""
+
+    odometer: str
+    model: str
+    rate: str
+
+
+@cache
+def motion_names() -> MotionNames:
+    """Which sensor has which role as a motion source."""
+    names = {sensor.role: sensor.name for sensor in built_in() if sensor.role is not None}
+    return MotionNames(*(names[role] for role in MotionRole))
+
+
+def title_of(name: str) -> str:
+    """Of a sensor, in sentences."""
+    return next((sensor.title for sensor in built_in() if sensor.name == name and sensor.title), name)
+
+
+def motion_installations() -> tuple[MotionInstallation, ...]:
+    """What the motion sources are off by: odometer, rate sensor, model."""
+    order = (MotionRole.ODOMETER, MotionRole.RATE, MotionRole.MODEL)
+    by_role = {sensor.role: sensor.installation for sensor in built_in()}
+    return tuple(made for role in order if (made := by_role[role]) is not None)
+
+
+def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+    """Parameters of the motion sources in the order in which they stand in the state."""
+    made = [p for installation in motion_installations() for p in installation.parameters(config, roles)]
+    return tuple(sorted(made, key=lambda p: p.rank))
 
 
 def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:

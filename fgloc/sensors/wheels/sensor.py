@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fgloc.sensors.base import BuiltIn, Joined, Stream
+from fgloc.sensors.base import BuiltIn, Joined, MotionRole, Stream
 from fgloc.sensors.wheels import messages, validation
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.findings import OdometryChecks
+from fgloc.sensors.wheels.installation import INSTALLATION
 from fgloc.types import Event
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ WHEELS = BuiltIn(
             validator=validation.joints,
         ),
     ),
+    role=MotionRole.ODOMETER,
+    installation=INSTALLATION,
     failures=_failures,
     carried=_carried,
     joined=_joined,
