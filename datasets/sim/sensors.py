@@ -14,6 +14,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from datasets.bag import BagWriter
 from datasets.convert import Message
@@ -204,7 +205,7 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
     camera = scene.installed.believed.camera
     assert camera is not None
     mounted = {
-        "camera_optical": (camera.position, quaternion_of(camera.rotation)),
+        "camera_optical": (camera.position, Rotation.from_matrix(camera.rotation).as_quat()),
         "imu_link": (scene.scenario.imu.position, np.array([0.0, 0.0, 0.0, 1.0])),
     }
     for frame, (position, quaternion) in mounted.items():
@@ -297,10 +298,3 @@ def _received(scene: Scene, channel: str, stamps: list[int]) -> list[int]:
     rng = channel_rng(scene.seed, f"latency of {channel}")
     late: IntArray = np.array(stamps) + np.round(1e9 * (least + rng.exponential(mean, len(stamps)))).astype(np.int64)
     return [int(s) for s in np.maximum.accumulate(late)]
-
-
-def quaternion_of(rotation: NDArray[np.float64]) -> FloatArray:
-    """Quaternion x, y, z, w of a rotation matrix ``(3, 3)``."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotation).as_quat())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from operator import is_not
 from typing import Any
 
 import gtsam
@@ -160,6 +161,7 @@ class LandmarkFactors:
         self._corners: dict[int, FloatArray] = {}
         self.installation = Installation({}) if installation is None else installation
         self._believed = self.installation.prior()
+        self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
 
     @property
@@ -207,10 +209,14 @@ class LandmarkFactors:
         return LandmarkFactor(m, alone or m, cauchy_k)
 
     def observe(self, measurements: Sequence[LandmarkMeasurement]) -> Observations:
-        """Sightings of the known map, prepared for being linearized."""
+        """Sightings of the known map, prepared for being linearized; of the same as the last time, once."""
         if self._known is None:
             raise EstimatorError("sightings are linearized against a known map only")
-        return Observations(measurements, self._known, self.installation)
+        held, observed = self._prepared
+        if observed is None or len(held) != len(measurements) or any(map(is_not, held, measurements)):
+            held, observed = tuple(measurements), Observations(measurements, self._known, self.installation)
+            self._prepared = held, observed
+        return observed
 
     def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> list[Linearized]:
         """Each sighting at a pose and the installation as it is known now.
