@@ -34,7 +34,8 @@ from fgloc.live import Live, LivePose
 from fgloc.recording.cdr import Messages
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import Storage
-from fgloc.types import Estimate, Event, FloatArray, ImageEvent, IntArray, TruthEvent
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Estimate, Event, FloatArray, IntArray, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 _TIMED = ("installed_run", "patches_run", "light_drop_run")

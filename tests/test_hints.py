@@ -13,8 +13,8 @@ from fgloc.config import Config, RecordingConfig
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import decode
-from fgloc.types import ImageEvent
 
 SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
 
@@ -34,7 +34,7 @@ def short_bag(folder: Path, pictures, change) -> Path:
         bag.static_transform(10**18, "base_link", "camera_optical", [0, 0, 0.2], [-0.5, 0.5, -0.5, 0.5])
         for i, image in enumerate(pictures):
             stamp = 10**18 + i * 10**8
-            bag.camera_info("/camera/camera_info", stamp, 640, 480, K, [0, 0, 0, 0, 0])
+            bag.camera_info("/camera/camera_info", stamp, (640, 480), K, [0, 0, 0, 0, 0])
             bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (0.0, 0.0))
             coded = cv2.imencode(".png", np.ascontiguousarray(change(image)))[1].tobytes()
             bag.compressed_image("/camera/image/compressed", stamp, coded, "png")

@@ -17,21 +17,21 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.corner_batch import MIN_DEPTH_M
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import Observations
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
     MotionMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
     PoseMeasurement,
-    RangeBearingMeasurement,
 )
 
 # Usual constants, of whitened residuals. Sources: Zhang 1997, "Parameter estimation techniques"; Agarwal et al. 2013,
@@ -86,7 +86,7 @@ def installed_motion_factor(
 
 
 def installed_prior_factor(
-    k: int, prior: PoseWithCovariance, belief: InstallationBelief
+    k: int, prior: PoseWithCovariance, belief: InstallationEstimate
 ) -> list[gtsam.NonlinearFactor]:
     """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone."""
     known = prior.installation or belief
@@ -160,24 +160,24 @@ class LandmarkFactors:
         self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
         self._corners: dict[int, FloatArray] = {}
         self.installation = Installation({}) if installation is None else installation
-        self._believed = self.installation.prior()
+        self._estimated = self.installation.prior()
         self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
 
     @property
-    def believed(self) -> InstallationBelief:
+    def estimated(self) -> InstallationEstimate:
         """What is known of the installation now."""
-        return self._believed
+        return self._estimated
 
-    @believed.setter
-    def believed(self, belief: InstallationBelief) -> None:
-        self._believed = belief
+    @estimated.setter
+    def estimated(self, belief: InstallationEstimate) -> None:
+        self._estimated = belief
         self._remembered = np.zeros(3), {}
 
     @property
     def time_offset_s(self) -> float:
         """How late stamps of sightings are, as far as is known."""
-        return self.installation.time_offset(self.believed)
+        return self.installation.time_offset(self.estimated)
 
     @property
     def known(self) -> bool:
@@ -202,7 +202,7 @@ class LandmarkFactors:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
         if not isinstance(m, PoseMeasurement) and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
-        if not isinstance(m, CornerMeasurement) and (problem := covariance_problem(m.cov)):
+        if not isinstance(m, PixelMeasurement) and (problem := covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
@@ -226,16 +226,16 @@ class LandmarkFactors:
         at, held = self._remembered
         if at is pose and all(id(m) in held for m in measurements):
             return [held[id(m)][1] for m in measurements]
-        lines = self.observe(measurements).linearize(pose, self.believed.mean)
+        lines = self.observe(measurements).linearize(pose, self.estimated.mean)
         self._remembered = pose, {id(m): (m, one) for m, one in zip(measurements, lines, strict=True)}
         return lines
 
     def whitening(self, one: Linearized) -> FloatArray:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""
-        cov = one.noise() + one.H @ self.believed.cov[np.ix_(one.columns, one.columns)] @ one.H.T
+        cov = one.noise() + one.H @ self.estimated.cov[np.ix_(one.columns, one.columns)] @ one.H.T
         return sighting_whitening(cov)
 
-    def depth(self, m: CornerMeasurement, pose: FloatArray) -> float:
+    def depth(self, m: PixelMeasurement, pose: FloatArray) -> float:
         """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""
         if self._known is None:
             raise EstimatorError("the depth of a marker needs a known map")
@@ -247,7 +247,7 @@ class LandmarkFactors:
         T = m.camera.T_base_cam
         return float(((base - T[:3, 3]) @ T[:3, 2]).min())
 
-    def lookalikes(self, m: CornerMeasurement, pose: FloatArray) -> list[int]:
+    def lookalikes(self, m: PixelMeasurement, pose: FloatArray) -> list[int]:
         """Other markers of the same size that the base at this pose sees about where this one was seen.
 
         None of them where they hang so densely that the place does not tell.
@@ -274,11 +274,11 @@ class LandmarkFactors:
         return found if len(found) <= _MOST_LOOKALIKES else []
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-        if isinstance(m, RangeBearingMeasurement):
+        if isinstance(m, PointMeasurement):
             noise = robust(gaussian(m.cov), cauchy_k)
             bearing = gtsam.Rot2(m.bearing_rad)
             return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
-        if isinstance(m, MarkerPoseMeasurement):
+        if isinstance(m, FrameMeasurement):
             noise = robust(gaussian(m.cov), cauchy_k)
             measured = gtsam.Pose2(*m.pose)
             return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), measured, noise)

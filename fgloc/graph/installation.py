@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc.config import Config
+from fgloc.sensors import registry
+from fgloc.sensors.base import MotionRole
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
@@ -23,7 +25,7 @@ TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its bloc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InstallationBelief:
+class InstallationEstimate:
     """Mean ``(n,)`` and covariance ``(n, n)`` of the installation state."""
 
     mean: FloatArray
@@ -80,9 +82,9 @@ class Installation:
     def __len__(self) -> int:
         return len(self.names)
 
-    def prior(self) -> InstallationBelief:
+    def prior(self) -> InstallationEstimate:
         """Before anything was measured."""
-        return InstallationBelief(self._prior_mean.copy(), self._prior_cov.copy())
+        return InstallationEstimate(self._prior_mean.copy(), self._prior_cov.copy())
 
     def measured(self, row: FloatArray, value: float, sigma: float) -> None:
         """Take a measurement of the parameters into the prior.
@@ -97,7 +99,7 @@ class Installation:
         cov = self._prior_cov - np.outer(gain, row @ self._prior_cov)
         self._prior_cov = 0.5 * (cov + cov.T)
 
-    def time_offset(self, belief: InstallationBelief) -> float:
+    def time_offset(self, belief: InstallationEstimate) -> float:
         """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
         for section, row in TIME_OFFSET.items():
             if section in self.blocks:
@@ -136,17 +138,10 @@ def installation_of(
         most: landmarks of a map that are states; a larger map is taken as exact.
         has_model: whether there is a learned motion.
     """
-    wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
-    sigmas = {
-        "wheels.radius": wheels.scale_sigma,
-        "wheels.track": wheels.turn_scale_sigma,
-        "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
-        "wheels.slowdown": wheels.slowdown_sigma,
-        "wheels.delay_s": wheels.delay_sigma_s,
-        "gyro.scale": gyro.scale_sigma if has_gyro else 0.0,
-        "wheels.time_offset_s": wheels.time_offset_sigma_s if has_gyro else 0.0,
-        "learned.scale": config.motion.scale_sigma if has_model else 0.0,
-    }
+    camera, rb = config.camera, config.landmarks
+    there = {MotionRole.ODOMETER: True, MotionRole.RATE: has_gyro, MotionRole.MODEL: has_model}
+    roles = [role for role, is_there in there.items() if is_there]
+    sigmas = {parameter.name: parameter.sigma for parameter in registry.motion_parameters(config, roles)}
     if landmark_map is None:
         return Installation(sigmas)
     if corners:

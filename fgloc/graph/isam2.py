@@ -32,9 +32,9 @@ from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.types import (
     FloatArray,
+    FrameMeasurement,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PointMeasurement,
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
@@ -203,7 +203,7 @@ class IncrementalEstimator(Estimator):
         self._fresh = False
         if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
-            if known is self.factors.believed:
+            if known is self.factors.estimated:
                 lines = self.factors.linearize(measurements, initial.pose)
             else:
                 lines = self.factors.observe(measurements).linearize(initial.pose, known.mean)
@@ -223,12 +223,12 @@ class IncrementalEstimator(Estimator):
         if self.factors.known or m.landmark_id in self._landmarks:
             return
         key = landmark_key(m.landmark_id)
-        if isinstance(m, RangeBearingMeasurement):
+        if isinstance(m, PointMeasurement):
             initial = se2.compose(
                 pose, [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), m.bearing_rad]
             )
             values.insert(key, initial[:2])
-        elif isinstance(m, MarkerPoseMeasurement):
+        elif isinstance(m, FrameMeasurement):
             initial = se2.compose(pose, m.pose)
             values.insert(key, gtsam.Pose2(*initial))
         else:
@@ -238,7 +238,7 @@ class IncrementalEstimator(Estimator):
     def _rebuild(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
         """Build the window again from the log, without the sightings of the offending step."""
         self.rebuilt += 1
-        frame.refused = (*frame.refused, *frame.sightings)
+        frame.rejected = (*frame.rejected, *frame.sightings)
         frame.sightings = ()
         try:
             frame.belief = self._replayed([*self._window(frame), frame], initial)

@@ -13,18 +13,8 @@ from fgloc.recording.reader import Recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.replay.options import EventFilter, Progress, RunOptions
 from fgloc.sensors.markers.detector import Detector, detect_stream
-from fgloc.types import (
-    CornersEvent,
-    Decision,
-    Estimate,
-    Event,
-    ImageEvent,
-    SensorEvent,
-    SightingsEvent,
-    Step,
-    TopicTimes,
-    TruthEvent,
-)
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.types import Decision, Estimate, Event, SensorEvent, SightingsEvent, Step, TopicTimes, TruthEvent
 
 
 class Replay:
@@ -99,7 +89,7 @@ class Replay:
             self.estimates = estimates
 
     def rejections(self) -> Counter[str]:
-        """Everything refused anywhere, by reason."""
+        """Everything rejected anywhere, by reason."""
         total = self._parts.rejections
         total.update(self._image_rejections)
         return total
