@@ -112,7 +112,7 @@ class GateConfig(Section):
     gap_s: float = Field(1.0, gt=0, le=1e9, description="a silence of a sensor longer than this is reported")
     clock_jump_s: float = Field(60.0, gt=0, le=1e9, description="a jump ahead larger than this starts a new segment")
     clock_back_s: float = Field(1.0, gt=0, le=1e9, description="a jump back larger than this starts a new segment")
-    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is not believed")
+    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is rejected")
 
 
 class KeyframesConfig(Section):
@@ -278,7 +278,7 @@ class LandmarksConfig(Section):
     )
     cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
     min_sightings: int = Field(
-        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is believed"
+        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is used"
     )
     repeat_s: float = Field(
         0.0,

@@ -94,7 +94,7 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
     def write_odometry(i: int, received: int) -> None:
         (poses, twists, *_), k = rows.at(i)
-        bag.odometry("/odom", stamps[i] + late, poses[k], twists[k], twist_cov=twist_cov, received_ns=received)
+        bag.odometry("/odom", stamps[i] + late, poses[k], twists[k], received, (None, twist_cov))
 
     def write_joints(i: int, received: int) -> None:
         (*_, angles, rates, effort), k = rows.at(i)
@@ -130,8 +130,7 @@ def _imu(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
             stamps[i] + late,
             gyro[k],
             accel[k],
-            angular_velocity_variance=imu.gyro_noise**2,
-            linear_acceleration_variance=imu.accel_noise**2,
+            variances=(imu.gyro_noise**2, imu.accel_noise**2),
             received_ns=received,
         )
 
@@ -272,7 +271,7 @@ def _write_lens(scene: Scene, bag: BagWriter, stamp: int, received: int) -> None
     assert camera is not None
     assert believed is not None
     size = (camera.width, camera.height)
-    bag.camera_info("/camera/camera_info", stamp, *size, believed.matrix, believed.distortion, received_ns=received)
+    bag.camera_info("/camera/camera_info", stamp, size, believed.matrix, believed.distortion, received_ns=received)
 
 
 def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:

@@ -20,7 +20,7 @@ from fgloc.graph.factors import (
     pose_key,
     prior_factor,
 )
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
@@ -114,29 +114,29 @@ class BatchSmoother:
         self._motions = BatchMotions(self.frames, self._factors.installation)
         self._optimize()
 
-    def installed(self) -> InstallationBelief:
+    def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found."""
         n = len(self._factors.installation)
         if not n:
-            return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
+            return InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
         marginals = self._marginals()
-        return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+        return InstallationEstimate(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def cost(self) -> float:
         """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
 
         Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
-        keyframe; a sighting that is left out counts as the least that would be refused.
+        keyframe; a sighting that is left out counts as the least that would be rejected.
         """
         total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
         if self._sightings is None:
             factors = [f for some in self.accepted.values() for s in some for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
-        refused = BatchSightings(self.frames, [frame.refused for frame in self.frames], self._factors)
-        for squares, rows in (s.squares(self.poses(), self._theta()) for s in (self._sightings, refused)):
+        rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
+        for squares, rows in (s.squares(self.poses(), self._theta()) for s in (self._sightings, rejected)):
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
-        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.refused)]
+        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
         covs = [s.alone.cov for s in seen if not isinstance(s.measurement, CornerMeasurement)]  # type: ignore[union-attr]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())

@@ -157,7 +157,7 @@ class Extrapolator:
 
     def _carried(self, held: _Held, step: Step) -> PoseWithCovariance:
         anchor, means = held.anchor, held.means
-        means.factors.believed = anchor.known
+        means.factors.estimated = anchor.known
         sensors = MotionSensors(
             held.wheels,
             None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),

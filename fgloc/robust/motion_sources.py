@@ -126,7 +126,7 @@ class MotionSources:
             derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
         if turn is not None:
             derivatives["gyro.scale"] = phi * by_turn
-        index, mean = self.factors.installation.index, self.factors.believed.mean
+        index, mean = self.factors.installation.index, self.factors.estimated.mean
         kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)

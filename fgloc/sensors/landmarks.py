@@ -33,7 +33,7 @@ from fgloc.types import (
 )
 
 _MIN_RANGE_M = 1e-3
-_CLEAR_RATIO = 2.0  # a marker's pose is believed if the mirrored one explains its corners this much worse
+_CLEAR_RATIO = 2.0  # a marker's pose is unambiguous if the mirrored one explains its corners this much worse
 _MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
 _MIN_COS_ALONG_AXIS = math.cos(math.radians(80.0))  # beyond it a distance along the axis says nothing of the range
 _S = TypeVar("_S", MarkerCorners, MarkerPose, RangeBearing)

@@ -17,7 +17,7 @@ from fgloc.types import FloatArray, ImuEvent, JointsEvent, Step
 
 MAX_GAP_S = 0.25  # a signal that was silent for longer has a hole
 _E = TypeVar("_E", ImuEvent, JointsEvent)
-_FOREVER_S = 1e4  # the first and the last values hold on; who asks decides whether to believe them
+_FOREVER_S = 1e4  # the first and the last values hold on; who asks decides for how long
 
 
 class Signal:
