@@ -12,7 +12,8 @@ from robot_world import CAMERA, SIGMA_PX, Chain, World, config, position_error, 
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.association import Association
-from fgloc.types import CornerMeasurement, CornersEvent, Landmark, LandmarkMap
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.types import Landmark, LandmarkMap, PixelMeasurement
 
 SHARE = 0.4
 
@@ -22,10 +23,10 @@ def hanging(landmark_id: int, along: float) -> Landmark:
     return standing(landmark_id, 3.0, along, math.pi)
 
 
-def measured(world_map: LandmarkMap, landmark_id: int, read: int | None = None) -> CornerMeasurement:
+def measured(world_map: LandmarkMap, landmark_id: int, read: int | None = None) -> PixelMeasurement:
     """As seen from the origin, and the id that was read."""
     corners = project(np.zeros(3), world_map.landmarks[landmark_id])
-    return CornerMeasurement(10**9, landmark_id if read is None else read, corners, SIGMA_PX, CAMERA)
+    return PixelMeasurement(10**9, landmark_id if read is None else read, corners, SIGMA_PX, CAMERA)
 
 
 def misread(events, ids, share: float, seed: int = 5):
@@ -35,9 +36,11 @@ def misread(events, ids, share: float, seed: int = 5):
         if isinstance(event, CornersEvent):
             seen = []
             for s in event.sightings:
-                other = int(rng.choice([i for i in ids if i != s.marker_id])) if rng.uniform() < share else s.marker_id
-                truth.setdefault((event.stamp_ns, other), []).append(s.marker_id)
-                seen.append(replace(s, marker_id=other))
+                other = (
+                    int(rng.choice([i for i in ids if i != s.landmark_id])) if rng.uniform() < share else s.landmark_id
+                )
+                truth.setdefault((event.stamp_ns, other), []).append(s.landmark_id)
+                seen.append(replace(s, landmark_id=other))
             event = replace(event, sightings=tuple(seen))
         made.append(event)
     return made, truth

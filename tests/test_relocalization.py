@@ -14,16 +14,15 @@ from fgloc.localizer import Localizer
 from fgloc.relocalization.global_search import GlobalSearch
 from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     Estimate,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerPoseMeasurement,
     Mode,
     MotionMeasurement,
-    RangeBearing,
-    RangeBearingEvent,
-    RangeBearingMeasurement,
+    PointMeasurement,
     Step,
 )
 
@@ -54,11 +53,10 @@ class Beacons:
 
     sees_corners = False
 
-    def measure(self, event: RangeBearingEvent) -> tuple[RangeBearingMeasurement, ...]:
+    def measure(self, event: RangeBearingEvent) -> tuple[PointMeasurement, ...]:
         cov = np.diag([1e-4, 1e-3])
         return tuple(
-            RangeBearingMeasurement(event.stamp_ns, s.landmark_id, s.range_m, s.bearing_rad, cov)
-            for s in event.sightings
+            PointMeasurement(event.stamp_ns, s.landmark_id, s.range_m, s.bearing_rad, cov) for s in event.sightings
         )
 
 
@@ -122,7 +120,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     for k in range(40):
         at = step(k, np.zeros(3), ())
         seen = [
-            MarkerPoseMeasurement(at.stamp_ns, i, rng.uniform(-3.0, 3.0, 3), np.diag([1e-4, 1e-4, 1e-3]))
+            FrameMeasurement(at.stamp_ns, i, rng.uniform(-3.0, 3.0, 3), np.diag([1e-4, 1e-4, 1e-3]))
             for i in range(len(PLACES))
         ]
         fits.clear()
