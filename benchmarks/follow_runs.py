@@ -34,6 +34,7 @@ class Cell:
     seed: int
     case: str
     pose: PoseName
+    corners: bool = False  # of markers, not images
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,8 @@ def run_all(cells: Sequence[Cell], jobs: int | None = None) -> dict[Cell, Driven
 
 def kept(cell: Cell) -> Driven:
     """A drive from the cache, or driven now and put there."""
-    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{_sources()}.json"
+    sees = "corners" if cell.corners else "images"
+    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{sees}_{_sources()}.json"
     if path.is_file():
         return Driven(**json.loads(path.read_text(encoding="utf-8")))
     made = _driven(cell)
@@ -76,7 +78,7 @@ def kept(cell: Cell) -> Driven:
 
 def _driven(cell: Cell) -> Driven:
     try:
-        score = follow(drive_of(cell.case, cell.pose, cell.seed)).score
+        score = follow(drive_of(cell.case, cell.pose, cell.seed, "corners" if cell.corners else "images")).score
     except FglocError as error:
         return Driven(failed=str(error))
     return Driven(score.track_mm, score.reached, score.arrived, score.pose_mm, score.seconds)

@@ -30,7 +30,8 @@ from fgloc.config import load_config
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose
 from fgloc.recording.reader import open_recording
-from fgloc.types import Estimate, Event, FloatArray, ImageEvent, TruthEvent
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Estimate, Event, FloatArray, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 _TIMED = ("installed_run", "patches_run", "light_drop_run")

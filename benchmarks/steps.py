@@ -38,20 +38,11 @@ from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.timing import Stopwatch
-from fgloc.types import (
-    Camera,
-    CommandEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    OdometryEvent,
-)
+from fgloc.types import Camera, ControlEvent, Event, FloatArray, Landmark, LandmarkMap
 
 _ROOT = Path(__file__).resolve().parent.parent
 _SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
@@ -71,7 +62,7 @@ def measure(quick: bool) -> Iterator[Row]:
     yield from _long_run(minutes)
 
 
-class _World:
+class World:
     """Events of the swaying robot, made as they are asked for."""
 
     def __init__(self, seed: int = 0) -> None:
@@ -93,7 +84,7 @@ class _World:
             if tick % 2 == 0:
                 yield self._odometry(stamp, pose, v, omega)
             if tick % 5 == 0:
-                yield CommandEvent(stamp, stamp, "/cmd_vel", v, omega)
+                yield ControlEvent(stamp, stamp, "/cmd_vel", v, omega)
                 yield self._corners(stamp, pose)
             pose = se2.compose(pose, se2.exp((v * 0.01, 0.0, omega * 0.01)))
 
@@ -131,19 +122,19 @@ class _World:
         return CornersEvent(stamp, stamp, "/detections", "camera", tuple(seen))
 
 
-class _Chain:
+class Chain:
     """Gate, stepper and localizer on a world, as the runner has them."""
 
-    def __init__(self, world: _World, keep_times: bool = False) -> None:
+    def __init__(self, world: World, keep_times: bool = False, keep_all: bool = False, with_model: bool = True) -> None:
         config = Config.model_validate({"wheels": {"source": "twist"}})
         self.gate = EventValidator(config.gate, set(world.map.landmarks))
         self.stepper = KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s)
-        model = load_model(_MODEL)
         wheels, landmarks = WheelMotion(config.wheels), LandmarkSensor(config, world.map, world.camera, None)
-        learned = LearnedMotion(model, config.motion)
-        self.localizer = Localizer(
-            config, world.map, MotionSensors(wheels, learned, model.joint), PoseSensors(landmarks)
-        )
+        motion = MotionSensors(wheels)
+        if with_model:
+            model = load_model(_MODEL)
+            motion = MotionSensors(wheels, LearnedMotion(model, config.motion), model.joint)
+        self.localizer = Localizer(config, world.map, motion, PoseSensors(landmarks), keep_all)
         self.localizer.stopwatch = Stopwatch(keep=keep_times)
         self.config = config
 
@@ -166,25 +157,25 @@ class _Chain:
 def _phases_and_ratio(seconds: float) -> Iterator[Row]:
     """Time by phase, and of the same factors given to bare GTSAM."""
     with _mirrored() as mirrors:
-        chain = _Chain(_World(), keep_times=True)
+        chain = Chain(World(), keep_times=True)
         clock, estimator = chain.localizer.stopwatch, chain.localizer.estimator
-        update_s: list[float] = []
-        bare_s: list[float] = []
-        fuse_s: list[float] = []
-        for _, cpu_s in chain.updates(_World().events(seconds)):
+        times: list[tuple[float, float, float, float]] = []  # update (processor), fuse (wall), bare (wall, processor)
+        steps = 0
+        for _, cpu_s in chain.updates(World().events(seconds)):
             bare = mirrors[-1].follow(estimator.k) if mirrors else None
-            if bare is not None:
-                update_s, bare_s = [*update_s, cpu_s], [*bare_s, bare]
-                fuse_s.append(clock.samples["fuse"][-1])
-    steps = len(clock.samples["fuse"])
+            fused = clock.samples.get("fuse", ())
+            if bare is not None and len(fused) > steps:
+                times.append((cpu_s, fused[-1], *bare))
+            steps = len(fused)
     for phase in ("gate", "stepper", "motion", "sightings", "weigh", "fuse"):
         sample = np.array(clock.samples[phase]) * 1e6
         yield Row(f"steps.{phase}_us", float(sample.sum()) / steps, float(np.std(sample)), steps, "us/step")
-    n = len(bare_s)
-    yield Row("steps.bare_gtsam_us", float(np.mean(bare_s)) * 1e6, float(np.std(bare_s)) * 1e6, n, "us/step")
-    yield Row("online.fuse_over_gtsam", sum(fuse_s) / sum(bare_s), n=n)
-    yield Row("online.fuse_over_gtsam_median", float(np.median(fuse_s) / np.median(bare_s)), n=n)
-    yield Row("online.update_over_gtsam", float(np.median(update_s) / np.median(bare_s)), n=n)
+    update, fuse, bare_wall, bare_cpu = np.array(times).T
+    n = len(update)
+    yield Row("steps.bare_gtsam_us", float(bare_wall.mean()) * 1e6, float(bare_wall.std()) * 1e6, n, "us/step")
+    yield Row("online.fuse_over_gtsam", float(fuse.sum() / bare_wall.sum()), n=n)
+    yield Row("online.fuse_over_gtsam_median", float(np.median(fuse) / np.median(bare_wall)), n=n)
+    yield Row("online.update_over_gtsam", float(np.median(update) / np.median(bare_cpu)), n=n)
 
 
 class _Mirror:
@@ -195,17 +186,17 @@ class _Mirror:
         self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(*arguments))
         self.pending: list[tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, float], list[int]]] = []
 
-    def follow(self, k: int) -> float | None:
-        """Take what is pending; seconds of processor time of a step that was one update, with pose and covariance."""
+    def follow(self, k: int) -> tuple[float, float] | None:
+        """Take what is pending; wall and processor seconds of a step that was one update, with pose and covariance."""
         pending, self.pending = self.pending, []
-        start = time.thread_time()
+        start, cpu_start = time.perf_counter(), time.thread_time()
         for update in pending:
             self._smoother.update(*update)
         if not pending:
             return None
         self._smoother.calculateEstimatePose2(pose_key(k))
         self._smoother.marginalCovariance(pose_key(k))
-        return time.thread_time() - start if len(pending) == 1 else None
+        return (time.perf_counter() - start, time.thread_time() - cpu_start) if len(pending) == 1 else None
 
 
 @contextmanager
@@ -231,9 +222,9 @@ def _mirrored() -> Iterator[list[_Mirror]]:
 
 def _long_run(minutes: int) -> Iterator[Row]:
     """An hour of updates: the tail, the growth of time and of memory."""
-    chain = _Chain(_World())
+    chain = Chain(World())
     times, n, memory_kb = np.ones((2000 * minutes, 2)), 0, {}  # memory of its own, taken from the start
-    for wall_and_cpu in chain.updates(_World().events(60.0 * minutes)):
+    for wall_and_cpu in chain.updates(World().events(60.0 * minutes)):
         times[n] = wall_and_cpu
         n += 1
         if n in (1200, 1200 * minutes - 20):

@@ -10,16 +10,9 @@ from exact import exact
 from robot_world import START_NS, Chain, polar, project, standing
 
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.types import (
-    CornersEvent,
-    Decision,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    RangeBearing,
-    RangeBearingEvent,
-    Step,
-)
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.types import Decision, Landmark, LandmarkMap, Step
 
 SURE, UNSURE = (0.001, 0.001, 0.001), (0.7, 0.7, 0.3)  # sigmas of the given pose: m, m, rad
 

@@ -12,11 +12,12 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, posit
 
 from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Kinematics
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.types import ImuEvent, OdometryEvent
+from fgloc.sensors.wheels.events import OdometryEvent
 
 TRACK = 0.3
 FAILS = (6.0, 11.0)  # s, in the dark

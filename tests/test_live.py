@@ -24,8 +24,10 @@ from fgloc.live import Live
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.tracking import TrackingDetector
-from fgloc.types import ImageEvent, ImuEvent, Mode
+from fgloc.types import Mode
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes

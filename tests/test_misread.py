@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from robot_world import Chain, World, config, position_error, room, standing
 
-from fgloc.types import CornersEvent, Landmark
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.types import Landmark
 
 SHARE = 0.4
 
@@ -25,9 +26,11 @@ def misread(events, ids, share: float, seed: int = 5):
         if isinstance(event, CornersEvent):
             seen = []
             for s in event.sightings:
-                other = int(rng.choice([i for i in ids if i != s.marker_id])) if rng.uniform() < share else s.marker_id
-                truth.setdefault((event.stamp_ns, other), []).append(s.marker_id)
-                seen.append(replace(s, marker_id=other))
+                other = (
+                    int(rng.choice([i for i in ids if i != s.landmark_id])) if rng.uniform() < share else s.landmark_id
+                )
+                truth.setdefault((event.stamp_ns, other), []).append(s.landmark_id)
+                seen.append(replace(s, landmark_id=other))
             event = replace(event, sightings=tuple(seen))
         made.append(event)
     return made, truth

@@ -12,16 +12,16 @@ from fgloc.config import Config
 from fgloc.localizer import Localizer
 from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Estimate,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerPoseMeasurement,
     Mode,
     MotionMeasurement,
-    RangeBearing,
-    RangeBearingEvent,
-    RangeBearingMeasurement,
+    PointMeasurement,
     Step,
 )
 
@@ -32,10 +32,11 @@ _WALL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a mark
 MOTION = np.array([0.02, 0.0, 0.0])
 
 
-class Wheels:
+class Wheels(WheelMotion):
     """Exact motion of a robot that drives straight on."""
 
-    from_commands = False
+    def __init__(self) -> None:
+        super().__init__(Config().wheels)
 
     def twist(self, step: Step, at_ns: int) -> np.ndarray:
         return MOTION * (1e9 / STEP_NS)
@@ -52,11 +53,10 @@ class Beacons:
 
     sees_corners = False
 
-    def measure(self, event: RangeBearingEvent) -> tuple[RangeBearingMeasurement, ...]:
+    def measure(self, event: RangeBearingEvent) -> tuple[PointMeasurement, ...]:
         cov = np.diag([1e-4, 1e-3])
         return tuple(
-            RangeBearingMeasurement(event.stamp_ns, s.landmark_id, s.range_m, s.bearing_rad, cov)
-            for s in event.sightings
+            PointMeasurement(event.stamp_ns, s.landmark_id, s.range_m, s.bearing_rad, cov) for s in event.sightings
         )
 
 
@@ -116,10 +116,10 @@ class Nonsense:
     def __init__(self) -> None:
         self._rng = np.random.default_rng(0)
 
-    def measure(self, event: RangeBearingEvent) -> list[MarkerPoseMeasurement]:
+    def measure(self, event: RangeBearingEvent) -> list[FrameMeasurement]:
         cov = np.diag([1e-4, 1e-4, 1e-3])
         places = self._rng.uniform(-3.0, 3.0, (len(PLACES), 3))
-        return [MarkerPoseMeasurement(event.stamp_ns, i, place, cov) for i, place in enumerate(places)]
+        return [FrameMeasurement(event.stamp_ns, i, place, cov) for i, place in enumerate(places)]
 
 
 def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
@@ -132,6 +132,6 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     sums = []
     for k in range(40):
         fits.clear()
-        assert run.update(step(k, np.zeros(3), ())) is None
+        assert run.update(step(k, np.zeros(3), (0,))) is None
         sums.append(sum(fits))
     assert 0 < max(sums) < 500  # sightings looked at in all fits of a step; one fit for each would be 40000 in the last

@@ -11,8 +11,8 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import OdometryEvent
 
 pytestmark = pytest.mark.real_data
 

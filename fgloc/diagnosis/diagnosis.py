@@ -91,7 +91,7 @@ class Diagnosis:
             if self._cutter.wants(at_s):
                 for spot in self._spotter.spots(event, at_s):
                     self._cutter.see(spot)
-        for imu in step.imu:
+        for imu in step.inertial:
             self._gyro.record(imu, self._cutter.seconds(imu.stamp_ns))
         travelled = self._cutter.travelled
         window = self._cutter.move(step, None if wheels is None else wheels.motion)

@@ -25,11 +25,11 @@ from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
     MotionMeasurement,
+    PixelMeasurement,
 )
 
 _LINEARIZATIONS = 6
@@ -129,16 +129,15 @@ class BatchSmoother:
         keyframe; a sighting that is left out counts as the least that would be rejected.
         """
         total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
-        held = [(*frame.sightings, *frame.rejected) for frame in self.frames]
-        seen = [s for some in held for s in some]
-        if not self._factors.known or not seen:
+        if self._sightings is None:
             factors = [f for some in self.accepted.values() for s in some for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
-        own = self.poses().repeat([len(some) for some in held], axis=0)
-        squares, rows = self._factors.observe([s.measurement for s in seen]).squares(own, self._theta())
-        bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
-        total += 0.5 * float(np.minimum(squares, bounds).sum())
-        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, CornerMeasurement)]  # type: ignore[union-attr]
+        rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
+        for squares, rows in (s.squares(self.poses(), self._theta()) for s in (self._sightings, rejected)):
+            bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
+            total += 0.5 * float(np.minimum(squares, bounds).sum())
+        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
+        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, PixelMeasurement)]  # type: ignore[union-attr]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total
@@ -219,12 +218,14 @@ class BatchSmoother:
             graph.add(factor)
         return graph
 
+    def factors_of_motion(self) -> Iterator[gtsam.NonlinearFactor]:
+        """Priors of poses, and motions linear about the solution."""
+        yield from self._priors()
+        yield from self._motions.factors(self.poses())
+
     def _of_motion(self) -> gtsam.NonlinearFactorGraph:
-        """Priors and motions, linear about the solution."""
         graph = gtsam.NonlinearFactorGraph()
-        for factor in self._priors():
-            graph.add(factor)
-        for factor in self._motions.factors(self.poses()):
+        for factor in self.factors_of_motion():
             graph.add(factor)
         return graph
 

@@ -102,6 +102,14 @@ class BatchSightings:
         if len(theta):
             yield self._of_installation(theta, rest)
 
+    def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Squared residual ``(m,)`` of each sighting by its own noise, and its rows, see `Observations.squares`."""
+        found = [chunk.squares(poses, theta) for chunk in self._chunks]
+        return (
+            np.concatenate([np.zeros(0), *(squares for squares, _ in found)]),
+            np.concatenate([np.zeros(0, dtype=np.int64), *(rows for _, rows in found)]),
+        )
+
     def _of_installation(self, theta: FloatArray, rest: FloatArray) -> gtsam.NonlinearFactor:
         """Its prior, and all that the sightings tell of it alone."""
         prior = self._installation.prior()
@@ -149,6 +157,10 @@ class _Images:
             same = np.array([image for image in ahead if len(image) == size])
             white = whitened(_rows(same, stack, len(theta)), shared[same].reshape(len(same), -1, shared.shape[2]))
             yield from self._of_poses(same[:, 0], white, own, theta, rest)
+
+    def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
+        """As `BatchSightings.squares`."""
+        return self._observed.squares(poses[self._row], theta)
 
     def _of_poses(
         self, first: IntArray, white: FloatArray, own: FloatArray, theta: FloatArray, rest: FloatArray

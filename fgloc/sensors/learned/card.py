@@ -177,6 +177,11 @@ class ModelCard(Section):
         return tuple(name for name in CHANNELS if name in self.inputs)
 
     @property
+    def reads_gyro(self) -> bool:
+        """Whether the model reads the gyro: its motion then has the gyro's turn in it."""
+        return "gyro" in self.inputs
+
+    @property
     def reads_wheels(self) -> bool:
         """Whether the model reads the wheels' speed: then it cannot witness their slip."""
         return "wheels" in self.inputs
