@@ -26,7 +26,8 @@ from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
-from fgloc.types import CommandEvent, Event, OdometryEvent, TruthEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent, Event, TruthEvent
 
 _ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
@@ -127,7 +128,7 @@ def _with_odometry(events: Iterable[Event]) -> Iterator[Event]:
     unknown = np.zeros((6, 6))
     for event in events:
         yield event
-        if not isinstance(event, CommandEvent):
+        if not isinstance(event, ControlEvent):
             continue
         if last_ns is not None:
             seconds = (event.stamp_ns - last_ns) * 1e-9

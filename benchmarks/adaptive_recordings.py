@@ -26,25 +26,17 @@ from rosbags.highlevel import AnyReader
 from datasets.sim.record import describe, is_recorded, robot_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
-from fgloc.config import Config, MarkersConfig
+from fgloc.config import Config
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import ImageError
-from fgloc.types import (
-    Camera,
-    CameraInfoEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    LandmarkMap,
-    MarkerCorners,
-    TruthEvent,
-)
+from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
 
 Split = Literal["train", "validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]
@@ -228,7 +220,7 @@ def _sightings(folder: Path, dictionary: str, events: Iterator[Event]) -> dict[i
                 stamps=np.array([(e.stamp_ns, e.received_ns) for e in found]),
                 frames=np.array([(e.frame_id, e.topic) for e in found]),
                 images=np.array([i for i, e in enumerate(found) for _ in e.sightings], dtype=int),
-                ids=np.array([s.marker_id for e in found for s in e.sightings], dtype=int),
+                ids=np.array([s.landmark_id for e in found for s in e.sightings], dtype=int),
                 corners=np.array([s.corners_px for e in found for s in e.sightings]).reshape(-1, 4, 2),
             )
     with np.load(path, allow_pickle=False) as held:

@@ -26,16 +26,9 @@ from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import (
-    CornersEvent,
-    Estimate,
-    Event,
-    LandmarkMap,
-    RangeBearingEvent,
-    RunResult,
-    Step,
-    Trajectory,
-)
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.types import Estimate, Event, LandmarkMap, RunResult, Step, Trajectory
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]
@@ -249,7 +242,7 @@ def carried_interval(recorded: Recorded) -> Interval:
 
 def moved_id(recorded: Recorded) -> int:
     """The landmark that is seen most often: moving another might change nothing."""
-    seen = [s.marker_id for e in recorded.events if isinstance(e, CornersEvent) for s in e.sightings]
+    seen = [s.landmark_id for e in recorded.events if isinstance(e, CornersEvent) for s in e.sightings]
     seen += [s.landmark_id for e in recorded.events if isinstance(e, RangeBearingEvent) for s in e.sightings]
     seen = [i for i in seen if i in recorded.landmarks]
     ids, counts = np.unique(seen, return_counts=True)

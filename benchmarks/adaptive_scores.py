@@ -16,7 +16,8 @@ from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.ablation.failures.sightings import MovedMarker
 from fgloc.config import Config
 from fgloc.evaluation.metrics import Metrics, compute_metrics
-from fgloc.types import CornersEvent, Decision, Event, FloatArray, Mode, RunResult
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.types import Decision, Event, FloatArray, Mode, RunResult
 
 _NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
 _NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")

@@ -33,7 +33,7 @@ from fgloc.runner import run
 from fgloc.sensors.learned import MotionModel, load_model, save_model
 from fgloc.sensors.learned.card import Kinematics, Split
 from fgloc.sensors.learned.load import model_of, read_model
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 from training.adapt import adapted
 from training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from training.data import Run, cut, make_run
@@ -177,11 +177,11 @@ def _finetuned(left_out: list[list[tuple[Path, Split]]], runs: dict[str, Run]) -
 
 def _run(recorded: mrclam.Run, name: str, data: DataConfig) -> Run:
     pairs = zip(recorded.commands_ns.tolist(), recorded.commands.tolist(), strict=True)
-    commands = [CommandEvent(stamp, stamp, "/cmd_vel", v, omega) for stamp, (v, omega) in pairs]
+    commands = [ControlEvent(stamp, stamp, "/cmd_vel", v, omega) for stamp, (v, omega) in pairs]
     return _sampled(name, commands, recorded.truth_ns, recorded.truth, data)
 
 
-def _sampled(name: str, commands: list[CommandEvent], stamps: FloatArray, poses: FloatArray, data: DataConfig) -> Run:
+def _sampled(name: str, commands: list[ControlEvent], stamps: FloatArray, poses: FloatArray, data: DataConfig) -> Run:
     return make_run(name, commands, stamps, poses, NetworkConfig().dt_s, data.history_s, data)
 
 
@@ -248,7 +248,7 @@ def _inference(name: str, model: MotionModel, quick: bool) -> Row:
     period = 50_000_000
     rng = np.random.default_rng(0)
     told = rng.uniform([0.0, -0.5], [0.1, 0.5], (4 * _STEPS + 100, 2)).tolist()
-    events = [CommandEvent(i * period, i * period, "/cmd_vel", v, omega) for i, (v, omega) in enumerate(told)]
+    events = [ControlEvent(i * period, i * period, "/cmd_vel", v, omega) for i, (v, omega) in enumerate(told)]
 
     def median_us() -> float:
         times = []

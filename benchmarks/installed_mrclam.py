@@ -88,7 +88,7 @@ def localized(robot: int) -> dict[str, float]:
 
         def note(step: Step, estimate: Estimate | None) -> None:
             if not moved_ns:
-                moved_ns.extend(c.stamp_ns for c in step.commands if c.v or c.omega)
+                moved_ns.extend(c.stamp_ns for c in step.controls if c.v or c.omega)
             if estimate is not None:
                 estimates.append(estimate)
 

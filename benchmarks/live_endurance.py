@@ -30,7 +30,8 @@ from benchmarks.live_streams import (
 from fgloc.config import Config, Role
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
-from fgloc.types import Camera, CornersEvent, Event, LandmarkMap, Step
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.types import Camera, Event, LandmarkMap, Step
 
 _MILLION = 1_000_000
 _BLOCKS = 50  # parts of the run that are timed one by one

@@ -13,20 +13,12 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
-from fgloc.live.facts import ROLE_OF
-from fgloc.types import (
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImuEvent,
-    JointsEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    OdometryEvent,
-    RangeBearing,
-    RangeBearingEvent,
-)
+from fgloc.live.facts import role_of
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap
 
 START_NS = 1_700_000_000_000_000_000
 _FED_AT_ONCE = 500  # events, between waits: a replay is faster than the estimator
@@ -55,7 +47,7 @@ def truth_of(recorded: Recorded) -> Callable[[int], FloatArray]:
 
 def roles_of(events: Iterable[Event]) -> set[Role]:
     """Roles that the events play."""
-    return {ROLE_OF[type(e)] for e in events if type(e) in ROLE_OF}
+    return {role for role in map(role_of, events) if role is not None}
 
 
 def feed(live: Live, events: Iterable[Event]) -> None:
@@ -114,7 +106,9 @@ def wrong_ids(events: Iterable[Event], ids: Iterable[int], rng: np.random.Genera
     known = np.array(sorted(ids))
     for event in events:
         if isinstance(event, CornersEvent):
-            seen = [MarkerCorners(int(rng.choice(known[known != s.marker_id])), s.corners_px) for s in event.sightings]
+            seen = [
+                MarkerCorners(int(rng.choice(known[known != s.landmark_id])), s.corners_px) for s in event.sightings
+            ]
             event = dataclasses.replace(event, sightings=tuple(seen))
         yield event
 

@@ -110,9 +110,9 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "blur_noise",
         "Noise of corners grows with the speed of the image.",
-        ("sensors/landmarks.py", "graph/corner_batch.py"),
-        (Switch("fgloc.sensors.landmarks:LandmarkSensor._corner", _unblurred),),
-        Probe("fgloc.sensors.landmarks:LandmarkSensor._corner", called),
+        ("sensors/markers/measure.py", "graph/corner_batch.py"),
+        (Switch("fgloc.sensors.markers.measure:CornerMeasurer._corner", _unblurred),),
+        Probe("fgloc.sensors.markers.measure:CornerMeasurer._corner", called),
         batch=True,
     ),
 )

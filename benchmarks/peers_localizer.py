@@ -19,8 +19,11 @@ import numpy as np
 
 from benchmarks.peers_filter import V_YAW, VX, YAW, Measurements, X, Y, run_filter
 from fgloc.sensors.cameras import pinhole, undistort_points
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import Camera, CornersEvent, Estimate, FloatArray, ImuEvent, LandmarkMap, MarkerCorners, Step
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Camera, Estimate, FloatArray, LandmarkMap, Step
 
 Kind = Literal["marker_poses", "pnp"]
 KINDS: tuple[Kind, ...] = ("marker_poses", "pnp")
@@ -135,10 +138,10 @@ class Localizer:
 
     def _messages(self, step: Step) -> Iterable[tuple[float, int, FloatArray, float]]:
         """Time, kind, values and distance of everything that came in a step."""
-        for e in step.odometry:
+        for e in step.of(OdometryEvent):
             self._stands = abs(e.linear[0]) < _STANDS_M_S and abs(e.angular[2]) < _STANDS_RAD_S
             yield e.stamp_ns * _NS, _WHEELS, np.array([e.linear[0], e.angular[2], 0.0]), 0.0
-        for imu in step.imu:
+        for imu in step.inertial:
             yield imu.stamp_ns * _NS, _GYRO, np.array([self._rate(imu), 0.0, 0.0]), 0.0
         for event in step.sightings:
             if isinstance(event, CornersEvent):
@@ -153,14 +156,14 @@ class Localizer:
 
     def _poses(self, event: CornersEvent) -> list[tuple[FloatArray, float]]:
         """Poses of the base that an image tells, each with the distance of the nearest marker [m]."""
-        seen = [s for s in event.sightings if s.marker_id in self._landmarks]
+        seen = [s for s in event.sightings if s.landmark_id in self._landmarks]
         if self._kind == "marker_poses":
             return [found for s in seen if (found := self._of_marker(s)) is not None]
         found = self._of_all(seen)
         return [] if found is None else [found]
 
     def _of_marker(self, seen: MarkerCorners) -> tuple[FloatArray, float] | None:
-        landmark = self._landmarks[seen.marker_id]
+        landmark = self._landmarks[seen.landmark_id]
         corners = undistort_points(self._camera, seen.corners_px)
         candidates = marker_pose_candidates(self._pinhole, corners, landmark.size_m)
         if not candidates:
@@ -174,7 +177,7 @@ class Localizer:
     def _of_all(self, seen: Sequence[MarkerCorners]) -> tuple[FloatArray, float] | None:
         if not seen:
             return None
-        points = np.concatenate([self._landmarks[s.marker_id].corners() for s in seen])
+        points = np.concatenate([self._landmarks[s.landmark_id].corners() for s in seen])
         pixels = np.concatenate([undistort_points(self._camera, s.corners_px) for s in seen])
         cv2.setRNGSeed(0)
         good, rvec, tvec, inliers = cv2.solvePnPRansac(

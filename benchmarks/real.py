@@ -25,7 +25,8 @@ from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
-from fgloc.types import RangeBearingEvent, RangeBearingMeasurement, RunResult
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.types import PointMeasurement, RunResult
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
@@ -131,7 +132,7 @@ def _residual_medians(bag: Path, config: Config, map_path: Path | None, result: 
             continue
         (pose,) = se2.interpolate(stamps, result.trajectory.poses, np.array([event.stamp_ns]))
         for m in sensor.measure(event):
-            if isinstance(m, RangeBearingMeasurement):
+            if isinstance(m, PointMeasurement):
                 local = (m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0)
                 away = se2.compose(pose, local)[:2] - landmark_map.landmarks[m.landmark_id].position[:2]
                 distances.setdefault(m.landmark_id, []).append(float(np.hypot(*away)))

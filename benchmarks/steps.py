@@ -38,20 +38,11 @@ from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.timing import Stopwatch
-from fgloc.types import (
-    Camera,
-    CommandEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    OdometryEvent,
-)
+from fgloc.types import Camera, ControlEvent, Event, FloatArray, Landmark, LandmarkMap
 
 _ROOT = Path(__file__).resolve().parent.parent
 _SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
@@ -93,7 +84,7 @@ class World:
             if tick % 2 == 0:
                 yield self._odometry(stamp, pose, v, omega)
             if tick % 5 == 0:
-                yield CommandEvent(stamp, stamp, "/cmd_vel", v, omega)
+                yield ControlEvent(stamp, stamp, "/cmd_vel", v, omega)
                 yield self._corners(stamp, pose)
             pose = se2.compose(pose, se2.exp((v * 0.01, 0.0, omega * 0.01)))
 

@@ -25,14 +25,16 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
 from benchmarks.equal import SAMPLES
-from fgloc.config import MarkersConfig, load_config
+from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector, use_one_thread
 from fgloc.sensors.markers.edges import refine_all
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.sensors.markers.tracking import TrackingDetector
-from fgloc.types import FloatArray, ImageEvent
+from fgloc.types import FloatArray
 
 _ID = "stills.missed_ids"
 _SHOWN, _SHOWN_EVERY_NS = 5, 50_000_000
@@ -84,7 +86,7 @@ class Outcome:
 def outcomes(folder: Path) -> Iterator[Outcome]:
     """Detect in each photograph below the folder marker_images."""
     for still in STILLS:
-        found = Counter(s.marker_id for s in _detector(still, folder).detect(_image(folder / still.file)).sightings)
+        found = Counter(s.landmark_id for s in _detector(still, folder).detect(_image(folder / still.file)).sightings)
         listed = Counter(still.ids)
         yield Outcome(still, tuple((listed - found).elements()), tuple((found - listed).elements()))
 

@@ -28,7 +28,7 @@ SENSORS = {  # name -> where it lives in fgloc/sensors, its section of the confi
     "wheels": (
         ("wheels",),
         "wheels",
-        ("OdometryEvent", "JointStatesEvent", "CommandEvent", "WheelsConfig"),
+        ("OdometryEvent", "JointsEvent", "WheelsConfig"),
     ),
     "learned": (("learned",), "motion", ("MotionConfig",)),
     "gyro": (("gyro",), "gyro", ("ImuEvent", "GyroConfig")),

@@ -27,11 +27,12 @@ import gtsam
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import WheelsConfig
 from fgloc.sensors.cameras import pinhole, undistort_points
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Camera, CornersEvent, Estimate, FloatArray, LandmarkMap, MarkerCorners, Step
+from fgloc.types import Camera, Estimate, FloatArray, LandmarkMap, Step
 
 Pipeline = Literal["marker_poses", "corners", "corners_rules"]
 PIPELINES: tuple[Pipeline, ...] = ("marker_poses", "corners", "corners_rules")
@@ -136,7 +137,7 @@ class Textbook:
 
     def _turn(self, step: Step, wheels: FloatArray) -> float | None:
         """The gyro's turn; its bias is what it says while the wheels stand."""
-        rates = [e.angular_velocity[2] for e in step.imu if step.start_ns <= e.stamp_ns <= step.stamp_ns]
+        rates = [e.angular_velocity[2] for e in step.inertial if step.start_ns <= e.stamp_ns <= step.stamp_ns]
         if not rates:
             return None
         rate = float(np.mean(rates))
@@ -154,7 +155,7 @@ class Textbook:
             replace(s, corners_px=undistort_points(self._camera, s.corners_px))
             for e in now
             for s in e.sightings
-            if s.marker_id in self._landmarks
+            if s.landmark_id in self._landmarks
         ]
 
     def _reprojection(self, seen: MarkerCorners, pose: FloatArray) -> float:
@@ -164,7 +165,7 @@ class Textbook:
         T_map_base[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
         T_map_base[:2, 3] = x, y
         T = np.linalg.inv(T_map_base @ self._camera.T_base_cam)
-        points = self._landmarks[seen.marker_id].corners() @ T[:3, :3].T + T[:3, 3]
+        points = self._landmarks[seen.landmark_id].corners() @ T[:3, :3].T + T[:3, 3]
         if points[:, 2].min() < _MIN_DEPTH_M:
             return math.inf
         pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._pinhole.K, self._pinhole.D)[0][:, 0]
@@ -184,12 +185,12 @@ class Textbook:
         return [
             gtsam.PlanarProjectionFactor1(self._k, corner, pixel, self._bTc, self._calibration, self._corner_noise)
             for s in used
-            for corner, pixel in zip(self._landmarks[s.marker_id].corners(), s.corners_px, strict=True)
+            for corner, pixel in zip(self._landmarks[s.landmark_id].corners(), s.corners_px, strict=True)
         ]
 
     def _poses_from(self, seen: MarkerCorners) -> list[FloatArray]:
         """Poses of the base by one marker, flattened; that of the lower reprojection error first."""
-        landmark = self._landmarks[seen.marker_id]
+        landmark = self._landmarks[seen.landmark_id]
         T_map_marker = np.eye(4)
         T_map_marker[:3, :3], T_map_marker[:3, 3] = landmark.rotation, landmark.position
         found = []

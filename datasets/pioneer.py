@@ -38,7 +38,9 @@ from fgloc.config import RecordingConfig, TopicsConfig
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
-from fgloc.types import FloatArray, IntArray, MarkerPosesEvent, OdometryEvent, Trajectory, TruthEvent
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
 _TOPICS = {
     "odometry": "/pioneer/pose",
@@ -149,7 +151,7 @@ def robot_settings(mounting: Mounting, body: Body) -> dict[str, Any]:
 def _camera_mounting(driven: Trajectory, sightings: Sequence[MarkerPosesEvent]) -> Mounting:
     seen = [(event.stamp_ns, marker) for event in sightings for marker in event.sightings]
     stamps = np.array([stamp for stamp, _ in seen], dtype=np.int64)
-    ids = np.array([marker.marker_id for _, marker in seen], dtype=np.int64)
+    ids = np.array([marker.landmark_id for _, marker in seen], dtype=np.int64)
     optical = np.array([marker.position for _, marker in seen]).reshape(-1, 3)  # z ahead, x to the right
     return sensor_mounting(driven, stamps, ids, np.column_stack([optical[:, 2], -optical[:, 0]]))
 
@@ -174,7 +176,7 @@ def _odometry(bag: BagWriter, events: Sequence[OdometryEvent]) -> Iterator[Messa
 
 def _markers(bag: BagWriter, events: Sequence[MarkerPosesEvent]) -> Iterator[Message]:
     for e in events:
-        seen = [(m.marker_id, m.position.tolist(), m.orientation.tolist(), m.cov) for m in e.sightings]
+        seen = [(m.landmark_id, m.position.tolist(), m.orientation.tolist(), m.cov) for m in e.sightings]
         yield e.received_ns, partial(bag.marker_poses, e.topic, e.stamp_ns, seen, e.received_ns)
 
 

@@ -22,9 +22,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Change, EventFailure, Scene
 from fgloc.config import GateConfig, Section
 from fgloc.sensors.base import Context, Stream, When
+from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
 
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84

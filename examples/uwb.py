@@ -26,10 +26,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Change, EventFailure, Scene
 from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import Context, Stream, When
+from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")

@@ -22,15 +22,13 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
-    CornersEvent,
     Event,
     FloatArray,
-    ImageEvent,
-    ImuEvent,
+    InertialEvent,
     LandmarkMap,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
+    MotionEvent,
+    RawEvent,
+    SightingsEvent,
 )
 
 _OPTICAL_TO_BODY = np.array(
@@ -97,7 +95,7 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
             "gate.max_speed takes it."
         )
-    camera = _camera(facts, config) if "image" in facts.roles or CornersEvent in facts.first else None
+    camera = _camera(facts, config) if "image" in facts.roles or _in_pixels(facts.first) else None
     notes += camera.notes if camera is not None else ()
     T_base_sensor = _sensor_pose(facts, config, notes)
     sensors = _sensors(facts, config, landmark_map)
@@ -180,17 +178,30 @@ def base_frame(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
     for name in BASE_NAMES:
         if name in stream.frames:
             return name
-    odometry = first.get(OdometryEvent)
-    return odometry.child_frame_id if isinstance(odometry, OdometryEvent) else BASE_NAMES[0]
+    named = (event.base_frame_id for event in first.values() if isinstance(event, MotionEvent))
+    return next(filter(None, named), BASE_NAMES[0])
+
+
+def camera_frame(first: Mapping[type[Event], Event]) -> str:
+    """Name of the camera's frame, by the first event of each kind: CameraInfo, image, or what was found in one."""
+    seen = [event for event in first.values() if isinstance(event, RawEvent)]
+    found = [event for event in first.values() if isinstance(event, SightingsEvent) and event.in_pixels]
+    info = first.get(CameraInfoEvent)
+    return next(
+        (e.frame_id for e in (info, *seen, *found) if isinstance(e, CameraInfoEvent | RawEvent | SightingsEvent)), ""
+    )
+
+
+def _in_pixels(first: Mapping[type[Event], Event]) -> bool:
+    """Whether there are sightings that take a calibrated camera."""
+    return any(isinstance(event, SightingsEvent) and event.in_pixels for event in first.values())
 
 
 def _camera(facts: StreamFacts, config: Config) -> Camera:
     if facts.camera is not None:
         return _fitting(facts.camera, facts, config)
     first = facts.first
-    info = first.get(CameraInfoEvent)
-    seen = (info, first.get(ImageEvent), first.get(CornersEvent))
-    frame = next((e.frame_id for e in seen if isinstance(e, CameraInfoEvent | ImageEvent | CornersEvent)), "")
+    info, frame = first.get(CameraInfoEvent), camera_frame(first)
     T_base_cam = given_pose(config, default_axes="optical")
     if T_base_cam is None:
         T_base_cam = facts.frames.lookup(base_frame(facts, config, first), frame)
@@ -224,8 +235,9 @@ def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
 
     Its length is ``gyro.scale``, so that rates along it are true ones.
     """
-    base, event = base_frame(stream, config, first), first.get(ImuEvent)
-    if isinstance(event, ImuEvent) and event.frame_id in stream.frames and base in stream.frames:
+    base = base_frame(stream, config, first)
+    event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
+    if event is not None and event.frame_id in stream.frames and base in stream.frames:
         return np.asarray(config.gyro.scale * stream.frames.lookup(base, event.frame_id)[2, :3])
     return np.array([0.0, 0.0, config.gyro.scale])
 
@@ -254,8 +266,8 @@ def _sensor_pose(facts: StreamFacts, config: Config, notes: list[str]) -> FloatA
     """Place of a sensor that reports ranges or marker poses: as configured, or from tf, or at the base."""
     given = given_pose(config, default_axes="body")
     first = facts.first
-    event = first.get(RangeBearingEvent) or first.get(MarkerPosesEvent)
-    if given is not None or not isinstance(event, RangeBearingEvent | MarkerPosesEvent):
+    event = next((e for e in first.values() if isinstance(e, SightingsEvent) and not e.in_pixels), None)
+    if given is not None or event is None:
         return given
     base = base_frame(facts, config, first)
     T = np.eye(4)

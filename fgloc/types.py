@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+M = TypeVar("M", bound="MotionEvent")
 MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
 
 
@@ -42,59 +43,109 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryEvent(Event):
-    """``nav_msgs/Odometry``: pose of ``child_frame_id`` in ``frame_id`` and body twist."""
+class MotionEvent(Event):
+    """Of a source of motion: it holds over time and is integrated over steps, at its own stamps."""
 
-    frame_id: str
-    child_frame_id: str
-    position: FloatArray  # (3,) m
-    orientation: FloatArray  # (4,) quaternion x, y, z, w
-    pose_cov: FloatArray  # (6, 6) ROS order: translation, rotation
-    linear: FloatArray  # (3,) m/s
-    angular: FloatArray  # (3,) rad/s
-    twist_cov: FloatArray  # (6, 6)
+    @property
+    def publisher(self) -> tuple[str, ...]:
+        """What tells apart those who share the topic, each with a clock of its own."""
+        return ()
+
+    @property
+    def base_frame_id(self) -> str:
+        """The robot's base frame, if the message names it."""
+        return ""
+
+    @property
+    def odometer(self) -> OdometerPose | None:
+        """The pose that the source has integrated itself; None: it gives none."""
+        return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CommandEvent(Event):
-    """``geometry_msgs/Twist`` or ``TwistStamped``: what the robot was told to do."""
+class OdometerPose:
+    """Pose of the base in a frame of the source's own, and the twist there."""
+
+    frame_id: str
+    pose: FloatArray  # (3,); NaN where it is not known
+    twist: FloatArray  # (3,) in the body frame: m/s, m/s, rad/s; NaN where it is not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlEvent(MotionEvent):
+    """Control input: what the robot was told to do. It holds until the next."""
 
     v: float  # m/s, forward
     omega: float  # rad/s, counter-clockwise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointsEvent(Event):
-    """``sensor_msgs/JointState``. An array that the message left empty has length 0."""
-
-    names: tuple[str, ...]
-    position: FloatArray  # (n,) rad
-    velocity: FloatArray  # (n,) rad/s
-    effort: FloatArray  # (n,) Nm
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuEvent(Event):
-    """``sensor_msgs/Imu``."""
+class InertialEvent(MotionEvent):
+    """Rates and specific forces in the axes of an inertial unit."""
 
     frame_id: str
     angular_velocity: FloatArray  # (3,) rad/s
     linear_acceleration: FloatArray  # (3,) m/s²
-    angular_velocity_cov: FloatArray  # (3, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImageEvent(Event):
-    """``sensor_msgs/Image`` or ``CompressedImage``, not decoded."""
+class RawEvent(Event):
+    """Data in which a detector still has to find the landmarks."""
 
     frame_id: str
-    encoding: str  # ROS encoding ("mono8", "bgr8", ...); for a compressed image its format ("jpeg", "png", ...)
-    compressed: bool
-    width: int  # 0 if compressed
-    height: int
-    step: int  # bytes per row; 0 if compressed
-    is_bigendian: bool
-    data: NDArray[np.uint8]  # (n,)
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height, if the message names them."""
+        return None
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no data."""
+        return False
+
+    def decoded_size(self) -> tuple[int, int] | None:
+        """Width and height of the decoded data; None if it cannot be decoded."""
+        return self.size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One landmark in one message; subclasses say how it was seen."""
+
+    landmark_id: int
+
+    def place(self) -> FloatArray | None:
+        """Position ``(3,)`` in the sensor's axes, if the message gives it."""
+        return None
+
+    def distance(self) -> float | None:
+        """Distance from the sensor [m], if the message gives it."""
+        return None
+
+    def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
+        """With white noise on its numbers, as ``fgloc ablate`` adds it.
+
+        Args:
+            sigmas: by kind of number: ``corner_px``, ``range_m``, ``bearing_rad``, ``position_m``; 0: none.
+            rng: of the noise.
+        """
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightingsEvent(Event):
+    """Landmarks that were seen at one time. Made anew as a keyframe, or moved to one."""
+
+    in_pixels: ClassVar[bool] = False  # whether it takes a calibrated camera to make measurements of them
+
+    frame_id: str
+    sightings: tuple[Sighting, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorEvent(Event):
+    """One message of a registered sensor (`fgloc.sensors.base`); a subclass says what is in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,71 +172,12 @@ class TransformEvent(Event):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MarkerCorners:
-    """One marker in one image. Corners: top-left, top-right, bottom-right, bottom-left of the upright marker."""
-
-    marker_id: int
-    corners_px: FloatArray  # (4, 2) u, v in the recorded (distorted) image
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerPose:
-    """One marker's pose in the sensor frame."""
-
-    marker_id: int
-    position: FloatArray  # (3,)
-    orientation: FloatArray  # (4,) quaternion x, y, z, w
-    cov: FloatArray  # (6, 6) ROS order; zeros if the message gives none
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RangeBearing:
-    """Distance and direction to one landmark in the sensor's plane (x forward, bearing counter-clockwise)."""
-
-    landmark_id: int
-    range_m: float
-    bearing_rad: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CornersEvent(Event):
-    """Markers found in one image: ``apriltag_msgs/AprilTagDetectionArray``, or our detector on an ImageEvent."""
-
-    frame_id: str
-    sightings: tuple[MarkerCorners, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerPosesEvent(Event):
-    """``aruco_msgs/MarkerArray`` or ``vision_msgs/Detection3DArray``."""
-
-    frame_id: str
-    sightings: tuple[MarkerPose, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RangeBearingEvent(Event):
-    """``landmark_msgs/LandmarkArray``."""
-
-    frame_id: str
-    sightings: tuple[RangeBearing, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SensorEvent(Event):
-    """One message of a registered sensor (`fgloc.sensors.base`); a subclass says what is in it."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TruthEvent(Event):
     """Pose from an external positioning system. Never reaches the estimator."""
 
     frame_id: str
     position: FloatArray  # (3,)
     orientation: FloatArray  # (4,) quaternion x, y, z, w
-
-
-SightingsEvent = CornersEvent | MarkerPosesEvent | RangeBearingEvent
 
 
 # --- Maps and cameras -------------------------------------------------------------------------------------------------
@@ -261,19 +253,17 @@ class LandmarkMap:
 class Step:
     """All that was heard between two keyframes, gated and in order of stamp.
 
-    Each sensor's tuple holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the last one
-    at or before the start, and the first one at or after the end where known. ``commands`` reach back ``history_s``
-    further. ``sightings`` were made at ``stamp_ns`` (the keyframe) or, arriving late, at their own stamps in the lag.
+    Each tuple of ``motion`` holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the
+    last one at or before the start, and the first one at or after the end where known. Control inputs reach back
+    ``history_s`` further. ``sightings`` were made at ``stamp_ns`` (the keyframe) or, arriving late, at their own stamps
+    in the lag.
     """
 
     index: int
     segment: int  # counts up where the clock jumped; a new segment shares no motion with the one before
     start_ns: int
     stamp_ns: int
-    odometry: tuple[OdometryEvent, ...] = ()
-    commands: tuple[CommandEvent, ...] = ()
-    joints: tuple[JointsEvent, ...] = ()
-    imu: tuple[ImuEvent, ...] = ()
+    motion: Mapping[type[MotionEvent], tuple[MotionEvent, ...]] = field(default_factory=dict)  # by class of event
     sightings: tuple[SightingsEvent, ...] = ()
     sensed: tuple[SensorEvent, ...] = ()  # of registered sensors, at their own stamps like late sightings
 
@@ -281,6 +271,31 @@ class Step:
     def dt(self) -> float:
         """Length [s]."""
         return (self.stamp_ns - self.start_ns) * 1e-9
+
+    def of(self, kind: type[M]) -> tuple[M, ...]:
+        """The motion events of a class, or of the one class derived from it that the robot has."""
+        for made, events in self.motion.items():
+            if issubclass(made, kind):
+                return events  # type: ignore[return-value]
+        return ()
+
+    @property
+    def controls(self) -> tuple[ControlEvent, ...]:
+        """Control inputs."""
+        return self.of(ControlEvent)
+
+    @property
+    def inertial(self) -> tuple[InertialEvent, ...]:
+        """Of the inertial unit."""
+        return self.of(InertialEvent)
+
+
+def by_class(events: Iterable[MotionEvent]) -> dict[type[MotionEvent], tuple[MotionEvent, ...]]:
+    """Motion events as a step holds them, in the order in which they are given."""
+    made: dict[type[MotionEvent], list[MotionEvent]] = {}
+    for event in events:
+        made.setdefault(type(event), []).append(event)
+    return {kind: tuple(same) for kind, same in made.items()}
 
 
 _AT_REST = np.zeros(3)
@@ -311,8 +326,8 @@ class MotionReadings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CornerMeasurement:
-    """Four corners of one marker, rid of what Cal3DS2 cannot model, with isotropic noise."""
+class PixelMeasurement:
+    """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
 
     stamp_ns: int
     landmark_id: int
@@ -326,31 +341,49 @@ class CornerMeasurement:
     blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
     jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
+    cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeBearingMeasurement:
-    """A landmark's direction and distance from the base (the sensor's offset is already taken out)."""
+class PointMeasurement:
+    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
 
     stamp_ns: int
     landmark_id: int
     range_m: float
     bearing_rad: float
     cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
-    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MarkerPoseMeasurement:
-    """A standing marker's planar pose ``T_base_marker`` (see Landmark.planar) with right-perturbation covariance."""
+class FrameMeasurement:
+    """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
 
     stamp_ns: int
     landmark_id: int
     pose: FloatArray  # (3,)
     cov: FloatArray  # (3, 3)
-    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in CornerMeasurement
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -391,6 +424,11 @@ class PoseMeasurement(ABC):
         return ()
 
     @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return len(self.cov)
+
+    @property
     def landmark_id(self) -> int:
         """A number that no landmark of the map has."""
         return -2 - self.target
@@ -401,7 +439,7 @@ class PoseMeasurement(ABC):
         return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
 
 
-LandmarkSighting = CornerMeasurement | RangeBearingMeasurement | MarkerPoseMeasurement
+LandmarkSighting = PixelMeasurement | PointMeasurement | FrameMeasurement
 LandmarkMeasurement = LandmarkSighting | PoseMeasurement
 
 
@@ -423,7 +461,7 @@ class Decision:
 
     step: int
     stamp_ns: int
-    kind: str  # a motion source, "corners", "range_bearing", "marker_pose", "place", "mode", "clock" or a sensor
+    kind: str  # a sensor by its name, "place", "mode" or "clock"
     landmark_id: int  # -1 for motion
     residual: float  # norm of the whitened residual against the prediction
     nis: float

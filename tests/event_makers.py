@@ -9,21 +9,12 @@ import numpy as np
 
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.intake.keyframing import KeyframeBuilder
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    MarkerCorners,
-    MarkerPose,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearing,
-    RangeBearingEvent,
-    Step,
-)
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Event, Step
 
 SQUARE = np.array([[100.0, 100.0], [150.0, 100.0], [150.0, 150.0], [100.0, 150.0]])
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -51,8 +42,8 @@ def odometry(t, pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0), received=None, topic="/o
     return OdometryEvent(**(fields | changes))
 
 
-def command(t, v=0.0, omega=0.0, received=None, topic="/cmd_vel") -> CommandEvent:
-    return CommandEvent(ns(t), ns(t if received is None else received), topic, v, omega)
+def command(t, v=0.0, omega=0.0, received=None, topic="/cmd_vel") -> ControlEvent:
+    return ControlEvent(ns(t), ns(t if received is None else received), topic, v, omega)
 
 
 def joints(t, left, right, names=("left_wheel_joint", "right_wheel_joint"), rates=(), topic="/joints") -> JointsEvent:
@@ -114,7 +105,7 @@ def check_steps(steps: Sequence[Step], min_interval_s: float = 0.05, max_interva
         else:
             assert step.start_ns == steps[k - 1].stamp_ns
             assert ns(min_interval_s) <= step.stamp_ns - step.start_ns <= ns(max_interval_s)
-        for kind in (step.odometry, step.commands, step.joints, step.imu, step.sightings):
+        for kind in (*step.motion.values(), step.sightings):
             stamps = [e.stamp_ns for e in kind]
             assert stamps == sorted(stamps)
         assert all(e.stamp_ns <= step.stamp_ns for e in step.sightings)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc.frames import rpy_matrix
-from fgloc.types import Camera, FloatArray, ImageEvent, Landmark
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Camera, FloatArray, Landmark
 
 # Optical axes in body axes: z forward, x right, y down (REP 103).
 BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -16,20 +16,11 @@ from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    Camera,
-    CommandEvent,
-    CornersEvent,
-    Estimate,
-    Event,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    OdometryEvent,
-    RangeBearing,
-    RangeBearingEvent,
-)
+from fgloc.types import Camera, ControlEvent, Estimate, Event, Landmark, LandmarkMap
 
 START_NS = 1_700_000_000_000_000_000
 T_BASE_CAM = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]])
@@ -146,7 +137,7 @@ class World:
             if tick % 5 == 0 and not _within(t, self.dumb):
                 made.append(self._odometry(stamp))
                 if tick % 10 == 0:
-                    made.append(CommandEvent(stamp, stamp, "/cmd_vel", SPEED, TURN))
+                    made.append(ControlEvent(stamp, stamp, "/cmd_vel", SPEED, TURN))
             if tick % (100 // self.rate) == 0 and not _within(t, self.blind):
                 made.append(self._sightings(stamp))
         return sorted(made, key=lambda e: e.received_ns)

@@ -8,8 +8,11 @@ import numpy as np
 
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.config import Config, WheelsConfig
-from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent
+from fgloc.config import Config
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import ControlEvent, Event, FloatArray
 from training.config import DataConfig
 from training.data import Run, make_run
 from training.heard import TopicTimes
@@ -20,7 +23,7 @@ RADIUS, TRACK, JOINTS = 0.05, 0.26, ("left_wheel", "right_wheel")
 GAIN_V, GAIN_OMEGA, DELAY, TAU = 0.9, 1.05, 0.08, 0.15
 
 
-def drive(rng: np.random.Generator, seconds: float) -> tuple[list[CommandEvent], np.ndarray, FloatArray]:
+def drive(rng: np.random.Generator, seconds: float) -> tuple[list[ControlEvent], np.ndarray, FloatArray]:
     """A robot with gains, delay and lag that also loses speed in turns: commands at 50 Hz, exact poses at 100 Hz."""
     dt = 0.01
     n = int(seconds / dt)
@@ -28,7 +31,7 @@ def drive(rng: np.random.Generator, seconds: float) -> tuple[list[CommandEvent],
     levels = rng.uniform([0.0, -0.6], [0.3, 0.6], (int(seconds) + 2, 2))
     told = levels[(t[::2]).astype(int)]
     commands = [
-        CommandEvent(T0 + round(s * SECOND), 0, "/cmd_vel", float(v), float(w))
+        ControlEvent(T0 + round(s * SECOND), 0, "/cmd_vel", float(v), float(w))
         for s, (v, w) in zip(t[::2], told, strict=True)
     ]
     state, pose, poses = np.zeros(2), np.zeros(3), []

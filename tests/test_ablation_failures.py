@@ -12,19 +12,14 @@ from pydantic import TypeAdapter, ValidationError
 
 from fgloc import se2
 from fgloc.ablation.failures import AnyFailure, Scene, corrupt, generators
-from fgloc.config import Config, WheelsConfig
+from fgloc.config import Config
 from fgloc.frames import quaternion_yaw
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.markers.images import decode
-from fgloc.types import (
-    CommandEvent,
-    ImuEvent,
-    JointsEvent,
-    Landmark,
-    LandmarkMap,
-    OdometryEvent,
-    RangeBearingEvent,
-    TruthEvent,
-)
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Landmark, LandmarkMap, TruthEvent
 
 RADIUS, TRACK = 0.05, 0.26
 WHEELS = WheelsConfig(left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
@@ -98,8 +93,8 @@ def assert_only(kinds, before, after):
 def test_interval_bounds_are_half_open_and_in_receive_time():
     before = driving()
     after = apply("dropout", before, sensor="command", when={"intervals": [(1.95, 3.95)]})
-    assert_only(CommandEvent, before, after)
-    left = seconds(of(CommandEvent, after))
+    assert_only(ControlEvent, before, after)
+    left = seconds(of(ControlEvent, after))
     assert len(left) == 80
     assert not ((left > 1.95) & (left < 3.95)).any()
 
@@ -108,7 +103,7 @@ def test_bursts_grow_around_the_same_centers():
     def gap(length):
         when = {"bursts": 1, "burst_s": length, "after_s": 5.0}
         after = apply("dropout", driving(60.0), seed=4, duration=60.0, sensor="command", when=when)
-        left = seconds(of(CommandEvent, after))
+        left = seconds(of(ControlEvent, after))
         k = int(np.argmax(np.diff(left)))
         return left[k], left[k + 1]
 
@@ -120,7 +115,7 @@ def test_bursts_grow_around_the_same_centers():
 
 def test_share_is_random_and_repeats_for_one_seed():
     def kept(seed):
-        return seconds(of(CommandEvent, apply("dropout", driving(60.0), seed, sensor="command", when={"share": 0.3})))
+        return seconds(of(ControlEvent, apply("dropout", driving(60.0), seed, sensor="command", when={"share": 0.3})))
 
     assert len(kept(1)) == pytest.approx(420, abs=40)
     assert np.array_equal(kept(1), kept(1))
@@ -167,21 +162,21 @@ def test_latency_delays_receipt_and_keeps_order_of_receipt():
     before = driving()
     after = apply("latency", before, sensor="command", delay_s=0.25)
     assert sorted(e.received_ns for e in after) == [e.received_ns for e in after]
-    late = of(CommandEvent, after)
+    late = of(ControlEvent, after)
     assert len(late) == 100
     assert all(e.received_ns - e.stamp_ns == 250_000_000 for e in late)
-    assert_only(CommandEvent, before, after)
+    assert_only(ControlEvent, before, after)
 
 
 def test_jitter_puts_messages_out_of_order():
-    late = of(CommandEvent, apply("latency", driving(), sensor="command", jitter_s=0.5))
+    late = of(ControlEvent, apply("latency", driving(), sensor="command", jitter_s=0.5))
     stamps = [e.stamp_ns for e in late]
     assert stamps != sorted(stamps)
-    assert sorted(stamps) == [e.stamp_ns for e in of(CommandEvent, driving())]
+    assert sorted(stamps) == [e.stamp_ns for e in of(ControlEvent, driving())]
 
 
 def test_stamped_on_arrival_moves_the_stamp_too():
-    late = of(CommandEvent, apply("latency", driving(), sensor="command", delay_s=0.25, stamped_on_arrival=True))
+    late = of(ControlEvent, apply("latency", driving(), sensor="command", delay_s=0.25, stamped_on_arrival=True))
     assert all(e.received_ns == e.stamp_ns for e in late)
 
 
@@ -193,7 +188,7 @@ def test_clock_offset_and_drift_move_stamps_alone():
 
 
 def test_duplicates_come_later_with_the_same_stamp():
-    after = of(CommandEvent, apply("duplicated_messages", driving(), sensor="command", after_s=0.05))
+    after = of(ControlEvent, apply("duplicated_messages", driving(), sensor="command", after_s=0.05))
     assert len(after) == 200
     stamps = [e.stamp_ns for e in after]
     assert all(stamps.count(s) == 2 for s in set(stamps))
@@ -257,7 +252,7 @@ def test_sighting_noise_has_the_stated_sigma():
 
 def test_occluded_ids_stay_hidden_throughout():
     events = [corners(0.1 * k, *range(5)) for k in range(20)]
-    seen = [{s.marker_id for s in e.sightings} for e in apply("occluded_ids", events, ids=[2], part=0.5)]
+    seen = [{s.landmark_id for s in e.sightings} for e in apply("occluded_ids", events, ids=[2], part=0.5)]
     assert all(s == seen[0] for s in seen)
     assert len(seen[0]) == 2
     assert 2 not in seen[0]
@@ -266,16 +261,16 @@ def test_occluded_ids_stay_hidden_throughout():
 
 def test_wrong_ids_are_other_ids_of_the_map():
     events = [corners(0.01 * k, 3) for k in range(1000)]
-    ids = [e.sightings[0].marker_id for e in apply("wrong_ids", events, probability=0.2)]
+    ids = [e.sightings[0].landmark_id for e in apply("wrong_ids", events, probability=0.2)]
     assert sum(i != 3 for i in ids) == pytest.approx(200, abs=40)
     assert set(ids) == set(range(5))
 
 
 def test_duplicated_id_renames_one_marker():
     (event,) = apply("duplicated_id", [corners(0.0, *range(5))], marker_id=1, other=4)
-    assert [s.marker_id for s in event.sightings] == [0, 1, 2, 3, 1]
+    assert [s.landmark_id for s in event.sightings] == [0, 1, 2, 3, 1]
     (event,) = apply("duplicated_id", [corners(0.0, *range(5))])
-    assert len({s.marker_id for s in event.sightings}) == 4
+    assert len({s.landmark_id for s in event.sightings}) == 4
 
 
 def test_moved_marker_moves_the_map_by_the_distance():
@@ -464,8 +459,8 @@ def test_failures_compose_and_draw_independently():
 
     both, scenes = run(chain, 3)
     alone, _ = run(chain[1:], 3, first=1)
-    assert 30 < len(of(CommandEvent, both)) < 70
-    assert len(of(CommandEvent, alone)) == 100
+    assert 30 < len(of(ControlEvent, both)) < 70
+    assert len(of(ControlEvent, alone)) == 100
     ids = [[s.landmark_id for e in of(RangeBearingEvent, r) for s in e.sightings] for r in (both, alone)]
     assert ids[0] == ids[1]
-    assert scenes[0].affected["dropout"] == 100 - len(of(CommandEvent, both))
+    assert scenes[0].affected["dropout"] == 100 - len(of(ControlEvent, both))

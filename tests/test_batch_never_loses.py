@@ -13,7 +13,9 @@ from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import CommandEvent, Mode, OdometryEvent, RangeBearingEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent, Mode
 
 MODES = ("batch", "online")
 STEP_NS = 20_000_000
@@ -57,7 +59,7 @@ def write(folder, world: World, commands=False, odometry=True, silent=(), unseen
                 if imu:
                     bag.imu("/imu", stamp, (0.01, -0.01, TURN + 0.002), (0.1, 0.2, 9.8))
                 bag.truth("/truth", stamp, (x, y, 0.0), (0, 0, math.sin(yaw / 2), math.cos(yaw / 2)))
-            elif isinstance(event, CommandEvent):
+            elif isinstance(event, ControlEvent):
                 if commands and not inside(stamp, silent):
                     bag.command("/cmd_vel", stamp, event.v, event.omega)
             elif isinstance(event, RangeBearingEvent) and not inside(stamp, unseen):

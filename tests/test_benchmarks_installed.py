@@ -27,21 +27,12 @@ from benchmarks.installed_scores import (
     truth_values,
 )
 from benchmarks.textbook import PIPELINES, Textbook
-from fgloc.config import Config, WheelsConfig
-from fgloc.types import (
-    Camera,
-    CornersEvent,
-    Decision,
-    ImuEvent,
-    JointsEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerCorners,
-    Mode,
-    RunResult,
-    Step,
-    Trajectory,
-)
+from fgloc.config import Config
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import Camera, Decision, Landmark, LandmarkMap, Mode, RunResult, Step, Trajectory, by_class
 
 SECOND = 1_000_000_000
 INSTALLED = {
@@ -275,7 +266,7 @@ def drive(seconds=10.0, speed=0.2, slip=(), carried_m=0.0, carried_s=math.inf):
             MarkerCorners(i, project(landmark, x)) for i, landmark in WALL.landmarks.items() if x < landmark.position[0]
         )
         event = CornersEvent(end, end, "/image", "cam", seen)
-        out.append(Step(k, 0, start, end, joints=tuple(joints), imu=gyro, sightings=(event,)))
+        out.append(Step(k, 0, start, end, by_class((*joints, *gyro)), (event,)))
         truth.append(x)
     return out, np.array(truth)
 

@@ -159,7 +159,7 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
 def test_several_at_once_are_all_off_and_have_one_file():
     both = named("gate+fit_kernel")
     with both.off():
-        assert pose_fit.cauchy_k(None, None) > 1e3
+        assert pose_fit.cauchy_k(None) > 1e3
         assert association.chi2_bound(0.99, 2) == math.inf
     name = file_name(Cell(3, "none", both.name))
     assert "together" in name

@@ -15,7 +15,7 @@ from datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, _span, convert
 from fgloc.config import load_config
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
-from fgloc.types import JointsEvent
+from fgloc.sensors.wheels.events import JointsEvent
 
 _ROWS = 40
 

@@ -18,7 +18,9 @@ from fgloc.config import load_config
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
-from fgloc.types import MarkerPosesEvent, OdometryEvent, Trajectory, TruthEvent
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Trajectory, TruthEvent
 
 _START_NS = 1_575_641_303_000_000_000
 _WRONG_CLOCK_NS = 1_202_150_932_000_000_000

@@ -18,7 +18,9 @@ from fgloc.errors import MapError, RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
-from fgloc.types import CommandEvent, OdometryEvent, RangeBearingEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent
 
 _NAME = "rosbag2_2025_11_25-15_11_34"
 _START_NS = 1_764_079_894_000_000_000
@@ -68,7 +70,7 @@ def test_configuration_reads_the_bag(source: Path, tmp_path: Path) -> None:
     assert config.gate.max_yaw_rate < 125
     with open_recording(bag, config.recording) as recording:
         events = list(recording.events())
-    kinds = [sum(isinstance(e, kind) for e in events) for kind in (OdometryEvent, CommandEvent, RangeBearingEvent)]
+    kinds = [sum(isinstance(e, kind) for e in events) for kind in (OdometryEvent, ControlEvent, RangeBearingEvent)]
     assert kinds == [20, 20, 7]
     first = next(e for e in events if isinstance(e, RangeBearingEvent))
     assert first.stamp_ns == _START_NS - 170_000_000 - 50_000_000

@@ -28,7 +28,8 @@ from fgloc.runner import run
 from fgloc.sensors.base import Context
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.motion_compensation import carry
-from fgloc.types import LandmarkMap, OdometryEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import LandmarkMap
 
 SECONDS = 14.0
 ANCHORS = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.2), 3: (6.0, 5.0, 1.8)}

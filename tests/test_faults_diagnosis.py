@@ -28,7 +28,7 @@ from datasets import mrclam, pioneer, turtlebot3
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
-from fgloc.diagnosis import Diagnosis
+from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
@@ -37,18 +37,13 @@ from fgloc.recording.files import find_beside
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import run
 from fgloc.sensor_setup import given_pose
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.maps import write_map
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    ImuEvent,
-    LandmarkMap,
-    MarkerCorners,
-    OdometryEvent,
-    RangeBearing,
-    RangeBearingEvent,
-)
+from fgloc.types import ControlEvent, LandmarkMap
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 START = 1_700_000_000_000_000_000
@@ -189,7 +184,7 @@ def test_fault_19_what_sightings_and_gyro_agree_on_is_the_wheels():
 
 def test_fault_19_commands_are_followed_late_and_that_is_no_clock():
     made = [
-        CommandEvent(e.stamp_ns, e.received_ns, "/cmd_vel", float(e.linear[0]), float(e.angular[2]))
+        ControlEvent(e.stamp_ns, e.received_ns, "/cmd_vel", float(e.linear[0]), float(e.angular[2]))
         if isinstance(e, OdometryEvent)
         else e
         for e in events(beacons(), late=DELTA)

@@ -21,9 +21,10 @@ from event_makers import (
 )
 
 from fgloc import se2
-from fgloc.config import GateConfig, WheelsConfig
+from fgloc.config import GateConfig
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 
 
@@ -423,7 +424,7 @@ def test_fault_32_most_yaw_rates_beyond_the_bound_suggest_degrees(gate):
 
 def test_fault_50_id_not_in_the_map(gate):
     event = gate.check(corners(1.0, 2, 17, 1))
-    assert [s.marker_id for s in event.sightings] == [2, 1]
+    assert [s.landmark_id for s in event.sightings] == [2, 1]
     assert gate.check(range_bearing(1.0, (99, 1.0, 0.0))) is None
     assert gate.rejections == {"sightings.unknown_id": 2}
     assert any(note.endswith(": 17, 99") for note in gate.notes)

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 from fgloc.config import RecordingConfig
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
-from fgloc.types import OdometryEvent
+from fgloc.sensors.wheels.events import OdometryEvent
 
 DEFAULT = RecordingConfig()
 

@@ -26,12 +26,12 @@ from fgloc.robust.association import Association
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import (
     Camera,
-    CornerMeasurement,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerPoseMeasurement,
     MotionMeasurement,
-    RangeBearingMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
 )
 
 WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker on a wall, facing -x
@@ -68,14 +68,14 @@ def project(pose: np.ndarray, landmark: Landmark, cam: Camera) -> np.ndarray:
     return np.column_stack([cam.K[0, 0] * xd + cam.K[0, 2], cam.K[1, 1] * yd + cam.K[1, 2]])
 
 
-def corner_sighting(pose: np.ndarray, landmark: Landmark, noise: np.ndarray | float = 0.0) -> CornerMeasurement:
+def corner_sighting(pose: np.ndarray, landmark: Landmark, noise: np.ndarray | float = 0.0) -> PixelMeasurement:
     cam = camera([0.05, -0.02, 0.001, -0.002])
-    return CornerMeasurement(0, landmark.landmark_id, project(pose, landmark, cam) + noise, 0.5, cam)
+    return PixelMeasurement(0, landmark.landmark_id, project(pose, landmark, cam) + noise, 0.5, cam)
 
 
-def point_sighting(pose: np.ndarray, landmark: Landmark, cov: np.ndarray) -> RangeBearingMeasurement:
+def point_sighting(pose: np.ndarray, landmark: Landmark, cov: np.ndarray) -> PointMeasurement:
     x, y, _ = se2.between(pose, np.array([*landmark.position[:2], 0.0]))
-    return RangeBearingMeasurement(0, landmark.landmark_id, float(np.hypot(x, y)), float(np.arctan2(y, x)), cov)
+    return PointMeasurement(0, landmark.landmark_id, float(np.hypot(x, y)), float(np.arctan2(y, x)), cov)
 
 
 POSES = [np.array([0.0, 0.0, 0.0]), np.array([1.0, -0.4, 0.25]), np.array([-0.5, 0.7, -0.2])]
@@ -89,7 +89,7 @@ def test_every_landmark_factor_has_zero_residual_at_truth(pose):
     sightings = [
         corner_sighting(pose, wall),
         point_sighting(pose, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
-        MarkerPoseMeasurement(0, 0, se2.between(pose, wall.planar), np.diag([1e-2, 2e-2, 3e-2])),
+        FrameMeasurement(0, 0, se2.between(pose, wall.planar), np.diag([1e-2, 2e-2, 3e-2])),
     ]
     for one in factors.linearize(sightings, pose):
         assert one.residual == pytest.approx(0.0, abs=1e-6)
@@ -105,7 +105,7 @@ def test_unknown_landmark_factors_have_zero_residual_at_truth(pose):
     values.insert(landmark_key(9), landmarks.landmarks[9].position[:2])
     values.insert(landmark_key(0), gtsam.Pose2(*landmarks.landmarks[0].planar))
     point = point_sighting(pose, landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
-    marker = MarkerPoseMeasurement(0, 0, se2.between(pose, landmarks.landmarks[0].planar), np.eye(3))
+    marker = FrameMeasurement(0, 0, se2.between(pose, landmarks.landmarks[0].planar), np.eye(3))
     for m in (point, marker):
         (factor,) = factors.sighting(0, m, None).factors
         assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
@@ -145,7 +145,7 @@ def test_marker_pose_prior_carries_the_lever_arm():
     landmarks = wall_map()
     truth, cov = POSES[1], np.diag([0.01, 0.02, 0.03]) ** 2
     seen = se2.between(truth, landmarks.landmarks[0].planar)
-    (one,) = LandmarkFactors(landmarks).linearize([MarkerPoseMeasurement(0, 0, seen, cov)], truth)
+    (one,) = LandmarkFactors(landmarks).linearize([FrameMeasurement(0, 0, seen, cov)], truth)
     implied = np.linalg.inv(one.J.T @ one.J)
     draws = []
     for noise in rng.multivariate_normal(np.zeros(3), cov, 20000):
@@ -157,7 +157,7 @@ def test_marker_pose_prior_carries_the_lever_arm():
 
 def test_cartesian_covariance_matches_samples():
     rng = np.random.default_rng(1)
-    m = RangeBearingMeasurement(0, 9, 3.0, 0.7, np.diag([0.02, 0.1]) ** 2)
+    m = PointMeasurement(0, 9, 3.0, 0.7, np.diag([0.02, 0.1]) ** 2)
     point, cov = cartesian(m)
     bearing, r = 0.7 + rng.normal(0, 0.02, 50000), 3.0 + rng.normal(0, 0.1, 50000)
     samples = np.column_stack([r * np.cos(bearing), r * np.sin(bearing)])
@@ -173,7 +173,7 @@ def test_carried_sightings_agree_with_those_made_at_the_keyframe():
     sightings = [
         corner_sighting(then, landmarks.landmarks[0]),
         point_sighting(then, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
-        MarkerPoseMeasurement(0, 0, se2.between(then, landmarks.landmarks[0].planar), np.eye(3) * 1e-2),
+        FrameMeasurement(0, 0, se2.between(then, landmarks.landmarks[0].planar), np.eye(3) * 1e-2),
     ]
     carried = [carry(m, motion, np.eye(3) * 1e-6) for m in sightings]
     for one in factors.linearize(carried, keyframe):
@@ -197,7 +197,7 @@ def test_a_matrix_that_is_no_covariance_never_reaches_gtsam(cov):
 
 def test_unknown_id_is_named():
     with pytest.raises(EstimatorError, match="landmark 42 is not in the map"):
-        LandmarkFactors(wall_map()).sighting(0, RangeBearingMeasurement(0, 42, 1.0, 0.0, np.eye(2)), None)
+        LandmarkFactors(wall_map()).sighting(0, PointMeasurement(0, 42, 1.0, 0.0, np.eye(2)), None)
 
 
 def test_fused_motion_equals_the_product_of_gaussians():
@@ -229,9 +229,7 @@ def drive(seed: int, n: int = 150, blind: tuple[int, int] = (0, 0)):
                 m = point_sighting(truth, landmarks.landmarks[int(i)], R)
                 noise = rng.multivariate_normal(np.zeros(2), R)
                 if m.range_m + noise[1] > 0.3:
-                    sightings.append(
-                        RangeBearingMeasurement(k, int(i), m.range_m + noise[1], m.bearing_rad + noise[0], R)
-                    )
+                    sightings.append(PointMeasurement(k, int(i), m.range_m + noise[1], m.bearing_rad + noise[0], R))
         rows.append((truth, [MotionMeasurement("wheels", k - 1, k, measured, Q)], sightings))
     return landmarks, rows
 
@@ -387,7 +385,7 @@ def test_a_marker_right_in_front_of_the_camera_is_no_reason_to_fail(depth):
 
 
 def test_a_landmark_under_the_robot_tells_its_place_no_better_than_its_range():
-    m = RangeBearingMeasurement(0, 9, 0.0, 0.3, np.diag([0.01, 0.05]) ** 2)
+    m = PointMeasurement(0, 9, 0.0, 0.3, np.diag([0.01, 0.05]) ** 2)
     _, cov = cartesian(m)
     assert np.sqrt(np.linalg.eigvalsh(cov)) == pytest.approx((0.01 * 0.05, 0.05))
 
@@ -463,46 +461,6 @@ def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(k
     estimator.revise({2: step, 3: step})
     assert estimator.belief.pose == pytest.approx((0.6, 0.5, 0.0), abs=1e-6)
     assert estimator.update(7 * 10**8, 0.1, step).pose == pytest.approx((0.7, 0.5, 0.0), abs=1e-6)
-
-
-def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
-    landmarks = wall_map()
-    factors = LandmarkFactors(landmarks)
-    weights = Association(Config(), factors)
-    truth = np.zeros(3)
-    m = corner_sighting(np.array([0.0, 0.6, 0.1]), landmarks.landmarks[0])
-    sure = PoseWithCovariance(truth, np.diag([1e-4, 1e-4, 1e-4]))
-    accepted, rejected, decisions = weights.judge(0, 0, [m], sure)
-    assert not accepted
-    assert [d.reason for d in decisions] == ["gate"]
-    assert weights.rejections["sightings.gate"] == 1
-    unsure = PoseWithCovariance(truth, np.diag([0.5, 0.5, 0.1]))
-    accepted, rejected, _ = weights.judge(1, 0, [m], unsure)
-    assert len(accepted) == 1
-    assert not rejected
-
-
-def test_weights_refuse_markers_behind_the_camera():
-    landmarks = wall_map()
-    weights = Association(Config(), LandmarkFactors(landmarks))
-    m = corner_sighting(np.zeros(3), landmarks.landmarks[0])
-    _, refused, decisions = weights.judge(0, 0, [m], PoseWithCovariance(np.array([6.0, 0.0, 0.0]), np.eye(3)))
-    assert len(refused) == 1
-    assert decisions[0].reason == "behind_camera"
-
-
-def test_repeated_sightings_share_their_information():
-    config = Config.model_validate({"landmarks": {"repeat_s": 1.0}})
-    landmarks = wall_map()
-    weights = Association(config, LandmarkFactors(landmarks))
-    belief = PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-2)
-    first = point_sighting(np.zeros(3), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
-    later = RangeBearingMeasurement(250_000_000, 9, first.range_m, first.bearing_rad, first.cov)
-    a, _, _ = weights.judge(0, 0, [first], belief)
-    b, _, decisions = weights.judge(1, 250_000_000, [later], belief)
-    assert np.allclose(a[0].measurement.cov, first.cov)
-    assert np.allclose(b[0].measurement.cov, 4.0 * first.cov)
-    assert decisions[0].weight == pytest.approx(0.25)
 
 
 @pytest.mark.slow

@@ -25,8 +25,10 @@ from fgloc.frames import rpy_matrix, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import base_up
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
-from fgloc.types import ImuEvent, JointsEvent, LandmarkMap, TruthEvent
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import LandmarkMap, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
@@ -151,7 +153,7 @@ def test_fault_52_mirrored_map(looked):
 
 
 def test_exchanged_ids(looked):
-    seen = [m.marker_id for row in looked.excerpt.pictures for p in row for m in p.seen]
+    seen = [m.landmark_id for row in looked.excerpt.pictures for p in row for m in p.seen]
     a, b = sorted(sorted(set(seen), key=seen.count)[-2:])
     found = looked.check(landmarks=swapped(looked.landmarks, a, b)).correction
     assert f"exchange ids {a} and {b} in the map" in found.sentence

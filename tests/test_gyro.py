@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from fgloc.config import GyroConfig
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.types import ImuEvent, Step
+from fgloc.types import Step, by_class
 
 START = 10**18
 STILL, DRIVING = np.zeros(3), np.array([0.04, 0.0, 0.02])
@@ -26,7 +27,7 @@ def step(start: float, end: float, rate, hz: float = 100.0, axis=(0.0, 0.0, 1.0)
     n = round((end - start) * hz)
     times = start + phase / hz + np.arange(-1, n + 2) / hz
     messages = tuple(imu(t, rate(t), axis) for t in times)
-    return Step(0, 0, START + round(start * 1e9), START + round(end * 1e9), imu=messages)
+    return Step(0, 0, START + round(start * 1e9), START + round(end * 1e9), by_class(messages))
 
 
 def known(gyro: Gyro, bias: float = 0.0, sigma: float = 1e-6) -> Gyro:
@@ -43,7 +44,7 @@ def test_a_varying_rate_is_integrated_to_the_ends_of_the_step(phase):
 
 def test_rates_are_held_at_the_ends_that_no_message_covers():
     messages = (imu(0.02, 1.0), imu(0.06, 2.0))
-    turn = known(Gyro(GyroConfig())).measure(Step(0, 0, START, START + 10**8, imu=messages), DRIVING)
+    turn = known(Gyro(GyroConfig())).measure(Step(0, 0, START, START + 10**8, by_class(messages)), DRIVING)
     assert turn.yaw == pytest.approx(0.02 * 1.0 + 0.04 * 1.5 + 0.04 * 2.0, abs=1e-9)
 
 
@@ -73,7 +74,7 @@ def test_silence_is_no_turn_and_is_counted_once_the_gyro_has_spoken():
     assert not gyro.rejections
     assert gyro.measure(step(0.0, 0.1, lambda t: 0.1), DRIVING) is not None
     assert gyro.measure(nothing, DRIVING) is None
-    gap = Step(0, 0, START, START + 4 * 10**8, imu=(imu(0.0, 0.1), imu(0.1, 0.1), imu(0.3, 0.1), imu(0.4, 0.1)))
+    gap = Step(0, 0, START, START + 4 * 10**8, by_class([imu(0.0, 0.1), imu(0.1, 0.1), imu(0.3, 0.1), imu(0.4, 0.1)]))
     assert gyro.measure(gap, DRIVING) is None
     assert gyro.rejections == {"gyro.silence": 2}
 

@@ -13,8 +13,8 @@ from fgloc.config import Config, RecordingConfig
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import decode
-from fgloc.types import ImageEvent
 
 SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
 

@@ -19,7 +19,8 @@ from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
-from fgloc.types import CornersEvent, MarkerCorners, RangeBearing, RangeBearingEvent
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from tests.fuzz.hostile_yaml import SYNTAX
 
 

@@ -12,12 +12,12 @@ from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.global_search import GlobalSearch, InitialPose
 from fgloc.types import (
-    CornerMeasurement,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerPoseMeasurement,
     MotionMeasurement,
-    RangeBearingMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
     Step,
 )
 
@@ -35,13 +35,13 @@ def landmark_map(*landmarks: Landmark) -> LandmarkMap:
     return LandmarkMap({m.landmark_id: m for m in landmarks})
 
 
-def seen_point(pose, landmark: Landmark, noise=(0.0, 0.0)) -> RangeBearingMeasurement:
+def seen_point(pose, landmark: Landmark, noise=(0.0, 0.0)) -> PointMeasurement:
     r, bearing = polar(pose, landmark)
-    return RangeBearingMeasurement(0, landmark.landmark_id, r + noise[0], bearing + noise[1], BEARING_RANGE_COV)
+    return PointMeasurement(0, landmark.landmark_id, r + noise[0], bearing + noise[1], BEARING_RANGE_COV)
 
 
-def seen_corners(pose, landmark: Landmark, noise=0.0) -> CornerMeasurement:
-    return CornerMeasurement(0, landmark.landmark_id, project(pose, landmark) + noise, 0.5, CAMERA)
+def seen_corners(pose, landmark: Landmark, noise=0.0) -> PixelMeasurement:
+    return PixelMeasurement(0, landmark.landmark_id, project(pose, landmark) + noise, 0.5, CAMERA)
 
 
 class Search:
@@ -119,8 +119,8 @@ def test_marker_poses_give_the_pose_if_their_yaw_is_used():
     cov = np.diag([0.05, 0.05, 0.05]) ** 2
     search = Search(landmark_map(marker, standing(4, -2.0, 0.4, 0.0)))
     start = search.step(
-        lambda pose: MarkerPoseMeasurement(0, 3, se2.between(pose, marker.planar), cov),
-        lambda pose: MarkerPoseMeasurement(0, 4, se2.between(pose, search_map(search, 4).planar), cov),
+        lambda pose: FrameMeasurement(0, 3, se2.between(pose, marker.planar), cov),
+        lambda pose: FrameMeasurement(0, 4, se2.between(pose, search_map(search, 4).planar), cov),
     )
     assert close(start, TRUTH, 1e-6, 1e-6)
 
@@ -136,7 +136,7 @@ def test_one_wrong_sighting_among_many_does_not_spoil_the_place():
     makers = [lambda pose, m=m: seen_point(pose, m, rng.normal(0, (0.06, 0.015))) for m in landmarks[:5]]
 
     def wrong(pose):
-        return RangeBearingMeasurement(0, 5, 1.5, -2.0, BEARING_RANGE_COV)
+        return PointMeasurement(0, 5, 1.5, -2.0, BEARING_RANGE_COV)
 
     assert not close(Search(landmark_map(*landmarks)).step(wrong, makers[0]), TRUTH, 0.5, 0.5)
     found = search.step(*makers, wrong) or search.step(*makers) or search.step(*makers)
@@ -153,7 +153,7 @@ def test_two_equally_good_places_are_not_decided():
 
     def as_other(pose):
         seen = seen_corners(pose, twins[0])
-        return CornerMeasurement(0, 1, seen.corners_px, seen.sigma_px, seen.camera)
+        return PixelMeasurement(0, 1, seen.corners_px, seen.sigma_px, seen.camera)
 
     assert search.step(as_both, as_other) is None
     assert search.step(as_both, as_other) is None

@@ -24,7 +24,7 @@ from robot_world import (
 )
 
 from fgloc import se2
-from fgloc.config import BatchConfig, Config, EstimatorConfig, GyroConfig
+from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.factors import LandmarkFactors
@@ -34,19 +34,13 @@ from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    ImuEvent,
-    Landmark,
-    LandmarkMap,
-    MotionMeasurement,
-    OdometryEvent,
-    RangeBearingMeasurement,
-    Step,
-)
+from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, PointMeasurement, Step, by_class
 
 # --- names and priors -------------------------------------------------------------------------------------------------
 
@@ -107,11 +101,11 @@ POINTS = LandmarkMap(
 )
 
 
-def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> RangeBearingMeasurement:
+def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> PointMeasurement:
     x, y, _ = se2.between(pose, (*POINTS.landmarks[i].position[:2], 0.0))
     R = np.diag([0.01, 0.02]) ** 2
     bearing, distance = rng.multivariate_normal((math.atan2(y, x), math.hypot(x, y)), R)
-    return RangeBearingMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
+    return PointMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
 
 
 def correlated(rng, n: int) -> tuple[PoseWithCovariance, InstallationEstimate]:
@@ -240,13 +234,13 @@ def turning(i: int, dt: float = 0.1, later_s: float = 0.0) -> Step:
     for j in range(-30, 40):
         t = i * dt + 0.01 * j
         stamp = START_NS + round((t + later_s) * 1e9)
-        commands.append(CommandEvent(stamp, stamp, "/cmd_vel", 0.3 + 0.2 * t, 0.4 + 0.8 * t))
+        commands.append(ControlEvent(stamp, stamp, "/cmd_vel", 0.3 + 0.2 * t, 0.4 + 0.8 * t))
     kept = tuple(c for c in commands if c.stamp_ns <= end)
     imu = tuple(
         ImuEvent(t, t, "/imu", "imu", np.array([0.0, 0.0, 0.5]), np.zeros(3), np.zeros((3, 3)))
         for t in range(start, end + 1, 10_000_000)
     )
-    return Step(i, 0, start, end, commands=kept, imu=imu)
+    return Step(i, 0, start, end, by_class((*kept, *imu)))
 
 
 def readings_with(theta: dict[str, float], later_s: float = 0.0, **gains):

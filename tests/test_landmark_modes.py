@@ -12,7 +12,9 @@ from robot_world import Chain, World, beacons, config, position_error, room
 
 from fgloc import se2
 from fgloc.frames import rpy_matrix
-from fgloc.types import CornersEvent, Event, LandmarkMap, RangeBearingEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.types import Event, LandmarkMap
 
 COARSE = {"range_sigma_m": 0.2, "bearing_sigma_rad": 0.05}  # of which one sighting cannot show half a metre
 
@@ -34,10 +36,8 @@ def misread(events: list[Event], ids: list[int], share: float, seed: int) -> lis
 
     out: list[Event] = []
     for e in events:
-        if isinstance(e, RangeBearingEvent):
+        if isinstance(e, RangeBearingEvent | CornersEvent):
             e = replace(e, sightings=tuple(replace(s, landmark_id=read(s.landmark_id)) for s in e.sightings))
-        elif isinstance(e, CornersEvent):
-            e = replace(e, sightings=tuple(replace(s, marker_id=read(s.marker_id)) for s in e.sightings))
         out.append(e)
     return out
 

@@ -15,20 +15,17 @@ from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError
 from fgloc.frames import rpy_matrix
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import (
-    CornerMeasurement,
-    CornersEvent,
     FloatArray,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerCorners,
-    MarkerPose,
-    MarkerPoseMeasurement,
-    MarkerPosesEvent,
-    RangeBearing,
-    RangeBearingEvent,
-    RangeBearingMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
 )
 
 CAMERA = forward_camera()
@@ -74,7 +71,7 @@ def test_an_image_becomes_corner_measurements_with_no_residual_at_truth() -> Non
     measured = sensor.measure(found)
     assert [m.landmark_id for m in measured] == [0, 7]  # the nearer one is larger
     for m, marker in zip(measured, markers, strict=True):
-        assert isinstance(m, CornerMeasurement)
+        assert isinstance(m, PixelMeasurement)
         assert (m.stamp_ns, m.sigma_px) == (found.stamp_ns, config.markers.sigma_px)
         residual = m.corners_px - project(m.camera, pose, marker.corners())
         assert np.abs(residual).max() < 2.0 * m.sigma_px
@@ -86,7 +83,7 @@ def test_fisheye_corners_are_rid_of_the_lens() -> None:
     [m] = LandmarkSensor(Config(), known(marker), FISHEYE, None).measure(
         corners_event((3, project(FISHEYE, np.zeros(3), marker.corners())))
     )
-    assert isinstance(m, CornerMeasurement)
+    assert isinstance(m, PixelMeasurement)
     assert (m.camera.model, m.camera.D.any()) == ("plumb_bob", False)
     assert np.abs(m.corners_px - project(m.camera, np.zeros(3), marker.corners())).max() < 1e-3
 
@@ -106,7 +103,7 @@ def test_fault_43_ids_of_a_larger_dictionary_are_rejected() -> None:
     image = image_event(render(CAMERA, (0, 0, 0), [mine, foreign], "DICT_4X4_1000", rng))
     sensor = LandmarkSensor(Config(), known(mine), CAMERA, None)
     found = MarkerDetector("DICT_4X4_1000", Config().markers).detect(image)
-    assert [s.marker_id for s in found.sightings] == [3, 512]
+    assert [s.landmark_id for s in found.sightings] == [3, 512]
     assert [m.landmark_id for m in sensor.measure(found)] == [3]
     assert sensor.rejections == {"sightings.unknown_id": 1}
 
@@ -168,7 +165,7 @@ def test_corners_without_a_map_give_range_and_bearing() -> None:
     normalised = []
     for _ in range(200):
         [m] = sensor.measure(corners_event((9, corners + rng.normal(0.0, 0.5, (4, 2)))))
-        assert isinstance(m, RangeBearingMeasurement)
+        assert isinstance(m, PointMeasurement)
         error = np.array([m.bearing_rad - np.arctan2(0.6, 2.6), m.range_m - np.hypot(2.6, 0.6)])
         normalised.append(error @ np.linalg.solve(m.cov, error))
     assert 1.4 < np.mean(normalised) < 2.8  # chi-square of two degrees of freedom
@@ -180,12 +177,12 @@ def test_corners_without_a_map_give_a_pose_whose_yaw_counts_where_it_is_clear() 
     sensor = LandmarkSensor(single_view(0.2, 0.05), None, CAMERA, None)
     near = standing(9, (1.0, 0.1, 0.4), np.pi + 0.7)
     [m] = sensor.measure(corners_event((9, project(CAMERA, np.zeros(3), near.corners()))))
-    assert isinstance(m, MarkerPoseMeasurement)
+    assert isinstance(m, FrameMeasurement)
     assert np.abs(se2.between(near.planar, m.pose)).max() < 1e-3
     assert m.cov[2, 2] >= 0.05**2
     far = standing(9, (4.0, 0.1, 0.4), np.pi + 0.1)
     [m] = sensor.measure(corners_event((9, project(CAMERA, np.zeros(3), far.corners()))))
-    assert isinstance(m, MarkerPoseMeasurement)  # a landmark that is a variable is of one kind for the whole run
+    assert isinstance(m, FrameMeasurement)  # a landmark that is a variable is of one kind for the whole run
     assert np.hypot(*(m.pose[:2] - far.planar[:2])) < 1e-3
     assert m.cov[2, 2] >= 1.0
 
@@ -198,7 +195,7 @@ def test_range_and_bearing_are_calibrated() -> None:
         range_scale=1.02, range_bias_m=0.1, bearing_bias_rad=0.01, range_sigma_m=0.05, range_sigma_per_m=0.03
     )
     [m] = LandmarkSensor(settings, None, None, None).measure(ranges_event((4, 2.1, 0.31)))
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, PointMeasurement)
     assert np.allclose([m.range_m, m.bearing_rad], [2.04, 0.3])
     assert np.allclose(m.cov, np.diag([0.02**2, (0.05 + 0.03 * 2.04) ** 2]), atol=1e-12)
     assert (m.stamp_ns, m.landmark_id) == (5, 4)
@@ -207,7 +204,7 @@ def test_range_and_bearing_are_calibrated() -> None:
 def test_range_along_the_axis_becomes_a_range() -> None:
     settings = config(range_along_axis=True)
     [m] = LandmarkSensor(settings, None, None, None).measure(ranges_event((4, 2.0, 0.4)))
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, PointMeasurement)
     assert np.allclose([m.range_m, m.bearing_rad], [2.0 / np.cos(0.4), 0.4])
     assert m.cov[1, 1] > (0.1 / np.cos(0.4)) ** 2  # the bearing's error adds to the range's
     sensor = LandmarkSensor(settings, None, None, None)
@@ -223,7 +220,7 @@ def test_the_sensors_place_is_taken_out_with_its_covariance() -> None:
     local = rpy_matrix(0.0, 0.0, 0.7)[:2, :2].T @ (truth - [0.4, -0.2])
     r, b = np.hypot(*local), np.arctan2(local[1], local[0])
     [m] = sensor.measure(ranges_event((1, r, b)))
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, PointMeasurement)
     assert np.allclose([m.range_m, m.bearing_rad], [np.hypot(*truth), np.arctan2(1.0, 2.5)])
     noisy = [
         sensor.measure(ranges_event((1, r + rng.normal(0, 0.03), b + rng.normal(0, 0.02))))[0] for _ in range(2000)
@@ -254,7 +251,7 @@ def test_marker_poses_give_range_and_bearing_in_the_base() -> None:
     event = poses_event(seen_from(OPTICAL, marker))
     assert event.sightings[0].position[2] > 2.5  # optical: z is ahead
     [m] = sensor.measure(event)
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, PointMeasurement)
     assert np.allclose([m.range_m, m.bearing_rad], [np.hypot(3.0, 1.0), np.arctan2(1.0, 3.0)])
     assert 0.015 < np.sqrt(m.cov[0, 0]) < 0.025
     assert 0.09 < np.sqrt(m.cov[1, 1]) < 0.11
@@ -268,7 +265,7 @@ def test_marker_poses_give_planar_poses_if_their_yaw_is_believed(map_known: bool
         marker = replace(marker, rotation=rpy_matrix(0.0, 0.0, 0.8))
     sensor = LandmarkSensor(config(yaw_sigma_rad=0.1), known(marker) if map_known else None, None, OPTICAL)
     [m] = sensor.measure(poses_event(seen_from(OPTICAL, marker)))
-    assert isinstance(m, MarkerPoseMeasurement)
+    assert isinstance(m, FrameMeasurement)
     assert np.abs(se2.between(marker.planar, m.pose)).max() < 1e-9
     assert np.allclose(m.cov[2], [0.0, 0.0, 0.01])
     assert np.linalg.eigvalsh(m.cov)[0] > 0.0
@@ -286,7 +283,7 @@ def test_the_map_says_whether_a_marker_stands() -> None:
     [m] = LandmarkSensor(config(yaw_sigma_rad=0.3), known(marker), None, OPTICAL).measure(
         poses_event((number, position, tilted))
     )
-    assert isinstance(m, MarkerPoseMeasurement)
+    assert isinstance(m, FrameMeasurement)
     assert abs(se2.wrap(m.pose[2] - np.pi)) < 0.01
 
 
@@ -294,4 +291,4 @@ def test_a_point_of_the_map_has_no_yaw() -> None:
     point = Landmark(2, np.array([3.0, 1.0, 0.0]), np.eye(3), 0.0)
     sensor = LandmarkSensor(config(yaw_sigma_rad=0.1), known(point), None, OPTICAL)
     [m] = sensor.measure(poses_event(seen_from(OPTICAL, standing(2, (3.0, 1.0, 0.4), 2.5))))
-    assert isinstance(m, RangeBearingMeasurement)
+    assert isinstance(m, PointMeasurement)

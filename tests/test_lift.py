@@ -12,18 +12,11 @@ from robot_world import START_NS, Chain, World, config, room
 from test_ablation_failures import apply, driving, make, of
 
 from fgloc.ablation.failures import corrupt
-from fgloc.ablation.failures.base import Scene
 from fgloc.robust.lift import LiftMonitor
-from fgloc.types import (
-    CommandEvent,
-    ImuEvent,
-    JointsEvent,
-    Mode,
-    MotionMeasurement,
-    MotionReadings,
-    OdometryEvent,
-    Step,
-)
+from fgloc.sensors.failures import Scene
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Mode, MotionMeasurement, MotionReadings, Step, by_class
 
 IN_THE_AIR = {"intervals": [(1.95, 5.95)]}
 DT_NS = 200_000_000
@@ -43,7 +36,7 @@ def test_lifted_wheels_stand_and_go_on_from_there_while_the_clock_runs():
     assert angles[8.0].position - angles[6.0].position == pytest.approx(exact[8.0].position - exact[6.0].position)
     still = [e for e in of(OdometryEvent, after) if 2.0 < e.stamp_ns * 1e-9 < 5.9]
     assert all(np.allclose(a.position, b.position) and not b.linear.any() for a, b in pairwise(still))
-    assert all(e.v == e.omega == 0.0 for e in of(CommandEvent, after) if 2.0 < e.stamp_ns * 1e-9 < 5.9)
+    assert all(e.v == e.omega == 0.0 for e in of(ControlEvent, after) if 2.0 < e.stamp_ns * 1e-9 < 5.9)
 
 
 def test_the_accelerometer_shows_a_rise_and_a_descent_of_the_height():
@@ -76,8 +69,8 @@ def step(k, force, omega=0.0, command=None):
         ImuEvent(t, t, "/imu", "imu", np.array([0.0, 0.0, omega]), np.array([0.0, 0.0, f]), np.zeros((3, 3)))
         for t, f in zip(stamps, forces, strict=True)
     )
-    commands = () if command is None else (CommandEvent(end - DT_NS, end - DT_NS, "/cmd_vel", command, 0.0),)
-    return Step(k, 0, end - DT_NS, end, commands=commands, imu=imu)
+    commands = () if command is None else (ControlEvent(end - DT_NS, end - DT_NS, "/cmd_vel", command, 0.0),)
+    return Step(k, 0, end - DT_NS, end, by_class((*commands, *imu)))
 
 
 def readings(s, forward=0.0, turn=0.0):

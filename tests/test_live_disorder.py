@@ -9,7 +9,9 @@ from robot_world import START_NS, World, beacons, config, room
 
 from fgloc.config import Config
 from fgloc.live import Live
-from fgloc.types import CommandEvent, CornersEvent, JointsEvent, Mode, OdometryEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, Mode
 
 SECOND = 1_000_000_000
 SECONDS = 10.0
@@ -186,7 +188,7 @@ def test_wheels_and_an_arm_may_share_a_topic():
             names, stamp = ("left_wheel", "right_wheel"), event.stamp_ns
             events.append(JointsEvent(stamp, stamp, "/joints", names, angle, np.zeros(2), np.zeros(2)))
             events.append(JointsEvent(stamp + 1, stamp, "/joints", ("arm",), np.zeros(1), np.zeros(1), np.zeros(1)))
-        elif not isinstance(event, CommandEvent):
+        elif not isinstance(event, ControlEvent):
             events.append(event)
     with Live(settings, world.map, roles=("joints", "sightings")) as live:
         made = []

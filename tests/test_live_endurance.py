@@ -14,12 +14,11 @@ from robot_world import CAMERA, START_NS, World, beacons, config, room
 
 from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
-from fgloc.intake.clock_guard import MOTION_EVENTS
 from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
 from fgloc.relocalization.pose_fit import PoseFit
-from fgloc.types import Mode
+from fgloc.types import Mode, MotionEvent
 
 SECOND = 1_000_000_000
 STEPS, WARM_UP = 450, 250
@@ -67,7 +66,7 @@ def test_memory_and_what_is_kept_stay_as_they_are():
                 poses.begin(run.anchors.parts)
             continue
         passed = run.check(event)
-        if isinstance(passed, MOTION_EVENTS):
+        if isinstance(passed, MotionEvent):
             poses.add(passed)
         for step, estimate in () if passed is None else run.use(passed):
             if estimate is not None:
@@ -120,7 +119,7 @@ def scattered(event, rng):
         sightings=tuple(
             dataclasses.replace(
                 s,
-                marker_id=int(rng.integers(20)),
+                landmark_id=int(rng.integers(20)),
                 corners_px=s.corners_px - s.corners_px.mean(axis=0) + rng.uniform(100, 380, 2),
             )
             for s in event.sightings

@@ -18,7 +18,9 @@ from robot_world import START_NS, World, beacons, config, nees, room
 from fgloc.errors import OutputError
 from fgloc.live import Live
 from fgloc.live.state import fingerprint, read_state
-from fgloc.types import ImuEvent, Mode, OdometryEvent
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Mode
 
 GAP = (6.0, 9.0)  # s, nothing listens
 

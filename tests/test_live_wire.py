@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from wire import DOMAIN, wait_until
 
-from fgloc.config import RecordingConfig, TopicsConfig
+from fgloc.config import RecordingConfig, TopicsConfig, role_names
 from fgloc.errors import WireError
 from fgloc.live.wire import intake, play
 from fgloc.live.wire.clock import WireClock
@@ -20,7 +20,7 @@ from fgloc.live.wire.names import dds_topic, dds_type, ros_topic, ros_type
 from fgloc.live.wire.participant import Participant, Publication, Sample
 from fgloc.live.wire.play import Player
 from fgloc.recording.cdr import Messages
-from fgloc.recording.decode import CONVERTERS
+from fgloc.recording.decode import converters_of
 from fgloc.recording.reader import open_recording
 
 
@@ -68,7 +68,7 @@ def test_types_on_the_wire_are_those_of_the_definitions():
     layout = messages.layout("sensor_msgs/msg/CameraInfo")
     assert [field.name for field in layout["sensor_msgs/msg/RegionOfInterest"]][:2] == ["x_offset", "y_offset"]
     assert next(field for field in layout["sensor_msgs/msg/CameraInfo"] if field.name == "k").array == 9
-    kinds = {kind for converters in CONVERTERS.values() for kind in converters}
+    kinds = {kind for role in role_names() for kind in converters_of(role)}
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
         writers = [one.writer(f"/t{k}", kind) for k, kind in enumerate(sorted(kinds))]
         expected = {Publication(f"/t{k}", kind) for k, kind in enumerate(sorted(kinds))}

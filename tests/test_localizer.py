@@ -27,13 +27,13 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import MotionConfig
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import carry
-from fgloc.types import CornerMeasurement, LandmarkMap, Mode
+from fgloc.types import LandmarkMap, Mode, PixelMeasurement
 
 MAPS = {"corners": room, "beacons": beacons}
 
@@ -150,7 +150,7 @@ def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
     then = se2.compose(keyframe, motion)
     values = []
     for _ in range(40):
-        seen = CornerMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
+        seen = PixelMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
         wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
         fit = joint_fit(keyframe, [carry(seen, wrong, cov)], factors, settings)
         error = se2.log(se2.between(fit.pose, keyframe))
@@ -232,9 +232,13 @@ def test_fault_49_sightings_of_a_false_id_are_refused_and_do_no_harm():
     events, swapped = [], 0
     for event in clean.events():
         sightings = getattr(event, "sightings", ())
-        if any(s.marker_id == 7 for s in sightings) and not any(s.marker_id == 2 for s in sightings) and swapped < 25:
+        if (
+            any(s.landmark_id == 7 for s in sightings)
+            and not any(s.landmark_id == 2 for s in sightings)
+            and swapped < 25
+        ):
             event = replace(
-                event, sightings=tuple(replace(s, marker_id=2) if s.marker_id == 7 else s for s in sightings)
+                event, sightings=tuple(replace(s, landmark_id=2) if s.landmark_id == 7 else s for s in sightings)
             )
             swapped += 1
         events.append(event)

@@ -13,7 +13,8 @@ from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.types import CornersEvent, ImageEvent, MarkerCorners, Mode
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.types import Mode
 
 
 def write_late_circle(folder, late_s, seconds=6.0):

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from marker_scenes import forward_camera, image_event, project, render, standing, texture
 
-from fgloc.config import MarkersConfig
 from fgloc.errors import ConfigError
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector, detect_stream, suggest_dictionary
 from fgloc.sensors.markers.dictionaries import dictionary_names, load_dictionary
-from fgloc.types import CommandEvent, CornersEvent, Event, ImageEvent
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.types import ControlEvent, Event
 
 CAMERA = forward_camera()
 DICTIONARIES = ["DICT_4X4_50", "DICT_6X6_250", "DICT_ARUCO_MIP_36h12", "DICT_APRILTAG_36h11", "DICT_APRILTAG_16h5"]
@@ -35,7 +36,7 @@ def test_corners_are_where_the_landmark_projects(dictionary: str, distance: floa
         pose = (rng.uniform(-0.2, 0.2), rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1))
         marker = standing(int(rng.integers(30)), (distance + 0.1, 0.0, 0.3), np.pi + rng.uniform(-0.6, 0.6))
         found = detector(dictionary).detect(image_event(render(CAMERA, pose, [marker], dictionary, rng)))
-        assert [s.marker_id for s in found.sightings] == [marker.landmark_id]
+        assert [s.landmark_id for s in found.sightings] == [marker.landmark_id]
         errors.append(found.sightings[0].corners_px - project(CAMERA, pose, marker.corners()))
     assert np.abs(errors).max() < 0.25
     assert np.sqrt((np.array(errors) ** 2).mean()) < 0.08
@@ -139,7 +140,7 @@ def stream(images: int) -> Iterator[Event]:
     for k in range(images):
         stamp = 100 * k
         yield image_event(seen if k % 3 else np.full_like(seen, 90), stamp)
-        yield from (CommandEvent(stamp + j, stamp + j, "/cmd", 0.1 * j, 0.0) for j in range(1, 4))
+        yield from (ControlEvent(stamp + j, stamp + j, "/cmd", 0.1 * j, 0.0) for j in range(1, 4))
 
 
 def test_stream_keeps_order_and_finds_what_plain_detection_finds() -> None:

@@ -11,7 +11,6 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
-from fgloc.config import MotionConfig, NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned import (
     DisplacementModel,
@@ -23,20 +22,22 @@ from fgloc.sensors.learned import (
     save_model,
 )
 from fgloc.sensors.learned.card import Kind
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import noise_density
-from fgloc.types import CommandEvent, Step
+from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.types import ControlEvent, Step, by_class
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
 KINDS = get_args(Kind)
 
 
-def commands(rng: np.random.Generator, seconds: float = 6.0) -> tuple[CommandEvent, ...]:
+def commands(rng: np.random.Generator, seconds: float = 6.0) -> tuple[ControlEvent, ...]:
     """Commands at irregular times, 20 ms apart on average, that change every half second."""
     stamps = T0 + np.cumsum(rng.integers(5_000_000, 35_000_000, int(seconds / 0.02)))
     levels = rng.uniform([-0.1, -0.5], [0.3, 0.5], (int(seconds * 2) + 3, 2))
-    return tuple(CommandEvent(int(t), int(t), "/cmd_vel", *map(float, levels[int((t - T0) * 2e-9)])) for t in stamps)
+    return tuple(ControlEvent(int(t), int(t), "/cmd_vel", *map(float, levels[int((t - T0) * 2e-9)])) for t in stamps)
 
 
 def model_of(kind: str, rng: np.random.Generator, tmp_path: Path, **changes: object) -> MotionModel:
@@ -45,7 +46,7 @@ def model_of(kind: str, rng: np.random.Generator, tmp_path: Path, **changes: obj
     return load_model(tmp_path / "model.safetensors")
 
 
-def known(events: tuple[CommandEvent, ...], end_ns: int) -> tuple[CommandEvent, ...]:
+def known(events: tuple[ControlEvent, ...], end_ns: int) -> tuple[ControlEvent, ...]:
     return tuple(e for e in events if e.stamp_ns <= end_ns)
 
 
@@ -66,10 +67,10 @@ def test_file_round_trip(kind: str, rng: np.random.Generator, tmp_path: Path) ->
 
 def test_command_track_averages_a_zero_order_hold() -> None:
     events = tuple(
-        CommandEvent(T0 + round(t * SECOND), 0, "c", v, 2 * v)
+        ControlEvent(T0 + round(t * SECOND), 0, "c", v, 2 * v)
         for t, v in ((1.0, 1.0), (2.0, 3.0), (2.5, 0.0), (4.0, 5.0))
     )
-    track = CommandTrack(events, T0)
+    track = CommandHistory(events, T0)
     means = track.means(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 9.0]))
     np.testing.assert_allclose(means[:, 0], [0.0, 1.0, 1.5, 0.0, 5.0], atol=1e-12)
     np.testing.assert_allclose(means[:, 1], 2 * means[:, 0], atol=1e-12)
@@ -79,7 +80,7 @@ def test_command_track_averages_a_zero_order_hold() -> None:
 def test_displacement_without_residual_is_the_calibrated_kinematics(rng: np.random.Generator, tmp_path: Path) -> None:
     card = make_card("displacement", kinematics=dict(scale_v=0.9, scale_omega=1.1, yaw_per_m=0.5, delay_s=0.1))
     save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
-    event = CommandEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
+    event = ControlEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
     prediction = load_model(tmp_path / "m.safetensors").predict((event,), T0 + SECOND, T0 + 2 * SECOND, None)
     assert prediction is not None
     twist = np.array([0.45, 0.0, 0.88 + 0.5 * 0.45])
@@ -110,7 +111,7 @@ def test_ensemble_is_the_mean_and_doubts_where_its_members_differ(rng: np.random
 def test_velocity_without_network_is_a_first_order_lag(rng: np.random.Generator, tmp_path: Path) -> None:
     card = make_card("velocity", kinematics=dict(scale_v=0.9, scale_omega=1.1))
     save_model(tmp_path / "m.safetensors", {k: 0 * v for k, v in make_tensors(card, rng).items()}, card)
-    event = CommandEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
+    event = ControlEvent(T0, T0, "/cmd_vel", 0.5, 0.8)
     predictions = [
         load_model(tmp_path / "m.safetensors").predict((event,), T0 + SECOND, T0 + n * SECOND, np.zeros(2))
         for n in (2, 5)
@@ -154,18 +155,18 @@ def test_covariance_is_composed_as_se2_does(kind: str, rng: np.random.Generator,
 
 def test_a_track_followed_step_by_step_equals_one_made_at_once(rng: np.random.Generator) -> None:
     events = commands(rng)
-    track = CommandTrack(events[:100])
+    track = CommandHistory(events[:100])
     for first in range(10, 180, 7):
         window = events[first : first + 100]
         assert track.following(window) is track
         times = (window[-1].stamp_ns - track.origin_ns) * 1e-9 - np.linspace(1.0, -0.5, 20)
         shifted = times + (track.origin_ns - window[0].stamp_ns) * 1e-9
-        np.testing.assert_allclose(track.means(times), CommandTrack(window).means(shifted), atol=1e-9)
+        np.testing.assert_allclose(track.means(times), CommandHistory(window).means(shifted), atol=1e-9)
     late = (*window[:50], replace(window[50], v=9.0, stamp_ns=window[50].stamp_ns - 1), *window[50:])
     assert track.following(late) is not track  # one came late, in the middle
     assert track.following(events[:50]) is not track  # an earlier part
-    long = tuple(CommandEvent(T0 + i * 1000, 0, "c", 1.0, 0.0) for i in range(20_000))
-    track = CommandTrack(long[:50])
+    long = tuple(ControlEvent(T0 + i * 1000, 0, "c", 1.0, 0.0) for i in range(20_000))
+    track = CommandHistory(long[:50])
     for first in range(0, 19_000, 40):
         track = track.following(long[first : first + 50])
     assert len(track._events) < 5000  # memory does not grow
@@ -225,7 +226,7 @@ def test_known_velocity_matters_at_first_and_fades(rng: np.random.Generator, tmp
 
 def test_naive_model_does_what_it_is_told(rng: np.random.Generator, tmp_path: Path) -> None:
     model = model_of("naive", rng, tmp_path)
-    events = tuple(CommandEvent(T0 + k * SECOND, 0, "c", 0.1 * k, 0.2 * k) for k in range(1, 4))
+    events = tuple(ControlEvent(T0 + k * SECOND, 0, "c", 0.1 * k, 0.2 * k) for k in range(1, 4))
     prediction = model.predict(events, T0 + 3 * SECOND // 2, T0 + 5 * SECOND // 2, None)
     assert prediction is not None
     halves = [se2.exp((0.05 * k, 0.0, 0.1 * k)) for k in (1, 2)]
@@ -257,9 +258,9 @@ def test_prediction_needs_a_command_and_a_length(rng: np.random.Generator, tmp_p
         model.predict(events, T0, T0, None)
 
 
-def step(events: tuple[CommandEvent, ...], index: int, segment: int = 0, length: int = SECOND // 5) -> Step:
+def step(events: tuple[ControlEvent, ...], index: int, segment: int = 0, length: int = SECOND // 5) -> Step:
     start = T0 + 3 * SECOND + index * length
-    return Step(index, segment, start, start + length, commands=events)
+    return Step(index, segment, start, start + length, by_class(events))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,7 +12,7 @@ import fgloc.sensors.learned
 from datasets import mrclam
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Kinematics
-from fgloc.types import CommandEvent
+from fgloc.types import ControlEvent
 from training.config import DataConfig
 from training.data import make_run
 from training.evaluate import evaluate
@@ -41,7 +41,7 @@ def test_shipped_models_load() -> None:
 def test_model_halves_the_drift_of_an_unseen_robot(robot: int) -> None:
     run = mrclam.read(real_data("mrclam6"), robot)
     commands = [
-        CommandEvent(int(t), int(t), "/cmd_vel", float(v), float(omega))
+        ControlEvent(int(t), int(t), "/cmd_vel", float(v), float(omega))
         for t, (v, omega) in zip(run.commands_ns, run.commands, strict=True)
     ]
     samples = make_run("r", commands, run.truth_ns, run.truth, 0.1, 3.0, DataConfig())

@@ -10,11 +10,13 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
-from fgloc.config import MotionConfig
 from fgloc.errors import ConfigError, ModelError
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import LearnedMotion, load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.signals import Signal, SignalReader, Signals
-from fgloc.types import CommandEvent, ImuEvent, JointsEvent, Step
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import ControlEvent, MotionEvent, Step, by_class
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
@@ -41,11 +43,19 @@ def drive(start: float, end: float, **changes: object) -> Step:
         0,
         T0 + round(start * SECOND),
         T0 + round(end * SECOND),
-        commands=(CommandEvent(T0 + 5 * SECOND // 2, T0, "/cmd_vel", 0.1, 0.1),),
-        joints=tuple(joints(t, 4.0 * t, 6.0 * t) for t in times),
-        imu=tuple(imu(t, 0.5) for t in times),
+        by_class(
+            (
+                ControlEvent(T0 + 5 * SECOND // 2, T0, "/cmd_vel", 0.1, 0.1),
+                *(joints(t, 4.0 * t, 6.0 * t) for t in times),
+                *(imu(t, 0.5) for t in times),
+            )
+        ),
     )
     return replace(step, **changes)
+
+
+def with_events(step: Step, kind: type[MotionEvent], events: tuple[MotionEvent, ...]) -> Step:
+    return replace(step, motion={**step.motion, kind: events})
 
 
 @pytest.fixture
@@ -86,8 +96,8 @@ def test_signals_of_a_step() -> None:
 def test_wheel_rates_stand_in_for_angles() -> None:
     reader = SignalReader(make_card("displacement", inputs=("commands", "wheels")))
     step = drive(3.0, 3.2)
-    rates = tuple(replace(e, position=np.zeros(0), velocity=np.array([0.0, 6.0, 4.0])) for e in step.joints)
-    signals = reader.read(replace(step, joints=rates))
+    rates = tuple(replace(e, position=np.zeros(0), velocity=np.array([0.0, 6.0, 4.0])) for e in step.of(JointsEvent))
+    signals = reader.read(with_events(step, JointsEvent, rates))
     assert isinstance(signals, Signals)
     assert signals.wheels is not None
     np.testing.assert_allclose(signals.wheels.means(np.array([0.0, 0.2])), [[0.25, 0.1 / 0.26]], atol=1e-9)
@@ -110,32 +120,34 @@ def test_best_known_kinematics_carry_the_model(tmp_path: Path, rng: np.random.Ge
 @pytest.mark.parametrize("missing", ["gyro", "effort", "wheels"])
 def test_a_step_without_a_signal_gives_no_measurement(missing: str, tmp_path: Path, rng: np.random.Generator) -> None:
     source = source_of(tmp_path, rng, ("commands", missing))
-    name = "imu" if missing == "gyro" else "joints"
+    kind = ImuEvent if missing == "gyro" else JointsEvent
     whole = drive(3.0, 4.0)
-    events = getattr(whole, name)
+    events = whole.of(kind)
     hole = tuple(e for e in events if not T0 + 3.3 * SECOND < e.stamp_ns < T0 + 3.7 * SECOND)
     short = tuple(e for e in events if e.stamp_ns < T0 + 3.7 * SECOND)
     late = tuple(e for e in events if e.stamp_ns > T0 + 3.3 * SECOND)
     for left in (hole, short, late, events[:1], ()):
-        assert source.measure(replace(whole, **{name: left}), None) is None
+        assert source.measure(with_events(whole, kind, left), None) is None
     thin = events[::10]
-    assert source.measure(replace(whole, **{name: thin}), None) is not None  # five a second will do
+    assert source.measure(with_events(whole, kind, thin), None) is not None  # five a second will do
     assert source.rejections == {f"learned.no_{missing}": 5}
-    assert source_of(tmp_path, rng, ("commands",)).measure(replace(whole, **{name: ()}), None) is not None
+    assert source_of(tmp_path, rng, ("commands",)).measure(with_events(whole, kind, ()), None) is not None
 
 
 def test_readings_that_are_not_numbers_are_holes(tmp_path: Path, rng: np.random.Generator) -> None:
     source = source_of(tmp_path, rng, ("commands", "effort"))
     whole = drive(3.0, 4.0)
-    lame = tuple(replace(e, effort=np.array([7.0, np.nan, 0.1])) for e in whole.joints)
-    mute = tuple(replace(e, effort=np.zeros(0)) for e in whole.joints)
-    other = tuple(replace(e, names=("a", "b", "c")) for e in whole.joints)
+    lame = tuple(replace(e, effort=np.array([7.0, np.nan, 0.1])) for e in whole.of(JointsEvent))
+    mute = tuple(replace(e, effort=np.zeros(0)) for e in whole.of(JointsEvent))
+    other = tuple(replace(e, names=("a", "b", "c")) for e in whole.of(JointsEvent))
     for events in (lame, mute, other):
-        assert source.measure(replace(whole, joints=events), None) is None
+        assert source.measure(with_events(whole, JointsEvent, events), None) is None
     assert source.rejections == {"learned.no_effort": 3}
-    both = tuple(replace(e, names=("front_left_wheel", "rear_left_wheel", "right_wheel")) for e in whole.joints)
+    both = tuple(
+        replace(e, names=("front_left_wheel", "rear_left_wheel", "right_wheel")) for e in whole.of(JointsEvent)
+    )
     with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
-        source.measure(replace(whole, joints=both), None)
+        source.measure(with_events(whole, JointsEvent, both), None)
 
 
 def test_contiguous_steps_remember_and_others_begin_anew() -> None:
@@ -147,7 +159,7 @@ def test_contiguous_steps_remember_and_others_begin_anew() -> None:
 
     def step(start: float, end: float, segment: int = 0) -> Step:
         heard = tuple(e for e in rates if T0 + (start - 0.02) * SECOND <= e.stamp_ns <= T0 + (end + 0.02) * SECOND)
-        return Step(0, segment, T0 + round(start * SECOND), T0 + round(end * SECOND), imu=heard)
+        return Step(0, segment, T0 + round(start * SECOND), T0 + round(end * SECOND), by_class(heard))
 
     def before(reader: SignalReader, at: Step) -> float:
         signals = reader.read(at)
@@ -172,7 +184,7 @@ def test_a_model_is_not_asked_without_its_signals(tmp_path: Path, rng: np.random
     source = source_of(tmp_path, rng, ("commands", "gyro"))
     step = drive(3.0, 3.2)
     with pytest.raises(ModelError, match="reads gyro, which the step has not"):
-        source.model.predict(step.commands, step.start_ns, step.stamp_ns, None)
+        source.model.predict(step.controls, step.start_ns, step.stamp_ns, None)
 
 
 def test_cards_say_what_a_model_reads() -> None:

@@ -13,7 +13,7 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse, predict
@@ -24,12 +24,15 @@ from fgloc.robust.motion_faults import FaultVerdict
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import CommandEvent, ImuEvent, MotionMeasurement, MotionReadings, Step
+from fgloc.types import ControlEvent, MotionMeasurement, MotionReadings, Step, by_class
 
 W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2
 L_W, L_N = np.linalg.cholesky(W), np.linalg.cholesky(N)
@@ -150,10 +153,10 @@ def step(i: int, dt: float, omega=0.0) -> Step:
     start, end = START_NS + round(i * dt * 1e9), START_NS + round((i + 1) * dt * 1e9)
     n = round(dt / 0.05)
     stamps = [START_NS + round((i * dt + 0.05 * j) * 1e9) for j in range(-1, n + 2)]
-    commands = tuple(CommandEvent(t, t, "/cmd_vel", SPEED, TURN) for t in stamps[:-1])
+    commands = tuple(ControlEvent(t, t, "/cmd_vel", SPEED, TURN) for t in stamps[:-1])
     rates = np.array([0.0, 0.0, TURN + omega])
     imu = tuple(ImuEvent(t, t, "/imu", "imu", rates, np.zeros(3), np.zeros((3, 3))) for t in stamps)
-    return Step(i, 0, start, end, commands=commands, imu=imu)
+    return Step(i, 0, start, end, by_class((*commands, *imu)))
 
 
 def test_commands_that_stand_in_for_wheels_are_left_out_beside_a_model_that_reads_them(tmp_path):

@@ -18,11 +18,11 @@ from fgloc.graph.noise_models import sighting_whitening
 from fgloc.graph.observation import Observations
 from fgloc.types import (
     Camera,
-    CornerMeasurement,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
 )
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
@@ -48,7 +48,7 @@ def scene(seed: int, n: int = 5):
         markers[i] = replace(flat, position=place, rotation=flat.rotation @ rotation(rng, 0.1))
         camera = Camera(640, 480, "plumb_bob", K, D, T)
         poses.append(pose)
-        seen.append(CornerMeasurement(0, i, np.zeros((4, 2)), 0.5, camera))
+        seen.append(PixelMeasurement(0, i, np.zeros((4, 2)), 0.5, camera))
     at_truth = Observations(seen, markers, Installation({})).linearize(np.array(poses), np.zeros(0))
     seen = [
         replace(
@@ -74,10 +74,10 @@ def planar_scene(seed: int, n: int = 6):
         x, y, yaw = se2.between(pose, landmarks[i].planar) + noise
         if i % 2:
             A = rng.normal(0.0, 0.03, (3, 3))
-            m = MarkerPoseMeasurement(0, i, np.array([x, y, yaw]), A @ A.T + 1e-4 * np.eye(3), twist, offset)
+            m = FrameMeasurement(0, i, np.array([x, y, yaw]), A @ A.T + 1e-4 * np.eye(3), twist, offset)
         else:
             cov = np.diag([0.02, 0.05]) ** 2
-            m = RangeBearingMeasurement(0, i, float(np.hypot(x, y)), float(np.arctan2(y, x)), cov, twist, offset)
+            m = PointMeasurement(0, i, float(np.hypot(x, y)), float(np.arctan2(y, x)), cov, twist, offset)
         poses.append(pose)
         seen.append(m)
     return np.array(poses), LandmarkMap(landmarks), seen

@@ -22,16 +22,11 @@ from fgloc.errors import RecordingError
 from fgloc.recording.info import format_info, inspect
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-    TransformEvent,
-    TruthEvent,
-)
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent, Event, TransformEvent, TruthEvent
 
 DEFAULT = RecordingConfig()
 
@@ -64,7 +59,7 @@ def test_rosbag2_folder_and_file(tmp_path, storage, single_file):
         assert [t.count for t in recording.topics if t.role == "sightings"] == [40]
     assert Counter(type(e).__name__ for e in events) == {
         "OdometryEvent": 200,
-        "CommandEvent": 200,
+        "ControlEvent": 200,
         "JointsEvent": 200,
         "TruthEvent": 200,
         "RangeBearingEvent": 40,
@@ -89,7 +84,7 @@ def test_ros1_bag_headerless_messages_take_receive_times(tmp_path):
         assert recording.kind == "ros1"
         assert recording.roles == {"odometry": "/odom", "command": "/cmd_vel", "truth": "/mocap/pose"}
         events = list(recording.events())
-    assert Counter(type(e).__name__ for e in events) == {"OdometryEvent": 100, "CommandEvent": 100, "TruthEvent": 100}
+    assert Counter(type(e).__name__ for e in events) == {"OdometryEvent": 100, "ControlEvent": 100, "TruthEvent": 100}
     for event in events:
         delay = event.received_ns - event.stamp_ns
         assert delay == (1_000_000 if isinstance(event, OdometryEvent) else 0)
@@ -112,7 +107,7 @@ def test_received_stamps_and_offsets(tmp_path):
             assert delay == 500_000_000
         elif isinstance(event, TruthEvent):
             assert delay == -252_000_000
-        elif isinstance(event, CommandEvent):
+        elif isinstance(event, ControlEvent):
             assert delay == -2_000_000
 
 
@@ -165,7 +160,7 @@ def test_apriltag_corners_are_put_in_opencv_order(tmp_path):
     assert isinstance(event, CornersEvent)
     assert (event.stamp_ns, event.frame_id) == (5_000_000_007, "cam")
     (tag,) = event.sightings
-    assert tag.marker_id == 0
+    assert tag.landmark_id == 0
     expected = [[199.5, 199.5], [99.5, 199.5], [99.5, 99.5], [199.5, 99.5]]  # half a turn, pixel centres whole
     np.testing.assert_array_equal(tag.corners_px, expected)
 
@@ -180,7 +175,7 @@ def test_aruco_poses(tmp_path):
 
     (event,) = read(write_sightings(tmp_path / "run", "aruco_msgs/msg/MarkerArray", make))
     assert isinstance(event, MarkerPosesEvent)
-    assert [(s.marker_id, s.position[0]) for s in event.sightings] == [(0, 0.0), (7, 7.0)]
+    assert [(s.landmark_id, s.position[0]) for s in event.sightings] == [(0, 0.0), (7, 7.0)]
 
 
 @pytest.mark.parametrize(
@@ -189,7 +184,7 @@ def test_aruco_poses(tmp_path):
 )
 def test_detection3d_ids(tmp_path, class_id, own_id, expected):
     (event,) = read(write_detections(tmp_path / "run", [(class_id, own_id), ("person", "")]))
-    assert [s.marker_id for s in event.sightings] == [expected]
+    assert [s.landmark_id for s in event.sightings] == [expected]
 
 
 def write_detections(folder: Path, ids: list[tuple[str, str]]) -> Path:
@@ -244,7 +239,7 @@ def test_embedded_definitions_win(tmp_path):
         writer.write(connection, START_NS, store.serialize_cdr(message, connection.msgtype))
     (event,) = read(tmp_path / "run")
     assert isinstance(event, MarkerPosesEvent)
-    assert [s.marker_id for s in event.sightings] == [42]
+    assert [s.landmark_id for s in event.sightings] == [42]
     np.testing.assert_array_equal(event.sightings[0].position, [1, 2, 3])
 
 

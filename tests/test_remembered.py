@@ -11,7 +11,7 @@ from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import read_record
 from fgloc.ablation.suite import Suite, expand
 from fgloc.cli.runs import SAMPLE
-from fgloc.config import MarkersConfig
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import ImageError
 from fgloc.sensors.markers.remembered import RememberedDetections
@@ -43,7 +43,7 @@ def pictures():
 
 def same(a, b):
     return (a.stamp_ns, a.received_ns, a.topic, a.frame_id) == (b.stamp_ns, b.received_ns, b.topic, b.frame_id) and all(
-        s.marker_id == t.marker_id and np.array_equal(s.corners_px, t.corners_px)
+        s.landmark_id == t.landmark_id and np.array_equal(s.corners_px, t.corners_px)
         for s, t in zip(a.sightings, b.sightings, strict=True)
     )
 

@@ -12,7 +12,7 @@ from fgloc.graph.estimator import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, RangeBearingMeasurement
+from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, PointMeasurement
 
 KINDS = ("fixed_lag", "isam2", "ekf")
 Q, R = np.diag([0.01, 0.005, 0.01]) ** 2, np.diag([0.02, 0.08]) ** 2
@@ -42,7 +42,7 @@ class Drive:
     def _sighting(self, k, truth, i, rng):
         x, y, _ = se2.between(truth, (*MAP.landmarks[i].position[:2], 0.0))
         bearing, distance = rng.multivariate_normal((np.arctan2(y, x), np.hypot(x, y)), R)
-        return RangeBearingMeasurement(k, i, distance, bearing, R)
+        return PointMeasurement(k, i, distance, bearing, R)
 
 
 def estimator(kind: str, lag_s: float = 3.0, keep_all: bool = False, threshold: float = 1e-4) -> Estimator:

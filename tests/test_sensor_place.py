@@ -8,7 +8,7 @@ from datasets.bag import BagWriter
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config
 from fgloc.recording.reader import open_recording
-from fgloc.types import RangeBearing, RangeBearingEvent
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 
 START_NS = 1_700_000_000_000_000_000
 K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]

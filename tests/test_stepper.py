@@ -1,5 +1,6 @@
 """How the stream of events is cut into steps."""
 
+import dataclasses
 import tracemalloc
 
 import numpy as np
@@ -20,7 +21,12 @@ from event_makers import (
     times,
 )
 
-from fgloc.types import CornersEvent, OdometryEvent
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent
+
+MOTION = (OdometryEvent, ControlEvent, JointsEvent, ImuEvent)
 
 
 def robot(rng, seconds=30.0, camera_latency=0.06):
@@ -48,7 +54,7 @@ def same(a, b):
     """Whether two runs gave the same steps."""
 
     def key(step):
-        kinds = (step.odometry, step.commands, step.joints, step.imu, step.sightings)
+        kinds = (*(step.of(kind) for kind in MOTION), step.sightings)
         return (step.index, step.segment, step.start_ns, step.stamp_ns, [[id(e) for e in k] for k in kinds])
 
     return [key(s) for s in a] == [key(s) for s in b]
@@ -76,13 +82,13 @@ def test_windows_hold_what_integration_needs():
     events = robot(np.random.default_rng(2))
     steps = run(stepper(history_s=2.0), events)
     for step in steps[10:-3]:
-        for kind in (step.odometry, step.joints, step.imu):
+        for kind in (step.of(OdometryEvent), step.of(JointsEvent), step.inertial):
             stamps = [e.stamp_ns for e in kind]
             assert stamps[0] <= step.start_ns < stamps[1]
             assert stamps[-2] < step.stamp_ns <= stamps[-1]
-        stamps = [e.stamp_ns for e in step.commands]
+        stamps = [e.stamp_ns for e in step.controls]
         assert stamps[0] <= max(step.start_ns - ns(2.0), ns(100.003)) < stamps[1] or stamps[0] == ns(100.003)
-    inside = {id(e) for step in steps for e in step.odometry}
+    inside = {id(e) for step in steps for e in step.of(OdometryEvent)}
     assert all(id(e) in inside for e in events if isinstance(e, OdometryEvent) and e.stamp_ns >= steps[0].stamp_ns)
 
 
@@ -166,7 +172,7 @@ def test_a_sensor_that_is_always_late_is_waited_for():
     check_steps(steps)
     assert target.rejections["odometry.late"] <= 10
     assert any("/odom" in note and "waited for" in note for note in target.notes)
-    held = {id(e) for step in steps for e in step.odometry}
+    held = {id(e) for step in steps for e in step.of(OdometryEvent)}
     assert len(held) >= len(odometries) - 10
 
 
@@ -197,7 +203,7 @@ def test_whatever_comes_the_steps_are_sound(seed):
         if rng.random() < 0.05 or 106.0 < event.stamp_ns * 1e-9 < 106.0 + seed:
             continue
         received = event.received_ns + (ns(rng.exponential(0.4)) if rng.random() < 0.05 else 0)
-        fields = {f: getattr(event, f) for f in event.__dataclass_fields__}
+        fields = {f.name: getattr(event, f.name) for f in dataclasses.fields(event)}
         moved = type(event)(**(fields | dict(received_ns=received)))
         chaos.append(moved)
         if rng.random() < 0.02:

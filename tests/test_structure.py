@@ -9,9 +9,9 @@ from benchmarks import structure
 FILES = {
     "fgloc/__init__.py": "",
     "fgloc/types.py": "class OdometryEvent: ...\n",
-    "fgloc/localizer.py": "import json\nfrom fgloc import types\nfrom fgloc.sensors.gyro.rate import Gyro\n",
+    "fgloc/localizer.py": "import json\nfrom fgloc import types\nfrom fgloc.sensors.gyro import Gyro\n",
     "fgloc/sensors/gyro.py": "class Gyro: ...\nname = 'gyro'\n",
-    "fgloc/sensors/registry.py": "from fgloc.sensors.gyro.rate import Gyro\n",
+    "fgloc/sensors/registry.py": "from fgloc.sensors.gyro import Gyro\n",
     "fgloc/robust.py": "class Gyro: ...\nx = Gyro()\nname = 'wheels.radius'\n",
     "fgloc/long.py": "def f():\n" + "    x = 1\n" * 50 + "def g():\n" + "    x = 1\n" * 49,
     "fgloc/wide.py": "def f(self, a, b, c, d, e, f, g): ...\n\n\ndef g(self, a, b, c, d, e, f, *, g, h): ...\n",
@@ -35,7 +35,7 @@ def root(tmp_path):
 
 def test_counts_of_a_small_tree(root):
     assert len(structure.flat_files(root)) == 9
-    assert structure.localizer_imports(root) == ["fgloc.sensors.gyro.rate", "fgloc.types"]
+    assert structure.localizer_imports(root) == ["fgloc.sensors.gyro", "fgloc.types"]
     assert structure.long_functions(root) == ["fgloc/long.py:1 f"]
     assert structure.many_parameters(root) == ["fgloc/wide.py:4 g"]
     assert structure.long_files(root) == ["fgloc/big.py 301"]

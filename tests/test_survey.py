@@ -159,13 +159,13 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
     class Rare(World):
         def _sightings(self, stamp):
             event = super()._sightings(stamp)
-            odd = dataclasses.replace(event.sightings[0], marker_id=33) if event.sightings else None
+            odd = dataclasses.replace(event.sightings[0], landmark_id=33) if event.sightings else None
             few = (stamp - self.start_ns) in (1_000_000_000, 6_000_000_000)
             misread = stamp // 100_000_000 % 15 == 0 and len(event.sightings) > 1
             kept = event.sightings
             if misread:  # the first is read as another one that hangs elsewhere
-                kept = (dataclasses.replace(kept[0], marker_id=(kept[0].marker_id + 7) % 20), *kept[1:])
-            unique = {s.marker_id: s for s in ((*kept, odd) if few and odd is not None else kept)}
+                kept = (dataclasses.replace(kept[0], landmark_id=(kept[0].landmark_id + 7) % 20), *kept[1:])
+            unique = {s.landmark_id: s for s in ((*kept, odd) if few and odd is not None else kept)}
             return dataclasses.replace(event, sightings=tuple(unique.values()))
 
     made = survey([write_world(tmp_path, Rare(room(), seed=3, seconds=22.0, rate=5))], settings())

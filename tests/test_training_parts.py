@@ -13,11 +13,11 @@ from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
-from fgloc.types import CommandEvent, Trajectory
+from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.types import ControlEvent, Trajectory
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig
 from training.data import Run, cut, load_run, make_run
@@ -47,7 +47,7 @@ def test_body_velocities_come_from_smoothed_truth() -> None:
     xy = np.cumsum(np.column_stack([v * np.cos(yaw), v * np.sin(yaw)]), axis=0) / 60
     noisy = np.column_stack([xy, yaw]) + rng.normal(size=(len(t), 3)) * [0.001, 0.001, 0.002]
     noisy[:, 2] = se2.wrap_array(noisy[:, 2])
-    commands = [CommandEvent(T0 + i * SECOND, 0, "c", 0.0, 0.0) for i in range(-3, 31)]
+    commands = [ControlEvent(T0 + i * SECOND, 0, "c", 0.0, 0.0) for i in range(-3, 31)]
     run = make_run("r", commands, T0 + np.round(t * SECOND).astype(np.int64), noisy, 0.1, 1.0, DataConfig())
     at = run.times + (run.origin_ns - T0) * 1e-9
     raw = np.diff(noisy[:, 0]) * 60

@@ -12,7 +12,10 @@ from scipy.spatial.transform import Rotation
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.sensors.maps import write_map
-from fgloc.types import CommandEvent, CornersEvent, OdometryEvent, RangeBearingEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent
 
 
 def write_world(folder: Path, *worlds: World, body=(0.0, 0.0, 0.0), sightings: bool = True) -> Path:
@@ -41,13 +44,13 @@ def write_world(folder: Path, *worlds: World, body=(0.0, 0.0, 0.0), sightings: b
                     bag.odometry("/odom", stamp, pose, (event.linear[0], event.angular[2]), received)
                     x, y, yaw = se2.compose(pose, body)
                     bag.truth("/truth", stamp, (x, y, 0.0), (0, 0, math.sin(yaw / 2), math.cos(yaw / 2)), received)
-                elif isinstance(event, CommandEvent):
+                elif isinstance(event, ControlEvent):
                     bag.command("/cmd_vel", stamp, event.v, event.omega, received)
                 elif isinstance(event, RangeBearingEvent) and sightings:
                     seen = [(s.landmark_id, s.range_m, s.bearing_rad) for s in event.sightings]
                     bag.range_bearing("/landmarks", stamp, seen, received)
                 elif isinstance(event, CornersEvent) and sightings:
-                    tags = [(s.marker_id, s.corners_px) for s in event.sightings]
+                    tags = [(s.landmark_id, s.corners_px) for s in event.sightings]
                     bag.write("/tags", "apriltag_msgs/msg/AprilTagDetectionArray", _tags(bag, stamp, tags), received)
     write_map(worlds[0].map, folder / "map.yaml")
     return folder / "bag"

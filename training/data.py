@@ -22,8 +22,8 @@ from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.sensor_setup import mounted_up
-from fgloc.sensors.learned.commands import CommandTrack
-from fgloc.types import CommandEvent, Event, FloatArray, TruthEvent
+from fgloc.sensors.learned.commands import CommandHistory
+from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 from training.config import DataConfig
 from training.heard import TopicTimes
 
@@ -41,10 +41,10 @@ class Run:
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
     valid: NDArray[np.bool_]  # (n,) the truth was heard around this time, and can be true
     heard: TopicTimes
-    track: CommandTrack  # time zero is origin_ns
+    track: CommandHistory  # time zero is origin_ns
 
     @property
-    def commands(self) -> tuple[CommandEvent, ...]:
+    def commands(self) -> tuple[ControlEvent, ...]:
         """In order of stamp."""
         return self.heard.commands
 
@@ -103,7 +103,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
     for k, (first, last) in enumerate(pairwise(limits)):
         part = sensed[bisect_left(sensed_ns, first) : bisect_left(sensed_ns, last)]
         inside = (stamps >= first) & (stamps < last)
-        if not inside.any() or not any(isinstance(event, CommandEvent) for event in part):
+        if not inside.any() or not any(isinstance(event, ControlEvent) for event in part):
             continue
         heard, label = TopicTimes(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
@@ -135,7 +135,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
     else:
         stamps, rows = smoothed_truth(truth_from, config)
-    for kind, count in (("commands", sum(isinstance(e, CommandEvent) for e in sensed)), ("truth", len(stamps))):
+    for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
     return _Recorded(settings, sensed, (stamps, rows), up)
@@ -143,7 +143,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
 
 def make_run(
     name: str,
-    heard: TopicTimes | Sequence[CommandEvent],
+    heard: TopicTimes | Sequence[ControlEvent],
     truth_ns: NDArray[np.int64],
     truth: FloatArray,
     dt_s: float,
@@ -178,7 +178,7 @@ def make_run(
         velocities=velocities,
         valid=_heard(t_truth, times, config) & _possible(velocities, dt_s, config),
         heard=heard,
-        track=CommandTrack(commands, first),
+        track=CommandHistory(commands, first),
     )
 
 
@@ -221,7 +221,7 @@ def cut(run: Run, name: str, first: int, last: int) -> Run:
         poses=run.poses[first:last],
         velocities=run.velocities[first:last],
         valid=run.valid[first:last],
-        track=CommandTrack(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
+        track=CommandHistory(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
     )
 
 

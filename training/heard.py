@@ -8,13 +8,17 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fgloc.config import Config, GyroConfig, WheelsConfig
+from fgloc.config import Config
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.card import WheelJoints
 from fgloc.sensors.learned.signals import Signals, signals_of
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import CommandEvent, Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent, Step
+from fgloc.types import ControlEvent, Event, FloatArray, Step
 
 _STEP_NS = 200_000_000  # of the gyro's filter
 _BLIND_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
@@ -51,12 +55,12 @@ class TopicTimes:
         config = Config() if config is None else config
         self.wheels: WheelsConfig = config.wheels
         self.imu_up = imu_up
-        self._commands: EventBuffer[CommandEvent] = EventBuffer()
+        self._commands: EventBuffer[ControlEvent] = EventBuffer()
         self._imu: EventBuffer[ImuEvent] = EventBuffer()
         self._joints: EventBuffer[JointsEvent] = EventBuffer()
         self._odometry: EventBuffer[OdometryEvent] = EventBuffer()
         for event in events:
-            if isinstance(event, CommandEvent):
+            if isinstance(event, ControlEvent):
                 self._commands.insert(event)
             elif isinstance(event, ImuEvent):
                 self._imu.insert(event)
@@ -95,10 +99,12 @@ class TopicTimes:
             segment=0,
             start_ns=start_ns,
             stamp_ns=end_ns,
-            odometry=self._odometry.window(start_ns, end_ns),
-            commands=self._commands.window(start_ns - round(history_s * 1e9), end_ns),
-            joints=self._joints.window(start_ns, end_ns),
-            imu=self._imu.window(start_ns, end_ns),
+            motion={
+                OdometryEvent: self._odometry.window(start_ns, end_ns),
+                ControlEvent: self._commands.window(start_ns - round(history_s * 1e9), end_ns),
+                JointsEvent: self._joints.window(start_ns, end_ns),
+                ImuEvent: self._imu.window(start_ns, end_ns),
+            },
         )
 
     def gyro_bias(self, stamp_ns: int) -> float:

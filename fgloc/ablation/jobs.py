@@ -34,9 +34,10 @@ from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.maps import load_map, write_map
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import ImageError
 from fgloc.sensors.markers.remembered import RememberedDetections
-from fgloc.types import ImageEvent, Mode, RunResult, TruthEvent
+from fgloc.types import Mode, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
 _SOURCES_LEFT_OUT = (

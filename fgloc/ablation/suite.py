@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import reduce
 from itertools import product
-from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from fgloc.ablation.failures import BuiltInFailure, Failure
+from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.files.settings_file import Settings, sentences
 from fgloc.recording.files import find_beside
 from fgloc.replay.options import RunMode
-from fgloc.sensors.registry import sensors
 
-if TYPE_CHECKING:
-    AnyFailure = Failure
-else:  # whoever installs a sensor may name its failures
-    AnyFailure = Annotated[
-        reduce(or_, (failure for sensor in sensors() for failure in sensor.failures), BuiltInFailure),
-        Field(discriminator="kind"),
-    ]
 _MOST_RUNS = 1_000_000
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Severity = Annotated[float, Field(ge=-1e6, le=1e6)]

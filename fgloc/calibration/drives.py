@@ -19,20 +19,13 @@ from fgloc.replay.options import Progress
 from fgloc.replay.smoothing import smooth_run
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.marker_pose.events import MarkerPosesEvent
 from fgloc.sensors.markers.detector import detect_stream
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.motion_compensation import MotionCompensation
+from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    CornerMeasurement,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    Landmark,
-    LandmarkMap,
-    MarkerPosesEvent,
-    RangeBearingEvent,
-)
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement
 
 _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
 
@@ -57,7 +50,7 @@ class Drive:
     sightings: Mapping[int, int]
     notes: tuple[str, ...]
 
-    def measure(self, sizes: Mapping[int, float], offset_s: float = 0.0) -> list[list[CornerMeasurement]]:
+    def measure(self, sizes: Mapping[int, float], offset_s: float = 0.0) -> list[list[PixelMeasurement]]:
         """Corners of these markers as seen from each keyframe.
 
         Args:
@@ -69,12 +62,12 @@ class Drive:
         sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
         motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
         moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
-        seen: list[list[CornerMeasurement]] = []
+        seen: list[list[PixelMeasurement]] = []
         for frame in self.frames:
             found = []
             if frame.step is not None:
                 wheels.measure(frame.step)
-                found = [m for m in moved.measure(frame.step, offset_s) if isinstance(m, CornerMeasurement)]
+                found = [m for m in moved.measure(frame.step, offset_s) if isinstance(m, PixelMeasurement)]
             seen.append([replace(m, sigma_px=m.sigma_px * _coarseness(m.corners_px)) for m in found])
         return seen
 
@@ -110,7 +103,7 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
         seen: Counter[int] = Counter()
         for event in _checked(recording, parts, unreadable, progress):
             if isinstance(event, CornersEvent):
-                seen.update(s.marker_id for s in event.sightings)
+                seen.update(s.landmark_id for s in event.sightings)
             for step in parts.stepper.push(event):
                 parts.localizer.update(step)
         for step in parts.stepper.flush():

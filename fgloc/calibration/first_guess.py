@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fgloc import se2
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import CornerMeasurement, FloatArray
+from fgloc.types import FloatArray, PixelMeasurement
 
 _AGREE_M, _AGREE_PER_M, _AGREE_RAD = 0.15, 0.08, 0.6  # views of one marker that are nearer than this mean the same
 _VOTERS = 40  # views of a marker that propose where it is
@@ -34,7 +34,7 @@ class Guess:
 
 
 def guess(
-    poses: FloatArray, seen: Sequence[Sequence[CornerMeasurement]], sizes: Mapping[int, float], least: int
+    poses: FloatArray, seen: Sequence[Sequence[PixelMeasurement]], sizes: Mapping[int, float], least: int
 ) -> tuple[dict[int, Guess], dict[int, str]]:
     """Where the views of each marker agree that it is.
 

@@ -9,6 +9,7 @@ import numpy as np
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.sensors import registry
 from fgloc.types import Camera, FloatArray, LandmarkMap
 
 Found = Mapping[str, tuple[float, float]]
@@ -36,7 +37,8 @@ def found_values(
       ``camera.focal_scale``, ``.cx_px``, ``.cy_px``, ``.k1``, ``.k2``;
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
-    out = _values([*_motion_rows(config), *_sighting_rows()], installation, belief)
+    motion = [row for made in registry.motion_installations() for row in made.found(config)]
+    out = _values([*motion, *_sighting_rows()], installation, belief)
     if camera is not None and "camera" in installation.blocks:
         first = installation.blocks["camera"][0]
         out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
@@ -59,22 +61,6 @@ def _values(
             i = installation.index[parameter]
             out[name] = (at + gain * float(belief.mean[i]), abs(gain) * float(sigma[i]))
     return out
-
-
-def _motion_rows(config: Config) -> list[_Row]:
-    track = config.wheels.track
-    return [
-        ("wheels.radius_scale", "wheels.radius", 1.0, 1.0),
-        ("wheels.track_scale", "wheels.track", 1.0, 1.0),
-        ("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -track)
-        if track is not None
-        else ("wheels.yaw_per_m", "wheels.yaw_per_m", config.wheels.yaw_per_m, 1.0),
-        ("wheels.slowdown", "wheels.slowdown", config.wheels.slowdown, 1.0),
-        ("wheels.delay_s", "wheels.delay_s", config.wheels.delay_s, 1.0),
-        ("gyro.scale", "gyro.scale", 1.0, -1.0),
-        ("learned.scale", "learned.scale", 1.0, 1.0),
-        ("wheels.time_offset_s", "wheels.time_offset_s", 0.0, 1.0),
-    ]
 
 
 def _sighting_rows() -> list[_Row]:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fgloc.graph.installation import Installation
 from fgloc.graph.observation import Observations
-from fgloc.types import CornerMeasurement, FloatArray, Landmark
+from fgloc.types import FloatArray, Landmark, PixelMeasurement
 
 _STEPS = 12
 _MOST = 25.0  # of the squared Mahalanobis distance of a view: above it the view is of another marker
@@ -38,7 +38,7 @@ class Turned:
 
 def mirrored(
     landmark: Landmark,
-    measurements: Sequence[CornerMeasurement],
+    measurements: Sequence[PixelMeasurement],
     poses: FloatArray,
     installation: Installation,
     theta: FloatArray,
@@ -74,7 +74,7 @@ def mirrored(
 
 def _refined(
     landmark: Landmark,
-    measurements: Sequence[CornerMeasurement],
+    measurements: Sequence[PixelMeasurement],
     poses: FloatArray,
     installation: Installation,
     theta: FloatArray,
@@ -120,7 +120,7 @@ def moved_by(landmark: Landmark, move: FloatArray) -> Landmark:
     return replace(landmark, position=landmark.position + move[:3], rotation=turned)
 
 
-def _camera(m: CornerMeasurement, pose: FloatArray) -> FloatArray:
+def _camera(m: PixelMeasurement, pose: FloatArray) -> FloatArray:
     x, y, yaw = pose
     c, s = np.cos(yaw), np.sin(yaw)
     a, b, height = m.camera.T_base_cam[:3, 3]

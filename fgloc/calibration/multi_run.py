@@ -14,9 +14,9 @@ from fgloc.errors import EstimatorError
 from fgloc.recording.files import find_beside
 from fgloc.replay.options import Progress
 from fgloc.runner import run
+from fgloc.sensors import registry
 from fgloc.types import InstallationFound, RunResult, Setting
 
-_SIGHTINGS = ("corners", "range_bearing", "marker_pose")
 _ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before
 _WHEELS = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # before anything was seen
 _COMMANDS = _WHEELS | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
@@ -73,7 +73,7 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
         result = run(bag, map_path, alone, "batch", progress, check=False)
         if result.found is not None and result.found.wheels != "command":
             break
-    if not any(result.counts.get(kind) for kind in _SIGHTINGS):
+    if not any(result.counts.get(kind) for kind in registry.landmark_kinds()):
         raise EstimatorError(
             f"{bag}: no sighting of a landmark was used, and without sightings nothing determines the "
             f"gains of the wheels; see `fgloc info {bag}`"

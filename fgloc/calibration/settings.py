@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import numpy as np
@@ -14,19 +16,14 @@ from fgloc.calibration.found import mounting
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
+from fgloc.sensors import registry
 from fgloc.sensors.cameras import pinhole
 from fgloc.types import Camera, FloatArray, InstallationFound, LandmarkMap, Setting
 
+_ODOMETER_ROLES = ("joints", "odometry", "command")  # whose messages may be taken for the wheels' motion
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _MOST_LOG_SCALE = 20.0  # of a run that diverged; larger ones overflow
 _SIGMAS = {  # the field that takes the sigma of settings back; of several the largest
-    "wheels.scale_v": "wheels.scale_sigma",
-    "wheels.scale_omega": "wheels.turn_scale_sigma",
-    "wheels.yaw_per_m": "wheels.yaw_per_m_sigma",
-    "wheels.slowdown": "wheels.slowdown_sigma",
-    "wheels.delay_s": "wheels.delay_sigma_s",
-    "gyro.scale": "gyro.scale_sigma",
-    "motion.scale": "motion.scale_sigma",
     "landmarks.range_scale": "landmarks.range_scale_sigma",
     "landmarks.bearing_bias_rad": "landmarks.bearing_bias_sigma_rad",
     "camera.focal_scale": "camera.focal_sigma",
@@ -86,24 +83,8 @@ class _State:
 
 
 def _of_motion(state: _State, config: Config) -> Iterator[Setting]:
-    wheels = config.wheels
-    longer, turn = 1.0 + state.value("wheels.radius"), 1.0 - state.value("wheels.track")
-    pull = (turn * longer * wheels.yaw_per_m + state.value("wheels.yaw_per_m")) / longer
-    gain = {"wheels.radius": wheels.scale_v}
-    yield from state.setting("wheels.scale_v", wheels.scale_v, wheels.scale_v * longer, gain)
-    gain = {"wheels.track": wheels.scale_omega, "wheels.radius": wheels.scale_omega}
-    gain["wheels.track"] *= -1.0
-    yield from state.setting("wheels.scale_omega", wheels.scale_omega, wheels.scale_omega * longer * turn, gain)
-    yield from state.setting("wheels.yaw_per_m", wheels.yaw_per_m, pull, {"wheels.yaw_per_m": 1.0})
-    for name in ("slowdown", "delay_s"):
-        given = getattr(wheels, name)
-        found = max(0.0, given + state.value(f"wheels.{name}"))
-        yield from state.setting(f"wheels.{name}", given, found, {f"wheels.{name}": 1.0})
-    scale = config.gyro.scale
-    yield from state.setting("gyro.scale", scale, scale * (1.0 + state.value("gyro.scale")), {"gyro.scale": scale})
-    scale = config.motion.scale
-    found = scale * (1.0 + state.value("learned.scale"))
-    yield from state.setting("motion.scale", scale, found, {"learned.scale": scale})
+    for installation in registry.motion_installations():
+        yield from installation.settings(state, config)
 
 
 def _of_sightings(state: _State, config: Config) -> Iterator[Setting]:
@@ -137,7 +118,7 @@ def _of_camera(state: _State, config: Config, camera: Camera | None) -> Iterator
 
 def _clocks(state: _State, config: Config, found: InstallationFound) -> Iterator[Setting]:
     clocks = {"camera.time_offset_s": found.seen_by, "sightings.time_offset_s": found.seen_by}
-    clocks["wheels.time_offset_s"] = found.wheels
+    clocks[f"{registry.motion_names().odometer}.time_offset_s"] = found.wheels
     for name, role in clocks.items():
         if not role:
             continue
@@ -159,10 +140,11 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
         if getattr(getattr(config, section), name) > 0.0:
             put(key, max(float(f"{sigma:.4g}"), changes.get(section, {}).get(name, 0.0)))
 
+    sigmas = reduce(or_, (dict(made.sigmas) for made in registry.motion_installations()), _SIGMAS)
     for s in settings:
-        if s.name in _SIGMAS:
+        if s.name in sigmas:
             put(s.name, round(s.found, 7))
-            spread(_SIGMAS[s.name], s.sigma / (s.given if "scale" in s.name else 1.0))
+            spread(sigmas[s.name], s.sigma / (s.given if "scale" in s.name else 1.0))
     if "camera.x" in by_name:
         pose = [by_name[f"camera.{axis}"] for axis in _AXES]
         put("recording.sightings_pose", tuple(round(s.found, 6) for s in pose))
@@ -177,7 +159,7 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
         )
         for role, s in clocks.items():
             seen = "camera" if "camera.x" in by_name else "landmarks"
-            section = "wheels" if role in ("joints", "odometry", "command") else seen
+            section = registry.motion_names().odometer if role in _ODOMETER_ROLES else seen
             spread(f"{section}.time_offset_sigma_s", s.sigma)
     sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
     return config.model_copy(update=sections)

@@ -16,8 +16,7 @@ from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
-from fgloc.relocalization.pose_fit import cauchy_k
-from fgloc.types import CornerMeasurement, FloatArray, Landmark, LandmarkMap
+from fgloc.types import FloatArray, Landmark, LandmarkMap, PixelMeasurement
 
 _WIDE_M, _WIDE_RAD = 0.5, 0.5  # sigmas of an unknown marker: next to nothing is known of it
 _FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of the first pose of a drive that finds itself by the markers
@@ -156,10 +155,10 @@ class SurveyGraph:
 
     def _look_from_the_other_side(self, solver: BatchSmoother) -> dict[int, Landmark]:
         """Markers that fit better the other way round; of those that fit both ways about alike, note the ids."""
-        seen: dict[int, list[tuple[CornerMeasurement, FloatArray]]] = {}
+        seen: dict[int, list[tuple[PixelMeasurement, FloatArray]]] = {}
         for frame, pose in zip(solver.frames, self._poses, strict=True):
             for s in (*frame.sightings, *frame.rejected):
-                if isinstance(s.measurement, CornerMeasurement):
+                if isinstance(s.measurement, PixelMeasurement):
                     seen.setdefault(s.measurement.landmark_id, []).append((s.measurement, pose))
         better = {}
         self.undecided = set()
@@ -215,7 +214,7 @@ class SurveyGraph:
                 rejected: list[LandmarkFactor] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
-                    (accepted if agrees else rejected).append(factors.sighting(k, m, cauchy_k(m, self._config)))
+                    (accepted if agrees else rejected).append(factors.sighting(k, m, m.cauchy_k))
                 log.keyframes[k] = Keyframe(
                     k,
                     frame.stamp_ns,

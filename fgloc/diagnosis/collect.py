@@ -12,16 +12,9 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.window import Spots, Window
 from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import (
-    CornerMeasurement,
-    CornersEvent,
-    FloatArray,
-    LandmarkMap,
-    MarkerPoseMeasurement,
-    SightingsEvent,
-    Step,
-)
+from fgloc.types import FloatArray, FrameMeasurement, LandmarkMap, PixelMeasurement, SightingsEvent, Step
 
 SPAN_S = 8.0  # sightings of a window
 MARGIN_S = 1.2  # wheel motion before and after them, for clocks that differ
@@ -58,7 +51,7 @@ class SightingCollector:
         if isinstance(event, CornersEvent) and self._map is None and self._config.markers.default_size_m is None:
             return
         for m in self._sensor.measure(event):
-            if isinstance(m, CornerMeasurement):
+            if isinstance(m, PixelMeasurement):
                 assert self._map is not None
                 landmark = self._map.landmarks[m.landmark_id]
                 found = marker_pose_candidates(m.camera, m.corners_px, landmark.size_m)
@@ -69,7 +62,7 @@ class SightingCollector:
                 sigma_rad = m.sigma_px / float(m.camera.K[0, 0])
                 side_px = float(np.linalg.norm(m.corners_px - np.roll(m.corners_px, 1, axis=0), axis=1).max())
                 sigma_m = float(np.linalg.norm(point)) * m.sigma_px / side_px
-            elif isinstance(m, MarkerPoseMeasurement):
+            elif isinstance(m, FrameMeasurement):
                 x, y = m.pose[:2]
                 point = self._in_sensor(x, y)
                 sigma_m = math.sqrt(max(m.cov[0, 0], m.cov[1, 1]))

@@ -13,22 +13,10 @@ from fgloc.config import Config, Role
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
 from fgloc.sensors.markers.detector import Detector
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import ImageError
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    ImuEvent,
-    IntArray,
-    JointsEvent,
-    MarkerCorners,
-    OdometryEvent,
-    Step,
-    TruthEvent,
-)
+from fgloc.types import Event, FloatArray, InertialEvent, IntArray, MotionEvent, Step, TruthEvent, by_class
 
 STRETCHES = 5
 STRETCH_S = 4.0  # within it wheels err by centimetres only
@@ -79,8 +67,8 @@ class Excerpt:
     """
 
     pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
-    motion: list[Event] = field(default_factory=list)
-    imu: list[ImuEvent] = field(default_factory=list)
+    motion: list[MotionEvent] = field(default_factory=list)
+    imu: list[InertialEvent] = field(default_factory=list)
     truth: list[TruthEvent] = field(default_factory=list)
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
     wheel_source: str = ""
@@ -162,10 +150,10 @@ class ExcerptCollector:
 
 def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
     passed = gate.check(event)
-    if isinstance(passed, JointsEvent | OdometryEvent | CommandEvent):
-        found.motion.append(passed)
-    elif isinstance(passed, ImuEvent):
+    if isinstance(passed, InertialEvent):
         found.imu.append(passed)
+    elif isinstance(passed, MotionEvent):
+        found.motion.append(passed)
     elif isinstance(passed, TruthEvent):
         found.truth.append(passed)
 
@@ -199,15 +187,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     reach = 1_000_000_000
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
-    step = Step(
-        0,
-        0,
-        int(grid[0]),
-        int(grid[-1]),
-        odometry=tuple(e for e in events if isinstance(e, OdometryEvent)),
-        commands=tuple(e for e in events if isinstance(e, CommandEvent)),
-        joints=tuple(e for e in events if isinstance(e, JointsEvent)),
-    )
+    step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
     wheels = WheelMotion(config.wheels)
     wheels.measure(step)
     if not wheels.source:
@@ -217,7 +197,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     return np.array([se2.log(m) for m in motions])
 
 
-def _gyro_increments(imu: list[ImuEvent], up: FloatArray, grid: IntArray) -> FloatArray | None:
+def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -> FloatArray | None:
     """Rotation ``(g,)`` between the stamps; None where they are not covered."""
     stamps = np.array([e.stamp_ns for e in imu], dtype=np.int64)
     inside = (stamps >= grid[0] - 500_000_000) & (stamps <= grid[-1] + 500_000_000)

@@ -156,7 +156,7 @@ class _Search:
     def _unseen(self, excerpt: Excerpt, parts: SensorSetup) -> bool:
         """Whether images were searched and next to none shows a marker of the map."""
         assert parts.landmark_map is not None
-        shown = [any(m.marker_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
+        shown = [any(m.landmark_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
         return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
 
     def _images(self, recording: Recording, parts: SensorSetup) -> bool:

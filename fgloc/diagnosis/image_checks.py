@@ -6,8 +6,8 @@ from itertools import islice
 
 from fgloc.recording.reader import Recording
 from fgloc.sensors.markers.detector import MarkerDetector, suggest_dictionary
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import GrayImage, ImageError, decode
-from fgloc.types import ImageEvent
 
 _IMAGES = 5  # looked at, spread over the recording
 _SCANNED = 200

@@ -10,7 +10,8 @@ import numpy as np
 from fgloc.config import Config, Role
 from fgloc.errors import ConfigError
 from fgloc.sensors.wheels.encoders import wheel_names
-from fgloc.types import Event, FloatArray, JointsEvent
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import Event, FloatArray
 
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps that differ more from the receive times are of another clock
 _FEWEST = 5  # messages of a role

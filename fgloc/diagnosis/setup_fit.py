@@ -19,8 +19,9 @@ from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.sensors.cameras import pinhole, undistort_points
+from fgloc.sensors.markers.events import MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import Camera, CornerMeasurement, FloatArray, IntArray, Landmark, LandmarkMap, MarkerCorners
+from fgloc.types import Camera, FloatArray, IntArray, Landmark, LandmarkMap, PixelMeasurement
 
 _SIZE, _MAP = 0, 1
 _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise
@@ -100,7 +101,7 @@ class Problem:
         sigma = float(np.hypot(setup.config.markers.sigma_px, _SIGMA_PX))
         self._motion = Motion(stretches, setup.turned, setup.config)
         self._corners: list[FloatArray] = []
-        self._measured: list[CornerMeasurement] = []
+        self._measured: list[PixelMeasurement] = []
         frames = []
         for i, picture in enumerate(p for s in stretches for p in s.pictures):
             for m in usable(picture, setup.landmark_map):
@@ -108,7 +109,7 @@ class Problem:
                 if np.isfinite(corners).all():
                     frames.append(i)
                     self._corners.append(m.corners_px)
-                    self._measured.append(CornerMeasurement(0, m.marker_id, corners, sigma, ideal))
+                    self._measured.append(PixelMeasurement(0, m.landmark_id, corners, sigma, ideal))
         self._frame: IntArray = np.array(frames, dtype=np.int64)
         self._ids = [m.landmark_id for m in self._measured]
         self._held = LandmarkMap({i: setup.landmark_map.landmarks[i] for i in sorted(set(self._ids))})
@@ -258,14 +259,16 @@ class Problem:
 
 def usable(picture: Picture, landmark_map: LandmarkMap) -> list[MarkerCorners]:
     """Markers of the map that have a size and are seen once in an image."""
-    times = Counter(m.marker_id for m in picture.seen)
+    times = Counter(m.landmark_id for m in picture.seen)
     known = landmark_map.landmarks
-    return [m for m in picture.seen if times[m.marker_id] == 1 and m.marker_id in known and known[m.marker_id].size_m]
+    return [
+        m for m in picture.seen if times[m.landmark_id] == 1 and m.landmark_id in known and known[m.landmark_id].size_m
+    ]
 
 
 def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
     """Whether the markers seen in a stretch are enough, and far enough apart, to determine where the robot was."""
-    ids = [m.marker_id for p in stretch.pictures for m in usable(p, landmark_map)]
+    ids = [m.landmark_id for p in stretch.pictures for m in usable(p, landmark_map)]
     places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
     return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc.diagnosis.pool import Evidence, Pool, eliminated
 from fgloc.diagnosis.window import Window
-from fgloc.types import FloatArray, ImuEvent
+from fgloc.types import FloatArray, InertialEvent
 
 _MIN_TURNING = 0.15  # rad/s, standard deviation of the yaw rate: less does not distinguish one time from another
 _STARTS_S = np.arange(-1.0, 1.01, 0.1)
@@ -37,7 +37,7 @@ class GyroWitness:
         self._times: list[float] = []
         self._rates: list[float] = []
 
-    def record(self, event: ImuEvent, at_s: float) -> None:
+    def record(self, event: InertialEvent, at_s: float) -> None:
         """Take in a message; those of the step before come again and are passed over."""
         if self._up is None:
             return

@@ -25,11 +25,11 @@ from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
     MotionMeasurement,
+    PixelMeasurement,
 )
 
 _LINEARIZATIONS = 6
@@ -137,7 +137,7 @@ class BatchSmoother:
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
         seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
-        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, CornerMeasurement)]  # type: ignore[union-attr]
+        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, PixelMeasurement)]  # type: ignore[union-attr]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total

@@ -21,9 +21,9 @@ from fgloc.graph.factors import (
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.types import (
     FloatArray,
+    FrameMeasurement,
     Landmark,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PointMeasurement,
 )
 
 _DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
@@ -69,9 +69,9 @@ def initial_values(
     for frame in frames:
         for sighting in accepted[frame.k]:
             m = sighting.measurement
-            if isinstance(m, MarkerPoseMeasurement):
+            if isinstance(m, FrameMeasurement):
                 seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, m.pose))
-            elif isinstance(m, RangeBearingMeasurement):
+            elif isinstance(m, PointMeasurement):
                 local = [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0]
                 seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, local)[:2])
     for landmark_id, places in seen.items():
@@ -100,7 +100,7 @@ def estimated_landmarks(
         if m.landmark_id in landmarks:
             continue
         cov = np.asarray(marginals.marginalCovariance(key))
-        if isinstance(m, MarkerPoseMeasurement):
+        if isinstance(m, FrameMeasurement):
             pose = values.atPose2(key)
             place, yaw = np.array([pose.x(), pose.y(), 0.0]), pose.theta()
             c, s = np.cos(yaw), np.sin(yaw)

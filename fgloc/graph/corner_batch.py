@@ -9,9 +9,9 @@ import numpy as np
 from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Stacked, landmark_block
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     Landmark,
+    PixelMeasurement,
 )
 
 _BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
@@ -26,7 +26,7 @@ class CornerBatch:
     """
 
     def __init__(
-        self, seen: Sequence[CornerMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
+        self, seen: Sequence[PixelMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
     ) -> None:
         held = [landmarks[m.landmark_id] for m in seen]
         half = np.array([0.5 * landmark.size_m for landmark in held])

@@ -22,16 +22,17 @@ from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import Observations
+from fgloc.sensors import registry
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     Landmark,
     LandmarkMap,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
     MotionMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
     PoseMeasurement,
-    RangeBearingMeasurement,
 )
 
 # Usual constants, of whitened residuals. Sources: Zhang 1997, "Parameter estimation techniques"; Agarwal et al. 2013,
@@ -139,7 +140,7 @@ def sighting_factors(
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
     """Between-factor from keyframe k - 1 to k; a kernel other than "none" is put on the wheels' alone."""
     noise = gaussian(m.cov)
-    if m.source == "wheels" and kernel != "none":
+    if m.source == registry.motion_names().odometer and kernel != "none":
         noise = gtsam.noiseModel.Robust.Create(_KERNELS[kernel], noise)
     return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), noise)
 
@@ -202,7 +203,7 @@ class LandmarkFactors:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
         if not isinstance(m, PoseMeasurement) and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
-        if not isinstance(m, CornerMeasurement) and (problem := covariance_problem(m.cov)):
+        if not isinstance(m, PixelMeasurement) and (problem := covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
@@ -235,7 +236,7 @@ class LandmarkFactors:
         cov = one.noise() + one.H @ self.estimated.cov[np.ix_(one.columns, one.columns)] @ one.H.T
         return sighting_whitening(cov)
 
-    def depth(self, m: CornerMeasurement, pose: FloatArray) -> float:
+    def depth(self, m: PixelMeasurement, pose: FloatArray) -> float:
         """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""
         if self._known is None:
             raise EstimatorError("the depth of a marker needs a known map")
@@ -247,7 +248,7 @@ class LandmarkFactors:
         T = m.camera.T_base_cam
         return float(((base - T[:3, 3]) @ T[:3, 2]).min())
 
-    def lookalikes(self, m: CornerMeasurement, pose: FloatArray) -> list[int]:
+    def lookalikes(self, m: PixelMeasurement, pose: FloatArray) -> list[int]:
         """Other markers of the same size that the base at this pose sees about where this one was seen.
 
         None of them where they hang so densely that the place does not tell.
@@ -274,11 +275,11 @@ class LandmarkFactors:
         return found if len(found) <= _MOST_LOOKALIKES else []
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-        if isinstance(m, RangeBearingMeasurement):
+        if isinstance(m, PointMeasurement):
             noise = robust(gaussian(m.cov), cauchy_k)
             bearing = gtsam.Rot2(m.bearing_rad)
             return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
-        if isinstance(m, MarkerPoseMeasurement):
+        if isinstance(m, FrameMeasurement):
             noise = robust(gaussian(m.cov), cauchy_k)
             measured = gtsam.Pose2(*m.pose)
             return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), measured, noise)

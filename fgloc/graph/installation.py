@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc.config import Config
+from fgloc.sensors import registry
+from fgloc.sensors.base import MotionRole
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
@@ -136,17 +138,10 @@ def installation_of(
         most: landmarks of a map that are states; a larger map is taken as exact.
         has_model: whether there is a learned motion.
     """
-    wheels, gyro, camera, rb = config.wheels, config.gyro, config.camera, config.landmarks
-    sigmas = {
-        "wheels.radius": wheels.scale_sigma,
-        "wheels.track": wheels.turn_scale_sigma,
-        "wheels.yaw_per_m": wheels.yaw_per_m_sigma,
-        "wheels.slowdown": wheels.slowdown_sigma,
-        "wheels.delay_s": wheels.delay_sigma_s,
-        "gyro.scale": gyro.scale_sigma if has_gyro else 0.0,
-        "wheels.time_offset_s": wheels.time_offset_sigma_s if has_gyro else 0.0,
-        "learned.scale": config.motion.scale_sigma if has_model else 0.0,
-    }
+    camera, rb = config.camera, config.landmarks
+    there = {MotionRole.ODOMETER: True, MotionRole.RATE: has_gyro, MotionRole.MODEL: has_model}
+    roles = [role for role, is_there in there.items() if is_there]
+    sigmas = {parameter.name: parameter.sigma for parameter in registry.motion_parameters(config, roles)}
     if landmark_map is None:
         return Installation(sigmas)
     if corners:

@@ -32,9 +32,9 @@ from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.types import (
     FloatArray,
+    FrameMeasurement,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PointMeasurement,
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
@@ -223,12 +223,12 @@ class IncrementalEstimator(Estimator):
         if self.factors.known or m.landmark_id in self._landmarks:
             return
         key = landmark_key(m.landmark_id)
-        if isinstance(m, RangeBearingMeasurement):
+        if isinstance(m, PointMeasurement):
             initial = se2.compose(
                 pose, [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), m.bearing_rad]
             )
             values.insert(key, initial[:2])
-        elif isinstance(m, MarkerPoseMeasurement):
+        elif isinstance(m, FrameMeasurement):
             initial = se2.compose(pose, m.pose)
             values.insert(key, gtsam.Pose2(*initial))
         else:

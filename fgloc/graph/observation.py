@@ -12,11 +12,11 @@ from fgloc.graph.linearized import Linearized
 from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
     IntArray,
     Landmark,
     LandmarkMeasurement,
+    PixelMeasurement,
     PoseMeasurement,
 )
 
@@ -35,15 +35,15 @@ class Observations:
             installation: the parameters.
         """
         self._count = len(measurements)
-        corners = [i for i, m in enumerate(measurements) if isinstance(m, CornerMeasurement)]
-        planar = [i for i, m in enumerate(measurements) if not isinstance(m, CornerMeasurement | PoseMeasurement)]
+        corners = [i for i, m in enumerate(measurements) if isinstance(m, PixelMeasurement)]
+        planar = [i for i, m in enumerate(measurements) if not isinstance(m, PixelMeasurement | PoseMeasurement)]
         by_pose = [i for i, m in enumerate(measurements) if isinstance(m, PoseMeasurement)]
         self.batches: list[tuple[list[int], CornerBatch | PlanarBatch | PoseBatch]] = []
         if corners:
-            seen = [m for m in measurements if isinstance(m, CornerMeasurement)]
+            seen = [m for m in measurements if isinstance(m, PixelMeasurement)]
             self.batches.append((corners, CornerBatch(seen, landmarks, installation)))
         if planar:
-            rest = [m for m in measurements if not isinstance(m, CornerMeasurement | PoseMeasurement)]
+            rest = [m for m in measurements if not isinstance(m, PixelMeasurement | PoseMeasurement)]
             self.batches.append((planar, PlanarBatch(rest, landmarks, installation)))
         if by_pose:
             self.batches.append((by_pose, PoseBatch([m for m in measurements if isinstance(m, PoseMeasurement)])))

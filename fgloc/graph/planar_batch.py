@@ -11,9 +11,9 @@ from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Stacked, landmark_block
 from fgloc.types import (
     FloatArray,
+    FrameMeasurement,
     Landmark,
-    MarkerPoseMeasurement,
-    RangeBearingMeasurement,
+    PointMeasurement,
 )
 
 _MOST_LOG_SCALE = 3.0  # of ranges: an estimate that diverges goes on to be refused, not to overflow
@@ -24,11 +24,11 @@ class PlanarBatch:
 
     def __init__(
         self,
-        seen: Sequence[RangeBearingMeasurement | MarkerPoseMeasurement],
+        seen: Sequence[PointMeasurement | FrameMeasurement],
         landmarks: Mapping[int, Landmark],
         installation: Installation,
     ) -> None:
-        poses = [m.pose if isinstance(m, MarkerPoseMeasurement) else None for m in seen]
+        poses = [m.pose if isinstance(m, FrameMeasurement) else None for m in seen]
         self.rows = [2 if pose is None else 3 for pose in poses]
         self._whole = np.array([pose is not None for pose in poses])
         self._yaw = np.array([0.0 if pose is None else pose[2] for pose in poses])
@@ -36,7 +36,7 @@ class PlanarBatch:
         self._point = np.zeros((len(seen), 2))
         self._whitening = np.zeros((len(seen), 3, 3))  # of the residual in the base frame
         for i, m in enumerate(seen):
-            if isinstance(m, MarkerPoseMeasurement):
+            if isinstance(m, FrameMeasurement):
                 self._point[i] = m.pose[:2]
                 c, s = np.cos(m.pose[2]), np.sin(m.pose[2])
                 turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -100,7 +100,7 @@ class PlanarBatch:
         return np.zeros((len(J), 0))
 
 
-def cartesian(m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
+def cartesian(m: PointMeasurement) -> tuple[FloatArray, FloatArray]:
     """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
 
     The frame turned by the bearing has range along its first axis and range times bearing across; first order in the

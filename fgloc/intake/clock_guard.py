@@ -6,9 +6,7 @@ from collections import deque
 from enum import Enum
 
 from fgloc.config import GateConfig
-from fgloc.types import CommandEvent, Event, ImuEvent, JointsEvent, OdometryEvent
-
-MOTION_EVENTS = (OdometryEvent, CommandEvent, JointsEvent, ImuEvent)
+from fgloc.types import Event, MotionEvent
 
 _LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation
 _CONFIRM_COUNT = 3  # events that agree on a new time ...
@@ -59,7 +57,7 @@ class ClockGuard:
         self._suspects.append(event)
         group = [e for e in self._suspects if self._agree(e, event)]
         span = max(e.stamp_ns for e in group) - min(e.stamp_ns for e in group)
-        moves = not self._motion or any(isinstance(e, MOTION_EVENTS) for e in group)
+        moves = not self._motion or any(isinstance(e, MotionEvent) for e in group)
         enough = span >= (_CONFIRM_NS if moves else _GIVE_UP_NS) and (
             ahead > 0 or max(e.received_ns for e in group) - min(e.received_ns for e in group) >= _CONFIRM_BACK_NS
         )
@@ -110,4 +108,4 @@ class ClockGuard:
             self._usual_ns += 0.1 * (min(advance, 2_000_000_000) - self._usual_ns)
             self._newest_ns = event.stamp_ns
         self._started = True
-        self._motion = self._motion or isinstance(event, MOTION_EVENTS)
+        self._motion = self._motion or isinstance(event, MotionEvent)

@@ -7,31 +7,18 @@ from collections import Counter, deque
 from collections.abc import Iterable
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
+from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.intake.event_buffer import EventBuffer
 from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
+from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    ImuEvent,
-    JointsEvent,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-    SensorEvent,
-    SightingsEvent,
-    Step,
-)
+from fgloc.types import ControlEvent, Event, MotionEvent, SensorEvent, SightingsEvent, Step
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
 _NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
-_SIGHTINGS = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
-_USED_LATE = (*_SIGHTINGS, SensorEvent)
-_NAMES: dict[type, str] = {OdometryEvent: "odometry", CommandEvent: "command", JointsEvent: "joints", ImuEvent: "imu"}
+_USED_LATE = (SightingsEvent, SensorEvent)
 
 
 class KeyframeBuilder:
@@ -72,16 +59,8 @@ class KeyframeBuilder:
         self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
         self._index = 0
         self._segment = 0
-        self._odometry: EventBuffer[OdometryEvent] = EventBuffer()
-        self._commands: EventBuffer[CommandEvent] = EventBuffer()
-        self._joints: EventBuffer[JointsEvent] = EventBuffer()
-        self._imu: EventBuffer[ImuEvent] = EventBuffer()
-        self._motion: dict[type, EventBuffer[Event]] = {
-            OdometryEvent: self._odometry,  # type: ignore[dict-item]
-            CommandEvent: self._commands,  # type: ignore[dict-item]
-            JointsEvent: self._joints,  # type: ignore[dict-item]
-            ImuEvent: self._imu,  # type: ignore[dict-item]
-        }
+        self._motion: dict[type[MotionEvent], EventBuffer[MotionEvent]] = {}  # by class of event
+        self._roles = {stream.event: stream.role for stream in (*registry.streams(), *self._streams.values())}
         self._reset()
 
     def _reset(self) -> None:
@@ -127,7 +106,7 @@ class KeyframeBuilder:
 
     def push(self, event: Event) -> list[Step]:
         """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
-        if not isinstance(event, (*MOTION_EVENTS, *_SIGHTINGS)) and type(event) not in self._streams:
+        if not isinstance(event, MotionEvent | SightingsEvent) and type(event) not in self._streams:
             return []
         return self._take(self._clock.judge(event))
 
@@ -170,11 +149,11 @@ class KeyframeBuilder:
         if isinstance(event, _USED_LATE):
             self._insert_late(event)
             return
-        name = _NAMES[type(event)]
+        assert isinstance(event, MotionEvent)
         if late:
-            self.rejections[f"{name}.late"] += 1
-        elif not self._motion[type(event)].insert(event):
-            self.rejections[f"{name}.duplicate"] += 1
+            self.rejections[f"{self._name(event)}.late"] += 1
+        elif not self._motion.setdefault(type(event), EventBuffer()).insert(event):
+            self.rejections[f"{self._name(event)}.duplicate"] += 1
 
     def _insert_late(self, event: SightingsEvent | SensorEvent) -> None:
         """Keep what may be used after its keyframe."""
@@ -198,8 +177,7 @@ class KeyframeBuilder:
 
     def _name(self, event: Event) -> str:
         """Of an event's role, for the rejections."""
-        stream = self._streams.get(type(event))  # type: ignore[arg-type]
-        return _NAMES.get(type(event), "sightings") if stream is None else stream.role
+        return self._roles[type(event)]
 
     def _stray(self, event: Event) -> None:
         """An event far off the clock: a sighting may just be very late, the rest is lost."""
@@ -211,7 +189,7 @@ class KeyframeBuilder:
         elif isinstance(event, _USED_LATE):
             self._insert_late(event)
         else:
-            self.rejections[f"{_NAMES[type(event)]}.late"] += 1
+            self.rejections[f"{self._name(event)}.late"] += 1
 
     def _jump(self, event: Event) -> list[Step]:
         """End the segment; one that has not begun (its first stamps were wrong) is forgotten."""
@@ -286,10 +264,9 @@ class KeyframeBuilder:
             segment=self._segment,
             start_ns=start,
             stamp_ns=stamp_ns,
-            odometry=self._odometry.window(start, stamp_ns),
-            commands=self._commands.window(start - self._history_ns, stamp_ns),
-            joints=self._joints.window(start, stamp_ns),
-            imu=self._imu.window(start, stamp_ns),
+            motion={
+                kind: buffer.window(start - self._back_ns(kind), stamp_ns) for kind, buffer in self._motion.items()
+            },
             sightings=tuple(e for e in self._pending[:handed] if not isinstance(e, SensorEvent)),
             sensed=(
                 *(e for e in self._pending[:handed] if isinstance(e, SensorEvent)),
@@ -301,11 +278,13 @@ class KeyframeBuilder:
             self._first_ns = stamp_ns
         self._last_ns = stamp_ns
         self._index += 1
-        self._odometry.trim(stamp_ns)
-        self._commands.trim(stamp_ns - self._history_ns)
-        self._joints.trim(stamp_ns)
-        self._imu.trim(stamp_ns)
+        for kind, buffer in self._motion.items():
+            buffer.trim(stamp_ns - self._back_ns(kind))
         return step
+
+    def _back_ns(self, kind: type[MotionEvent]) -> int:
+        """How far events are kept from before a step."""
+        return self._history_ns if issubclass(kind, ControlEvent) else 0
 
     def _finish(self) -> list[Step]:
         """Steps up to the newest event, without waiting for anything."""

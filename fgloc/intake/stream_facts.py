@@ -9,8 +9,7 @@ from typing import Protocol
 from fgloc.config import Role
 from fgloc.recording.reader import Recording
 from fgloc.recording.transforms import FrameTree
-from fgloc.sensors.markers.images import ImageError, decode
-from fgloc.types import Camera, Event, ImageEvent
+from fgloc.types import Camera, Event, RawEvent
 
 _SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded is looked for
 
@@ -106,10 +105,6 @@ def first_events(recording: Recording) -> dict[type[Event], Event]:
 def first_size(events: Iterable[Event]) -> tuple[int, int] | None:
     """Width and height of the first image among events that can be decoded."""
     for event in events:
-        if isinstance(event, ImageEvent):
-            try:
-                height, width = decode(event).shape
-            except ImageError:
-                continue
-            return width, height
+        if isinstance(event, RawEvent) and (size := event.decoded_size()) is not None:
+            return size
     return None

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
-from fgloc.intake.clock_guard import MOTION_EVENTS
-from fgloc.types import CornersEvent, Event, ImageEvent, JointsEvent, MarkerPosesEvent, RangeBearingEvent
+from fgloc.types import Event, MotionEvent, RawEvent, SightingsEvent
 
 _RESET_NS = 5_000_000_000  # a topic's delay that changes by more is not the network's
 _COUNT = 3  # messages that agree on the new delay, before ...
@@ -15,15 +14,15 @@ _AGREE_NS = 500_000_000  # how much their delays may differ
 _ALIVE_NS = 2_000_000_000  # a topic silent for longer bears no witness
 _PATIENCE_NS = 3_000_000_000  # for how long messages are held back
 _SHARE = 0.1  # of a new delay in the mean
-_STAMPED = (*MOTION_EVENTS, ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent)
+_STAMPED = (MotionEvent, RawEvent, SightingsEvent)
 
 
 Source = tuple[str, tuple[str, ...]]
 
 
 def source_of(event: Event) -> Source:
-    """Who speaks: a topic; of joint states, one for each set of joints, as wheels and arm may share the topic."""
-    return event.topic, event.names if isinstance(event, JointsEvent) else ()
+    """The publisher of an event: of those that share a topic, which one."""
+    return event.topic, event.publisher if isinstance(event, MotionEvent) else ()
 
 
 @dataclass(slots=True)

@@ -6,36 +6,17 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from fgloc.config import GateConfig
-from fgloc.intake.field_checks import PLANAR, Changes, FieldChecks
-from fgloc.intake.sighting_validation import EMPTIED, SightingsValidator
-from fgloc.sensors.base import Check, Stream
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-    SensorEvent,
-    TransformEvent,
-    TruthEvent,
-)
+from fgloc.sensors import registry
+from fgloc.sensors.base import Stream
+from fgloc.sensors.field_checks import EMPTIED, Changes, FieldChecks
+from fgloc.types import Event, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
-_MAX_ANGLE = 1e9  # rad, of a joint
-_MAX_ACCELERATION = 1e3  # m/s²
-_NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
-_NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
 
 @dataclass(slots=True)
@@ -80,34 +61,23 @@ class EventValidator:
         Args:
             config: bounds.
             known_ids: ids of the map; None if no map is given: then every id passes.
-            streams: of registered sensors, which bring their own checks.
+            streams: of sensors of other packages; the built-in ones are known.
         """
         self.rejections: Counter[str] = Counter()
         self._config = config
         self._notes: dict[str, None] = {}  # an ordered set
-        self._parts = FieldChecks(config, self._note)
-        self._sightings = SightingsValidator(config, known_ids, self._parts, self.rejections, self._note)
-        self._seen: Counter[str] = Counter()  # events by sensor
+        self._parts = FieldChecks(config, self._note, self.rejections, known_ids)
+        self._seen: Counter[str] = Counter()  # events by role
         self._topics: dict[str, _Topic] = {}
-        self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {
-            OdometryEvent: ("odometry", self._odometry),
-            CommandEvent: ("command", self._command),
-            JointsEvent: ("joints", self._joints),
-            ImuEvent: ("imu", self._imu),
-            ImageEvent: ("image", self._image),
-            TruthEvent: ("truth", self._truth),
-            CornersEvent: ("sightings", self._sightings.corners),
-            MarkerPosesEvent: ("sightings", self._sightings.marker_poses),
-            RangeBearingEvent: ("sightings", self._sightings.range_bearings),
-        }
-        for stream in streams:
-            self._checks[stream.event] = stream.role, partial(_by_stream, stream.check, config)
+        self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {TruthEvent: ("truth", self._truth)}
+        for stream in (*registry.streams(), *streams):
+            self._checks[stream.event] = stream.role, stream.validate(self._parts)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each; nothing is said twice."""
-        notes = [*self._notes, *self._sightings.notes]
-        for reason in ("odometry.twist_yaw_rate_bound", "command.yaw_rate_bound", "imu.yaw_rate_bound"):
+        notes = [*self._notes, *self._parts.notes]
+        for reason in sorted(r for r in self.rejections if r.endswith("yaw_rate_bound")):
             bad, seen = self.rejections[reason], self._seen[reason.split(".")[0]]
             if bad >= 10 and bad > 0.1 * seen:
                 notes.append(
@@ -179,102 +149,7 @@ class EventValidator:
             topic.back = False
         topic.recent.append(stamp)
 
-    # --- one method per kind of event: the event, a repaired copy, or the reason for rejection ---
-
-    def _odometry(self, event: OdometryEvent) -> Event | str:
-        config = self._config
-        changes: Changes = {}
-        vx, vy, vz = event.linear.tolist()
-        wx, wy, wz = event.angular.tolist()
-        if not math.isfinite(vx + vy + vz + wx + wy + wz):
-            twist = "non_finite"
-        elif max(abs(vx), abs(vy), abs(vz)) > config.max_speed:
-            twist = "speed_bound"
-        elif max(abs(wx), abs(wy), abs(wz)) > config.max_yaw_rate:
-            twist = "yaw_rate_bound"
-        else:
-            twist = self._parts.covariance(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
-        x, y, z = event.position.tolist()
-        if not math.isfinite(x + y + z):
-            pose = "non_finite"
-        elif max(abs(x), abs(y), abs(z)) > config.max_position:
-            pose = "position_bound"
-        else:
-            pose = self._parts.quaternion(event.orientation, "orientation", changes) or self._parts.covariance(
-                event.topic, "pose", event.pose_cov, PLANAR, "pose_cov", changes
-            )
-        if twist:
-            self.rejections[f"odometry.twist_{twist}"] += 1
-            changes |= _NO_TWIST
-        if pose:
-            self.rejections[f"odometry.pose_{pose}"] += 1
-            changes |= _NO_POSE
-        if twist and pose:
-            return EMPTIED
-        return replace(event, **changes) if changes else event
-
-    def _command(self, event: CommandEvent) -> Event | str:
-        if not math.isfinite(event.v + event.omega):
-            return "non_finite"
-        if abs(event.v) > self._config.max_speed:
-            return "speed_bound"
-        return "yaw_rate_bound" if abs(event.omega) > self._config.max_yaw_rate else event
-
-    def _joints(self, event: JointsEvent) -> Event | str:
-        n = len(event.names)
-        changes: Changes = {}
-        usable = 0  # angles and rates
-        for name, bound, wild in (
-            ("position", _MAX_ANGLE, "position_bound"),
-            ("velocity", self._config.max_wheel_rate, "wheel_rate_bound"),
-            ("effort", math.inf, ""),
-        ):
-            array: FloatArray = getattr(event, name)
-            values: list[float] = array.tolist()
-            if n == 0 or len(values) not in (0, n):
-                return "length"
-            good = [abs(value) <= bound and math.isfinite(value) for value in values]
-            if name != "effort":
-                usable += sum(good)
-            if all(good):
-                continue
-            if all(math.isnan(value) for value in values):  # a driver's way to say that it has none
-                self._note(f"{event.topic}: every {name} is NaN in some messages; taken as not given")
-                changes[name] = np.empty(0)
-            else:
-                finite = all(math.isfinite(value) for value in values)
-                self.rejections["joints." + (wild if finite else f"{name}_non_finite")] += 1
-                changes[name] = np.where(good, array, np.nan)
-        if not usable:
-            return "non_finite"
-        return replace(event, **changes) if changes else event
-
-    def _imu(self, event: ImuEvent) -> Event | str:
-        changes: Changes = {}
-        cov = event.angular_velocity_cov
-        if cov[0, 0] == -1.0:  # REP 145
-            self._note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")
-            return "unavailable"
-        wx, wy, wz = event.angular_velocity.tolist()
-        if not math.isfinite(wx + wy + wz):
-            return "non_finite"
-        if max(abs(wx), abs(wy), abs(wz)) > self._config.max_yaw_rate:
-            return "yaw_rate_bound"
-        if reason := self._parts.covariance(
-            event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes
-        ):
-            return reason
-        ax, ay, az = event.linear_acceleration.tolist()
-        if not abs(ax) + abs(ay) + abs(az) <= _MAX_ACCELERATION:  # also NaN
-            self.rejections["imu.acceleration"] += 1
-            changes["linear_acceleration"] = np.full(3, np.nan)
-        return replace(event, **changes) if changes else event
-
-    def _image(self, event: ImageEvent) -> Event | str:
-        size = len(event.data)
-        if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
-            return "empty"
-        return "truncated" if not event.compressed and size < event.height * event.step else event
+    # --- what no sensor has: the event, a repaired copy, or the reason for rejection ---
 
     def _truth(self, event: TruthEvent) -> Event | str:
         changes: Changes = {}
@@ -297,7 +172,3 @@ class EventValidator:
 
     def _note(self, text: str) -> None:
         self._notes.setdefault(text)
-
-
-def _by_stream(check: Check, config: GateConfig, event: SensorEvent) -> Event | str:
-    return check(event, config)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fgloc.sensors.markers.detector import Detector, use_one_thread
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.markers.images import ImageError
-from fgloc.types import CornersEvent, Event, ImageEvent
+from fgloc.types import Event
 
 
 class State(Enum):

@@ -15,7 +15,7 @@ from fgloc.live.reception import role_of
 from fgloc.live.run import OnlineRun
 from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
-from fgloc.types import Estimate, Event, ImageEvent, Step
+from fgloc.types import Estimate, Event, RawEvent, Step
 
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot
 _MEAN_OF = 20  # steps, in the mean of their time
@@ -68,7 +68,7 @@ class Engine:
         with self.changed:
             self.check_alive()
             for event in events:
-                is_image = isinstance(event, ImageEvent)
+                is_image = isinstance(event, RawEvent)
                 queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
                 if is_image:
                     self.worker.arrived(queued)

@@ -12,21 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from fgloc.config import RecordingConfig, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import yaw_quaternion
-from fgloc.types import (
-    CameraInfoEvent,
-    CommandEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    MarkerCorners,
-    OdometryEvent,
-    RangeBearing,
-    RangeBearingEvent,
-    TransformEvent,
-)
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import CameraInfoEvent, ControlEvent, Event, FloatArray, TransformEvent
 
 When = tuple[int, int, str]
 BASE, SENSOR = "base_link", "sensor"
@@ -90,7 +80,7 @@ class EventMaker:
 
     def command(self, stamp_ns: int, v: float, omega: float) -> None:
         """What the robot is told to do: forward speed [m/s] and yaw rate [rad/s]."""
-        self._deliver(CommandEvent(*self._when("command", stamp_ns), float(v), float(omega)))
+        self._deliver(ControlEvent(*self._when("command", stamp_ns), float(v), float(omega)))
 
     def imu(
         self,

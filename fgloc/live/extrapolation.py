@@ -5,33 +5,36 @@ from __future__ import annotations
 import copy
 import threading
 from bisect import bisect_left, bisect_right, insort
-from collections import deque
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections import defaultdict, deque
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.intake.clock_guard import MOTION_EVENTS, ClockGuard, ClockVerdict
+from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources
+from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import CommandEvent, Event, ImuEvent, JointsEvent, Mode, OdometryEvent, Step
+from fgloc.stats import chi2_bound
+from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
 HISTORY_S = 5.0  # poses further back than this are not told
 _BEFORE_NS = 500_000_000  # motion events this long before a keyframe tell how it was moving then
 _PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
 _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
 
+_CONTRADICTION = chi2_bound(0.99, 3)  # of wheels and learned motion; where they are rejected in error, little is lost
 _MOST_EVENTS = 8192  # of one kind
-
-E = TypeVar("E", bound=Event)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +74,7 @@ class Extrapolator:
         self._history_ns = round(config.keyframes.history_s * 1e9)
         self._kept_ns = max(self._history_ns, _BEFORE_NS)
         self._clock = ClockGuard(config.gate)
-        self._events: dict[type[Event], list[Any]] = {kind: [] for kind in MOTION_EVENTS}  # by stamp
+        self._events: defaultdict[type[MotionEvent], list[MotionEvent]] = defaultdict(list)  # by class and stamp
         self._anchors: deque[_Held] = deque()
         self._segment = -1
         self._newest_ns = 0
@@ -83,7 +86,7 @@ class Extrapolator:
             self._means = _Means(parts.joint, model, LandmarkFactors(None, parts.installation))
             self._anchors.clear()
 
-    def add(self, event: Event) -> None:
+    def add(self, event: MotionEvent) -> None:
         """Take in a motion event that passed the gate."""
         with self._lock:
             for verdict, judged in self._clock.judge(event):
@@ -94,6 +97,7 @@ class Extrapolator:
                         events.clear()
                     self._anchors.clear()
                     self._newest_ns = 0
+                assert isinstance(judged, MotionEvent)
                 insort(self._events[type(judged)], judged, key=_stamp)
                 self._newest_ns = max(self._newest_ns, judged.stamp_ns)
             events = self._events[type(event)]
@@ -137,20 +141,22 @@ class Extrapolator:
     def _step(self, anchor: Anchor, end_ns: int) -> Step:
         """All motion events from a while before the anchor to the first one after the end."""
         start_ns = anchor.stamp_ns
-        first = start_ns - _BEFORE_NS
         return Step(
             0,
             anchor.segment,
             start_ns,
             end_ns,
-            odometry=self._window(OdometryEvent, first, end_ns),
-            commands=self._window(CommandEvent, start_ns - self._history_ns, end_ns),
-            joints=self._window(JointsEvent, first, end_ns),
-            imu=self._window(ImuEvent, start_ns, end_ns),
+            {kind: self._window(kind, start_ns - self._back_ns(kind), end_ns) for kind in self._events},
         )
 
-    def _window(self, kind: type[E], start_ns: int, end_ns: int) -> tuple[E, ...]:
-        """In order of stamp: events inside, the last one at or before the start, and the first at or after the end."""
+    def _back_ns(self, kind: type[MotionEvent]) -> int:
+        """How far before a step its events are of use: those of an inertial unit are integrated from end to end."""
+        if issubclass(kind, ControlEvent):
+            return self._history_ns
+        return 0 if issubclass(kind, InertialEvent) else _BEFORE_NS
+
+    def _window(self, kind: type[MotionEvent], start_ns: int, end_ns: int) -> tuple[MotionEvent, ...]:
+        """In order of stamp: events inside, the last one at or before the start, the first one at or after the end."""
         events = self._events[kind]
         first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
@@ -170,10 +176,28 @@ class Extrapolator:
             end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
             piece = _piece(step, start_ns, end_ns)
             readings = sources.read(piece, anchor.since_fix_s + (start_ns - step.start_ns) * 1e-9)
-            motions = anchor.budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
+            budget = _without_slip(anchor.budget, readings, sources)
+            motions = budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
             belief = predict(belief, anchor.known, means.factors.installation, motions)
             start_ns = end_ns
         return belief
+
+
+def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: MotionSources) -> NoiseBudget:
+    """Without wheels that contradict the learned motion: a slip that began after the keyframe.
+
+    The test that flags slips (`MotionFaults`) sees whole steps only.
+    """
+    if readings.learned is None or not sources.learned_is_independent or "learned" in budget.rejected:
+        return budget
+    difference = source_difference(readings, sources)
+    if difference is None:
+        return budget
+    d, D = difference.value, difference.by_installation
+    cov = difference.cov * max(budget.scale, 1.0) + D @ difference.installation_cov @ D.T
+    if float(d @ np.linalg.solve(cov, d)) <= _CONTRADICTION:
+        return budget
+    return replace(budget, rejected={**budget.rejected, "wheels": "slip"})
 
 
 def _stamp(event: Event) -> int:
@@ -184,7 +208,9 @@ def _piece(step: Step, start_ns: int, end_ns: int) -> Step:
     """A part of a step with all of its events but those of the IMU, which are integrated from end to end."""
     if (start_ns, end_ns) == (step.start_ns, step.stamp_ns):
         return step
-    stamps = [e.stamp_ns for e in step.imu]
-    first = max(bisect_right(stamps, start_ns) - 1, 0)
-    imu = step.imu[first : bisect_left(stamps, end_ns) + 1]
-    return Step(0, step.segment, start_ns, end_ns, step.odometry, step.commands, step.joints, imu)
+    motion = dict(step.motion)
+    for kind, events in step.motion.items():
+        if issubclass(kind, InertialEvent):
+            first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
+            motion[kind] = events[first : bisect_left(events, end_ns, key=_stamp) + 1]
+    return Step(0, step.segment, start_ns, end_ns, motion)

@@ -8,43 +8,16 @@ import numpy as np
 
 from fgloc.config import Config, Role, role_names
 from fgloc.recording.transforms import FrameTree
-from fgloc.sensor_setup import base_frame, given_pose
+from fgloc.sensor_setup import base_frame, camera_frame, given_pose
 from fgloc.sensors import registry
-from fgloc.sensors.markers.images import ImageError, decode
-from fgloc.types import (
-    Camera,
-    CameraInfoEvent,
-    CommandEvent,
-    CornersEvent,
-    Event,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-    SensorEvent,
-    TransformEvent,
-    TruthEvent,
-)
-
-ROLE_OF: Mapping[type[Event], Role] = {
-    OdometryEvent: "odometry",
-    CommandEvent: "command",
-    JointsEvent: "joints",
-    ImuEvent: "imu",
-    ImageEvent: "image",
-    CameraInfoEvent: "camera_info",
-    CornersEvent: "sightings",
-    MarkerPosesEvent: "sightings",
-    RangeBearingEvent: "sightings",
-    TruthEvent: "truth",
-}
+from fgloc.types import Camera, CameraInfoEvent, Event, RawEvent, SightingsEvent, TransformEvent, TruthEvent
 
 
 def role_of(event: Event) -> Role | None:
     """Role of an event's topic; None if it needs none."""
-    return ROLE_OF.get(type(event)) or (registry.role_of_event(event) if isinstance(event, SensorEvent) else None)
+    if isinstance(event, CameraInfoEvent | TruthEvent):
+        return "camera_info" if isinstance(event, CameraInfoEvent) else "truth"
+    return registry.role_of_event(event)
 
 
 _MOTION: frozenset[Role] = frozenset({"odometry", "joints", "command", "imu"})
@@ -112,11 +85,9 @@ class LiveFacts:
             self._add_transform(event)
         else:
             self._seen.setdefault(type(event), event)
-        if isinstance(event, ImageEvent) and self.image_size is None:
-            try:
-                height, width = decode(event).shape
-                self.image_size = width, height
-            except ImageError:
+        if isinstance(event, RawEvent) and self.image_size is None:
+            self.image_size = event.decoded_size()
+            if self.image_size is None:
                 return False
         before = len(self.roles)
         for role, topic in self._topics.items():
@@ -161,15 +132,16 @@ class LiveFacts:
 
     def _missing(self, role: Role) -> str:
         """What the sensor of a role cannot be built without; "" if it is all there."""
-        corners = role == "sightings" and CornersEvent in self._seen
-        if role not in _WITH_CAMERA or self.camera is not None or not (role == "image" or corners):
+        in_pixels = role == "sightings" and any(
+            e.in_pixels for e in self._seen.values() if isinstance(e, SightingsEvent)
+        )
+        if role not in _WITH_CAMERA or self.camera is not None or not (role == "image" or in_pixels):
             return ""
         if CameraInfoEvent not in self._seen and self._config.camera.file is None:
             return "no CameraInfo yet, and no camera.file"
         if given_pose(self._config, "optical") is not None:
             return ""
-        info = self._seen.get(CameraInfoEvent) or self._seen.get(ImageEvent) or self._seen.get(CornersEvent)
-        frame = info.frame_id if isinstance(info, CameraInfoEvent | ImageEvent | CornersEvent) else ""
+        frame = camera_frame(self._seen)
         base = base_frame(self, self._config, self.first)
         if frame.lstrip("/") != base.lstrip("/") and not (frame in self.frames and base in self.frames):
             return f"no transform from {base} to {frame!r} yet, and no recording.sightings_pose"

@@ -27,18 +27,18 @@ from typing import Any, TypeAlias
 
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.intake.clock_guard import MOTION_EVENTS
 from fgloc.live.anchors import Anchor, MotionParts, Outlet
 from fgloc.live.estimation import Estimation, Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.types import Estimate, Event, ImageEvent
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.types import Estimate, Event, MotionEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
-_GATHERED = MOTION_EVENTS  # they only matter to the estimation when a sighting or a question comes
-_GATHER_S = 0.01  # for which they wait for one another: waking both processes costs more than sending
+# Motion events only matter to the estimation when a sighting or a question comes.
+_GATHER_S = 0.005  # for which they wait for one another: waking both processes costs more than sending
 _END_S = 10.0  # that it may take to use what it has and to save its state
 _ANSWERING = 4  # its threads that answer questions
 
@@ -152,7 +152,7 @@ class EstimationProcess:
         if self._closing:
             raise EstimatorError("the live run is closed; make a new Live")
         self._waiting.append(item)
-        self._urgent = self._urgent or not isinstance(item, _GATHERED)
+        self._urgent = self._urgent or not isinstance(item, MotionEvent)
         if self._urgent or len(self._waiting) == 1:
             self._changed.notify_all()
 

@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fgloc.config import Config
-from fgloc.intake.clock_guard import MOTION_EVENTS
 from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
 from fgloc.intake.validation import EventValidator
 from fgloc.live.facts import LiveFacts
 from fgloc.live.facts import role_of as known_role
 from fgloc.live.status import TopicMeter, TopicStatus
-from fgloc.types import Event, TransformEvent
+from fgloc.types import Event, MotionEvent, TransformEvent
 
 _SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
 _SUCCESSION_NS = 1_000_000_000  # a publisher silent for this long has ended; another one of the topic is used
@@ -70,11 +69,12 @@ class Reception:
         first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
         return first.has_the_topic(publisher, event.received_ns)
 
-    def motion(self, event: Event) -> Event | None:
+    def motion(self, event: Event) -> MotionEvent | None:
         """An event that was received, if it is of the motion source to be used, and as the gate lets it through."""
-        if not isinstance(event, MOTION_EVENTS) or not self._selection.topic_is_used(event):
+        if not isinstance(event, MotionEvent) or not self._selection.topic_is_used(event):
             return None
-        return self._gate.check(event)
+        passed = self._gate.check(event)
+        return passed if isinstance(passed, MotionEvent) else None
 
     def note(self, text: str) -> None:
         """Remember a sentence for the user."""

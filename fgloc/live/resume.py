@@ -8,10 +8,9 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.frames import quaternion_yaw
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.state import OdometryState, RunState, row3
-from fgloc.types import FloatArray, Mode, OdometryEvent, Step
+from fgloc.types import FloatArray, Mode, MotionEvent, Step
 
 _KNOWN = (Mode.OK, Mode.DEAD_RECKONING)  # modes whose pose is worth going on from
 _USELESS_M, _USELESS_RAD = 3.0, 0.7  # sigmas above which the map is searched anyway
@@ -21,12 +20,12 @@ _AT_ORIGIN_M, _AT_ORIGIN_RAD = 0.05, 0.05  # an odometry this near to zero has p
 _STAMP_S = 0.02  # how far the odometry's pose and the saved one may be apart in time
 
 
-def odometry_state(event: OdometryEvent) -> OdometryState | None:
-    """What is saved of an odometry message; None if it gives no pose."""
-    pose = _pose(event)
-    if not np.isfinite(pose).all():
+def odometry_state(event: MotionEvent) -> OdometryState | None:
+    """What is saved of a motion event; None if it gives no pose."""
+    told = event.odometer
+    if told is None or not np.isfinite(told.pose).all():
         return None
-    return OdometryState(topic=event.topic, frame_id=event.frame_id, stamp_ns=event.stamp_ns, pose=row3(pose))
+    return OdometryState(topic=event.topic, frame_id=told.frame_id, stamp_ns=event.stamp_ns, pose=row3(told.pose))
 
 
 def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> tuple[PoseWithCovariance | None, str]:
@@ -67,16 +66,15 @@ def _by_odometry(state: RunState, step: Step, gap_s: float) -> FloatArray | None
     saved = state.odometry
     if saved is None:
         return None
-    events = [e for e in step.odometry if e.topic == saved.topic and e.frame_id == saved.frame_id]
-    events = [e for e in events if np.isfinite(_pose(e)).all()]
-    if not events:
+    told = [(e.stamp_ns, e.odometer) for events in step.motion.values() for e in events if e.topic == saved.topic]
+    poses = [(at, p) for at, p in told if p is not None and p.frame_id == saved.frame_id and np.isfinite(p.pose).all()]
+    if not poses:
         return None
-    event = min(events, key=lambda e: abs(e.stamp_ns - step.stamp_ns))
+    at_ns, now_told = min(poses, key=lambda found: abs(found[0] - step.stamp_ns))
     twist = np.array(state.twist)
     then = se2.compose(np.array(saved.pose), se2.exp(twist * (state.stamp_ns - saved.stamp_ns) * 1e-9))
-    now_twist = np.array([*event.linear[:2], event.angular[2]])
-    now_twist = np.where(np.isfinite(now_twist), now_twist, 0.0)
-    now = se2.compose(_pose(event), se2.exp(now_twist * (step.stamp_ns - event.stamp_ns) * 1e-9))
+    now_twist = np.where(np.isfinite(now_told.twist), now_told.twist, 0.0)
+    now = se2.compose(now_told.pose, se2.exp(now_twist * (step.stamp_ns - at_ns) * 1e-9))
     if _at_origin(now) and not _at_origin(then):
         return None
     motion = se2.between(then, now)
@@ -99,10 +97,6 @@ def _odometry_cov(state: RunState, motion: FloatArray, gap_s: float, config: Con
     x = noise.x_per_sqrt_m**2 * path + common
     y = noise.y_per_sqrt_m**2 * path + common
     return np.diag([x, y, yaw]) + 1e-9 * np.eye(3)
-
-
-def _pose(event: OdometryEvent) -> FloatArray:
-    return np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
 
 
 def _at_origin(pose: FloatArray) -> bool:

@@ -24,16 +24,7 @@ from fgloc.live.state import (
     matrix3,
     row3,
 )
-from fgloc.types import (
-    CornersEvent,
-    Estimate,
-    Event,
-    FloatArray,
-    LandmarkMap,
-    Mode,
-    OdometryEvent,
-    Step,
-)
+from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Mode, MotionEvent, SightingsEvent, Step
 
 _TOLD_EVERY_S = 5.0  # the diagnosis is asked no more often: what it pools changes slowly
 
@@ -76,7 +67,7 @@ class OnlineRun:
         self._resumed = resumed
         self._reset: PoseWithCovariance | None = None  # a pose that was given, for the next step
         self._last_step: Step | None = None
-        self._odometry: OdometryEvent | None = None
+        self._odometry: MotionEvent | None = None  # the newest that gives a pose
         self._fastest = (0.0, 0.0)
         self._past_rejections: Counter[str] = Counter()
         self._notes: list[str] = []
@@ -112,12 +103,12 @@ class OnlineRun:
     def use(self, event: Event, detected: bool = False) -> Iterator[tuple[Step, Estimate | None]]:
         """Take the next event in order; ``detected``: markers found in an image that has passed the gate."""
         assert self.parts is not None
-        if detected and isinstance(event, CornersEvent):
+        if detected and isinstance(event, SightingsEvent):
             passed = self.parts.detections.check(event)
             if passed is None:
                 return
             event = passed
-        if isinstance(event, OdometryEvent):
+        if isinstance(event, MotionEvent) and event.odometer is not None:
             self._odometry = event
         for step in self.parts.stepper.push(event):
             self.reordering_s = (self.parts.stepper.newest_ns - step.stamp_ns) * 1e-9

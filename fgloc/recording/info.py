@@ -13,12 +13,11 @@ import numpy as np
 from fgloc.config import BUILT_IN_ROLES, Config, Role
 from fgloc.errors import RecordingError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.checks import CHECKS, OtherChecks
-from fgloc.recording.checks_base import Collector
-from fgloc.recording.checks_camera import CameraInfoChecks, ImageChecks, SightingsChecks
+from fgloc.recording.checks import CameraInfoChecks, collector
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
-from fgloc.types import Event
+from fgloc.sensors.topic_checks import Collector, RawChecks, SightingsChecks
+from fgloc.types import Event, MotionEvent
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
 
@@ -93,12 +92,14 @@ def _read_through(
     """Times and checks of each topic, and the first name of a child frame."""
     times = {topic.name: Times() for topic in recording.topics}
     role_of = {topic: role for role, topic in recording.roles.items()}
-    checks: dict[str, Collector] = {topic: CHECKS.get(role, OtherChecks)() for topic, role in role_of.items()}
+    checks: dict[str, Collector] = {topic: collector(role) for topic, role in role_of.items()}
     child_frame = ""
     recording.undecodable = {}
     for message in recording.messages():
         topic, _, received_ns, _ = message
-        times.setdefault(topic, Times()).received.append(received_ns)  # damage may hide a topic at first
+        if topic not in times:  # damage may hide it at first
+            times[topic] = Times()
+        times[topic].received.append(received_ns)
         if topic in role_of:
             for event in recording.decode(message, role_of[topic]):
                 times[topic].decoded.append(received_ns)
@@ -106,7 +107,8 @@ def _read_through(
                 checks[topic].add(event)
                 if watch is not None:
                     watch(event)
-                child_frame = child_frame or getattr(event, "child_frame_id", "")
+                if isinstance(event, MotionEvent):
+                    child_frame = child_frame or event.base_frame_id
     return times, checks, child_frame
 
 
@@ -118,10 +120,10 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
         found.append("No odometry, joint states or commands: nothing tells how the robot moves.")
     if not unsettled and not roles.keys() - _NO_PLACE:
         found.append("No images and no marker sightings: nothing bounds the drift.")
-    images = next((c for c in checks.values() if isinstance(c, ImageChecks)), None)
+    images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
     sightings = next((c for c in checks.values() if isinstance(c, SightingsChecks)), None)
-    needs_camera = images is not None or (sightings is not None and sightings.corners)
+    needs_camera = images is not None or (sightings is not None and sightings.in_pixels)
     if needs_camera and info is None and config.camera.file is None:
         found.append("No sensor_msgs/CameraInfo for the camera; give a calibration (camera.file in the configuration).")
     if images is not None and info is not None and images.sizes and info.size not in images.sizes:

@@ -7,21 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from fgloc.config import BUILT_IN_ROLES, Role, TopicsConfig, role_names
-from fgloc.recording.decode import CONVERTERS, converters_of
+from fgloc.recording.decode import converters_of
 from fgloc.sensors import registry
 
-# Of several candidates for a role, the only one with such a name (alone or below a namespace) is taken.
-CONVENTIONAL_NAMES: Mapping[Role, tuple[str, ...]] = {
-    "odometry": ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
-    "command": ("cmd_vel",),
-    "joints": ("joint_states",),
-    "imu": ("imu", "imu/data"),
-    "image": ("image_raw", "image_raw/compressed", "image", "image/compressed"),
-    "camera_info": ("camera_info",),
-    "sightings": (),
-    "truth": (),
-}
-
+_CAMERA_INFO = ("camera_info",)  # its usual name
 # Words (between / and _) by which a topic says what it is.
 TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "vrpn", "qualisys"})
 _NOT_TRUTH = re.compile(
@@ -110,7 +99,7 @@ def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
     """That topics would fit by type but not by name; empty if there is none, or the role is not told by names."""
     if role not in ("image", "truth"):
         return ""
-    fitting = CONVERTERS[role].keys() - CONVERTERS["odometry"].keys()
+    fitting = converters_of(role).keys() - converters_of("odometry").keys()
     by_type = [topic.name for topic in filled if topic.message_type in fitting]
     if not by_type:
         return ""
@@ -153,7 +142,7 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
-        odometry = topic.message_type in CONVERTERS["odometry"]
+        odometry = topic.message_type in converters_of("odometry")
         return _says_truth(topic.name) or not (odometry or _NOT_TRUTH.search(topic.name))
     if role == "odometry":
         return not _says_truth(topic.name)
@@ -212,8 +201,7 @@ def _says_truth(topic: str) -> bool:
 
 
 def _conventional(role: Role, topic: str) -> bool:
-    stream = registry.streams().get(role)
-    names = CONVENTIONAL_NAMES[role] if stream is None else stream.usual_names
+    names = _CAMERA_INFO if role == "camera_info" else registry.usual_names(role)
     return any(topic.strip("/") == name or topic.endswith(f"/{name}") for name in names)
 
 

@@ -19,7 +19,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, RangeBearingMeasurement
+from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
 _RING = 24  # pieces of a ring, 15 degrees apart
 _MAX_HYPOTHESES = 96  # four rings; the unlikeliest go first
@@ -60,7 +60,7 @@ class GaussianSum:
         """Take in one step. The work is bounded: so many hypotheses, so many sightings."""
         if len(self.poses) and motions:
             self._predict(*fuse(motions))
-        beacons = [m for m in sightings if isinstance(m, RangeBearingMeasurement) and m.landmark_id in self._places]
+        beacons = [m for m in sightings if isinstance(m, PointMeasurement) and m.landmark_id in self._places]
         for m in beacons[:: -(-len(beacons) // _MAX_SIGHTINGS) or 1]:
             self._take(m)
 
@@ -103,7 +103,7 @@ class GaussianSum:
         ad = se2.adjoint(se2.inverse(motion))
         self.covs = ad @ self.covs @ ad.T + cov
 
-    def _take(self, m: RangeBearingMeasurement) -> None:
+    def _take(self, m: PointMeasurement) -> None:
         R = self._cov(m)
         seen_before = m.landmark_id in self._last_ns
         self._last_ns[m.landmark_id] = m.stamp_ns
@@ -121,7 +121,7 @@ class GaussianSum:
         self._none += outlier
         self._prune()
 
-    def _update(self, m: RangeBearingMeasurement, R: FloatArray, outlier: float) -> None:
+    def _update(self, m: PointMeasurement, R: FloatArray, outlier: float) -> None:
         """Kalman's update of each hypothesis that the sighting suits; for the others it is an outlier."""
         residual, J = _residuals(self.poses, self._places[m.landmark_id], m)
         PJ = self.covs @ J.transpose(0, 2, 1)
@@ -138,7 +138,7 @@ class GaussianSum:
         self.covs = np.where(good[:, None, None], covs, self.covs)
         self.log_weights = self.log_weights + np.maximum(fits, outlier)
 
-    def _cov(self, m: RangeBearingMeasurement) -> FloatArray:
+    def _cov(self, m: PointMeasurement) -> FloatArray:
         """Of the sighting: with the errors that it shares with the last one of its landmark, and with all others."""
         config = self._config
         cov = m.cov + np.diag([config.bearing_bias_sigma_rad**2, (config.range_scale_sigma * m.range_m) ** 2])
@@ -167,7 +167,7 @@ class GaussianSum:
         self.poses, self.covs, self.log_weights = poses[kept], self.covs[kept], weights[kept]
 
 
-def _ring(place: FloatArray, m: RangeBearingMeasurement, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _ring(place: FloatArray, m: PointMeasurement, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses ``(n, 3)`` all around a beacon seen so, with covariances that let each reach the next."""
     yaws = np.linspace(-math.pi, math.pi, _RING, endpoint=False)
     x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
@@ -182,7 +182,7 @@ def _ring(place: FloatArray, m: RangeBearingMeasurement, R: FloatArray) -> tuple
     return poses, np.repeat(cov[None], _RING, axis=0)
 
 
-def _residuals(poses: FloatArray, place: FloatArray, m: RangeBearingMeasurement) -> tuple[FloatArray, FloatArray]:
+def _residuals(poses: FloatArray, place: FloatArray, m: PointMeasurement) -> tuple[FloatArray, FloatArray]:
     """Measured minus predicted bearing and range ``(n, 2)``, and the prediction's Jacobian ``(n, 2, 3)``."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = place[0] - poses[:, 0], place[1] - poses[:, 1]

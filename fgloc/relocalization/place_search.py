@@ -13,16 +13,15 @@ from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, Pos
 from fgloc.relocalization.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     LandmarkMap,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
+    PixelMeasurement,
+    PointMeasurement,
     PoseMeasurement,
-    RangeBearingMeasurement,
 )
 
-_RESIDUALS = {CornerMeasurement: 8, MarkerPoseMeasurement: 3, RangeBearingMeasurement: 2}
 _LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
 _CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
@@ -84,7 +83,7 @@ class PlaceSearch:
             m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
         few = self._map is not None and len(self._map) < _CHECKABLE
-        if few or not all(isinstance(m, RangeBearingMeasurement) for m in agreeing):
+        if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
             return True
         for landmark_id in best.agreeing:
             fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id], _ITERATIONS)
@@ -114,7 +113,7 @@ class PlaceSearch:
         contributing = {
             i for i, information in information_of.items() if information > _LEAST_SHARE * max(information_of.values())
         }
-        residuals = {m.landmark_id: _residuals(m) for m in agreeing if m.landmark_id in contributing}
+        residuals = {m.landmark_id: m.dof for m in agreeing if m.landmark_id in contributing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         outliers = [m for m in sightings if not any(m is other for other in agreeing)]
@@ -146,15 +145,15 @@ class PlaceSearch:
         for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
             yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
         sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
-        whole = [m for m in sightings if not isinstance(m, RangeBearingMeasurement)]  # that give a place each
+        whole = [m for m in sightings if not isinstance(m, PointMeasurement)]  # that give a place each
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
-        for m in [*seeds, *(m for m in sightings if isinstance(m, RangeBearingMeasurement))]:
+        for m in [*seeds, *(m for m in sightings if isinstance(m, PointMeasurement))]:
             landmark = self._map.landmarks[m.landmark_id]
-            if isinstance(m, CornerMeasurement):
+            if isinstance(m, PixelMeasurement):
                 yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
-            elif isinstance(m, MarkerPoseMeasurement):
+            elif isinstance(m, FrameMeasurement):
                 yield se2.compose(landmark.planar, se2.inverse(m.pose))
-            elif isinstance(m, RangeBearingMeasurement):
+            elif isinstance(m, PointMeasurement):
                 points.append((landmark.position[:2], m.range_m, m.bearing_rad))
         yield from candidates_from_points(points)
 
@@ -173,10 +172,6 @@ def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
     return bool(stamps) and by_sensors and max(stamps) - min(stamps) > _LASTING * window_ns
 
 
-def _residuals(m: LandmarkMeasurement) -> int:
-    return len(m.cov) if isinstance(m, PoseMeasurement) else _RESIDUALS[type(m)]
-
-
 def _information(m: LandmarkMeasurement) -> float:
     """What a sighting weighs, in comparison with others of its kind."""
-    return 1.0 / (m.sigma_px**2 if isinstance(m, CornerMeasurement) else float(np.trace(m.cov[:2, :2])))
+    return 1.0 / (m.sigma_px**2 if isinstance(m, PixelMeasurement) else float(np.trace(m.cov[:2, :2])))

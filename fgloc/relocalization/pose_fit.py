@@ -17,7 +17,7 @@ from fgloc.graph.linearized import Stacked
 from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
 from fgloc.stats import chi2_bound
-from fgloc.types import CornerMeasurement, FloatArray, IntArray, LandmarkMeasurement, PoseMeasurement
+from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
 _GAUSS_NEWTON_STEPS = 4
 _BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
@@ -65,7 +65,7 @@ class PoseFit:
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
-        self._k = np.array([cauchy_k(m, config) for m in sightings])
+        self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray, iterations: int) -> Fit | None:
@@ -132,11 +132,9 @@ def sighting_costs(
     return PoseFit(sightings, factors, config).costs(pose)
 
 
-def cauchy_k(m: LandmarkMeasurement, config: Config) -> float:
-    """Cauchy constant of a sighting of this kind, in units of its sigma."""
-    if isinstance(m, PoseMeasurement):
-        return m.cauchy_k
-    return (config.markers if isinstance(m, CornerMeasurement) else config.landmarks).cauchy_k
+def cauchy_k(m: LandmarkMeasurement) -> float:
+    """Cauchy constant of a sighting in a fit, in units of its sigma."""
+    return m.cauchy_k
 
 
 def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:

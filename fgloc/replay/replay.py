@@ -13,18 +13,8 @@ from fgloc.recording.reader import Recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.replay.options import EventFilter, Progress, RunOptions
 from fgloc.sensors.markers.detector import Detector, detect_stream
-from fgloc.types import (
-    CornersEvent,
-    Decision,
-    Estimate,
-    Event,
-    ImageEvent,
-    SensorEvent,
-    SightingsEvent,
-    Step,
-    TopicTimes,
-    TruthEvent,
-)
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.types import Decision, Estimate, Event, SensorEvent, SightingsEvent, Step, TopicTimes, TruthEvent
 
 
 class Replay:

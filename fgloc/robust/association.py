@@ -12,14 +12,14 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.relocalization.pose_fit import Fit, cauchy_k, joint_fit
+from fgloc.relocalization.pose_fit import Fit, joint_fit
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
-    CornerMeasurement,
     Decision,
     LandmarkMeasurement,
+    PixelMeasurement,
     PoseMeasurement,
 )
 
@@ -62,7 +62,7 @@ class Association:
         measurements, judged = self._sensors.revise(measurements, judged, predicted, self._judge)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
-            sighting = self._factors.sighting(k, m, cauchy_k(m, self._config), alone)
+            sighting = self._factors.sighting(k, m, m.cauchy_k, alone)
             reason = "quarantined" if self.modes.excludes(m.landmark_id) else gate
             if reason:
                 rejected.append(sighting)
@@ -108,7 +108,7 @@ class Association:
         rows = [i for i, d in enumerate(decisions) if d.reason]
         for i, misread in zip(rows, rejected, strict=True):
             m = misread.measurement
-            if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, CornerMeasurement):
+            if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, PixelMeasurement):
                 continue
             fits = []
             for other in self._factors.lookalikes(m, predicted.pose):
@@ -132,7 +132,7 @@ class Association:
                 (
                     misread,
                     sighting,
-                    Decision(k, stamp_ns, "corners", other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
+                    Decision(k, stamp_ns, kind_of(m), other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
                 )
             )
         self.rejections += Counter()  # drops the zeros
@@ -219,7 +219,7 @@ class Association:
         known = predicted.installation or self._factors.estimated
         seen = [measurements[i] for i in rows]
         together = correct(predicted, known, seen, self._factors)
-        dof = sum(8 if isinstance(m, CornerMeasurement) else len(m.cov) for m in seen)
+        dof = sum(m.dof for m in seen)
         return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
 
     def _agreeing_with(
@@ -256,7 +256,7 @@ class Association:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
         correlation_s = self._config.landmarks.repeat_s
         last = self._last_used_ns.get(m.landmark_id)
-        if correlation_s == 0.0 or last is None or isinstance(m, CornerMeasurement | PoseMeasurement):
+        if correlation_s == 0.0 or last is None or isinstance(m, PixelMeasurement | PoseMeasurement):
             return m, 1.0
         apart = max((m.stamp_ns - last) * 1e-9, 0.01)
         scale = max(1.0, correlation_s / apart)

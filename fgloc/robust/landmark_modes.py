@@ -27,7 +27,7 @@ from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
 from fgloc.graph.observation import Observations
 from fgloc.stats import chi2_bound
-from fgloc.types import CornerMeasurement, FloatArray, LandmarkMeasurement, MotionMeasurement, PoseMeasurement
+from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
 _MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
 ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
@@ -240,7 +240,7 @@ class LandmarkModes:
     def _shared(self, m: LandmarkMeasurement) -> float:
         """Scale on the sigma of a rejected sighting, as errors of one landmark are correlated for some time."""
         last = self._last_ns.get(m.landmark_id)
-        if last is None or isinstance(m, CornerMeasurement):
+        if last is None or isinstance(m, PixelMeasurement):
             return 1.0
         return math.sqrt(max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 1e-3)))
 

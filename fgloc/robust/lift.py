@@ -118,7 +118,7 @@ class _RiseTest:
 
     def test(self, step: Step, carried: bool) -> tuple[float, float]:
         """Squared ratio of rise and standard deviation of the least likely window, and its bound."""
-        new = [e for e in step.imu if max(self._newest_ns, step.start_ns) < e.stamp_ns <= step.stamp_ns]
+        new = [e for e in step.inertial if max(self._newest_ns, step.start_ns) < e.stamp_ns <= step.stamp_ns]
         forces = [float(np.linalg.norm(e.linear_acceleration)) for e in new]
         if not new or not all(map(math.isfinite, forces)) or max(forces) == 0.0:  # 0: there is no accelerometer
             self._samples.clear()
@@ -173,7 +173,7 @@ class _TurnTest:
 
 def _told_to_stand(step: Step) -> bool:
     """Whether all commands of the last second are zero, and there are some."""
-    recent = [c for c in step.commands if c.stamp_ns >= step.start_ns - _STANDS_NS]
+    recent = [c for c in step.controls if c.stamp_ns >= step.start_ns - _STANDS_NS]
     return bool(recent) and all(c.v == 0.0 and c.omega == 0.0 for c in recent)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +12,13 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
+from fgloc.sensors import registry
+from fgloc.sensors.base import Turn
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro.rate import Turn
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
-_SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 
 
@@ -58,7 +59,7 @@ class MotionSources:
 
     @property
     def _learned_has_gyro(self) -> bool:
-        return self._learned is not None and "gyro" in self._learned.model.card.inputs
+        return self._learned is not None and self._learned.model.card.reads_gyro
 
     def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
         """Ask every source once.
@@ -72,11 +73,7 @@ class MotionSources:
             return MotionReadings()
         wheels = self._wheels.measure(step)
         if wheels is not None:
-            change = None
-            if not self.factors.installation.index.keys().isdisjoint(("wheels.time_offset_s", "wheels.delay_s")):
-                start, end = self._wheels.twist(step, step.start_ns), self._wheels.twist(step, step.stamp_ns)
-                change = end - se2.adjoint(se2.inverse(wheels.motion)) @ start
-            wheels = self._installed(wheels, change=change)
+            wheels = self._installed(wheels, self._wheels.derivatives(step, wheels, self.factors.installation.index))
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
@@ -84,8 +81,9 @@ class MotionSources:
             turn = self.gyro.measure(step, None if wheels is None or _is_commanded_to_move(step) else motion, untold_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
-                gyro = MotionMeasurement("gyro", step.start_ns, step.stamp_ns, with_yaw(motion, turn.yaw), cov)
-                gyro = self._installed(gyro, turn)
+                name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
+                gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
+                gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
         readings = MotionReadings(wheels, self._with_drift(self._measure_learned(step, velocity), step), gyro)
         if readings.wheels is not None or readings.learned is not None:
@@ -96,46 +94,16 @@ class MotionSources:
         """The learned motion with the drift of the gyro that it reads, where no fix tells the yaw by itself."""
         if learned is None or self._turn is None or not self._learned_has_gyro or self._untold_s == 0.0:
             return learned
-        drift = max(self._turn.variance - self._config.gyro.yaw_per_sqrt_s**2 * step.dt, 0.0)
+        drift = max(self._turn.variance - self._turn.noise, 0.0)
         return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
 
-    def _installed(
-        self, m: MotionMeasurement, turn: Turn | None = None, change: FloatArray | None = None
-    ) -> MotionMeasurement:
-        """The motion with the installation as it is known now, and its derivatives by it.
-
-        Args:
-            m: as it is reported.
-            turn: the gyro's, if the motion is made of it.
-            change: ``(3,)`` of the wheels' twist over the step: by it a wrong clock shows.
-
-        Sources: Deray, Sola, Andrade-Cetto 2019, "Joint on-manifold self-calibration of odometry model and sensor
-        extrinsics using pre-integration" (differential drive); the right Jacobian of SE(2) to first order.
-        """
-        rho_x, rho_y, phi = se2.log(m.motion)
-        by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
-        derivatives: dict[str, FloatArray] = {}
-        if m.source == "wheels":
-            derivatives["wheels.radius"] = np.array([rho_x, rho_y, phi])
-            derivatives["wheels.track"] = -phi * by_turn
-            derivatives["wheels.yaw_per_m"] = rho_x * by_turn
-            derivatives["wheels.slowdown"] = self._by_slowdown(m, rho_x, phi)
-            if change is not None:
-                derivatives["wheels.time_offset_s"], derivatives["wheels.delay_s"] = change, -change
-        if m.source == "learned":
-            derivatives["learned.scale"] = np.array([rho_x, rho_y, 0.0])
-        if turn is not None:
-            derivatives["gyro.scale"] = phi * by_turn
+    def _installed(self, m: MotionMeasurement, *derivatives: Mapping[str, FloatArray]) -> MotionMeasurement:
+        """The motion as reported with the installation as it is known now; its derivatives are those of the sensors."""
         index, mean = self.factors.installation.index, self.factors.estimated.mean
-        kept = {name: (d, float(mean[index[name]])) for name, d in derivatives.items() if name in index}
+        by = {name: d for each in derivatives for name, d in each.items()}
+        kept = {name: (d, float(mean[index[name]])) for name, d in by.items() if name in index}
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
-
-    def _by_slowdown(self, m: MotionMeasurement, rho_x: float, phi: float) -> FloatArray:
-        """Derivative of the wheels' motion by ``slowdown``: it takes from the speed by the turning that is reported."""
-        wheels, seconds = self._config.wheels, max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-        commanded = abs(phi) / seconds / wheels.scale_omega
-        return np.array([-commanded * rho_x / max(1.0 - wheels.slowdown * commanded, _SLOWEST), 0.0, 0.0])
 
     def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
         """The readings with the learned motion evaluated at a better velocity."""
@@ -144,13 +112,11 @@ class MotionSources:
     def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
         if self._learned is None:
             return None
-        m = self._learned.measure(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        m = self._learned.measure_scaled(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
         if m is None:
             return None
-        scale = self._config.motion.scale
-        if scale != 1.0:
-            m = replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
-        return self._installed(m, self._turn if self._learned_has_gyro else None)
+        by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
+        return self._installed(m, self._learned.derivatives(m.motion), *by_turn)
 
     def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
         """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
@@ -200,4 +166,4 @@ class MotionSources:
 def _is_commanded_to_move(step: Step) -> bool:
     """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
     since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.commands)
+    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.controls)

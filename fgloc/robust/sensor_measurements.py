@@ -8,15 +8,8 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.innovation_bias import InnovationBias
-from fgloc.types import (
-    CornerMeasurement,
-    LandmarkMeasurement,
-    MarkerPoseMeasurement,
-    PoseMeasurement,
-    RangeBearingMeasurement,
-)
-
-KINDS = {CornerMeasurement: "corners", RangeBearingMeasurement: "range_bearing", MarkerPoseMeasurement: "marker_pose"}
+from fgloc.sensors import registry
+from fgloc.types import LandmarkMeasurement, PoseMeasurement
 
 Judged = list[tuple[float, int, str]]
 """Of each measurement: NIS, degrees of freedom, and why it is rejected ("" if it is not)."""
@@ -82,7 +75,7 @@ def _explained_otherwise(
 def kind_of(m: LandmarkMeasurement) -> str:
     """Of a measurement's row in ``steps.csv``: of a registered sensor with the number of what it measured."""
     if not isinstance(m, PoseMeasurement):
-        return KINDS[type(m)]
+        return registry.kind_of(type(m))
     return m.source if m.target < 0 else f"{m.source}.{m.target}"
 
 

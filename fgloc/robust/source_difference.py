@@ -11,17 +11,6 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
-_OF_MOTION = (
-    "wheels.radius",
-    "wheels.track",
-    "wheels.yaw_per_m",
-    "wheels.slowdown",
-    "wheels.delay_s",
-    "learned.scale",
-    "gyro.scale",
-    "wheels.time_offset_s",
-)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Difference:
@@ -66,7 +55,7 @@ def source_difference(readings: MotionReadings, sources: MotionSources) -> Diffe
 def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFactors) -> tuple[FloatArray, FloatArray]:
     """Derivative ``(3, p)`` of ``b`` less ``a`` by the parameters of the sources, and their covariance."""
     index = factors.installation.index
-    names = [name for name in _OF_MOTION if name in index]
+    names = sorted({**a.depends_on, **b.depends_on}, key=_is_clock)
     D = np.zeros((3, len(names)))
     for i, name in enumerate(names):
         for m, sign in ((a, -1.0), (b, 1.0)):
@@ -74,3 +63,7 @@ def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFac
                 D[:, i] += sign * m.depends_on[name][0]
     rows = [index[name] for name in names]
     return D, factors.estimated.cov[np.ix_(rows, rows)]
+
+
+def _is_clock(parameter: str) -> bool:
+    return parameter.endswith(".time_offset_s")

@@ -7,21 +7,30 @@ docs/adding-a-sensor.md goes through one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from enum import IntEnum, StrEnum
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
 
-from fgloc.config import Config, GateConfig, Section
-from fgloc.types import FloatArray, LandmarkMap, PoseMeasurement, SensorEvent
+from fgloc.sensors.field_checks import FieldChecks
+from fgloc.sensors.topic_checks import Collector, TimingOnly
+from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement, Setting
+
+if TYPE_CHECKING:
+    from fgloc.config import Config, GateConfig, Section
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
 
-Converter = Callable[[Any, When], SensorEvent]
+Converter = Callable[[Any, When], Event]
 """From a decoded message (fields as the message definition names them) to an event."""
 
-Check = Callable[[Any, GateConfig], SensorEvent | str]
+Check = Callable[[Any, "GateConfig"], Event | str]
 """Validates an event: the event, a repaired copy, or in one word why it is rejected."""
+
+Validator = Callable[[FieldChecks], Callable[[Any], Event | str]]
+"""Makes a `Check` for one run that counts the parts it rejects, or tells the user what it assumed."""
 
 
 class Stream(NamedTuple):
@@ -33,16 +42,157 @@ class Stream(NamedTuple):
         converters: by message type, ``"sensor_msgs/msg/Range"``.
         usual_names: topics that are taken without asking where several have such a type.
         keyframe: whether each event gets a pose of its own; otherwise it is moved to the next pose by the wheels, which
-            costs nothing within ``keyframes.max_interval_s`` unless they slip.
+            costs nothing within ``keyframes.max_interval_s`` unless they slip. Events of motion never get one.
         check: see `Check`. Stamps are checked for every sensor alike.
+        validator: takes the place of the check where a run's counts and notes are needed.
+        findings: what looks wrong with the topic of a recording, for ``fgloc info``.
     """
 
     role: str
-    event: type[SensorEvent]
+    event: type[Event]
     converters: Mapping[str, Converter]
     usual_names: tuple[str, ...]
-    keyframe: bool
-    check: Check
+    keyframe: bool = False
+    check: Check | None = None
+    validator: Validator | None = None
+    findings: Callable[[], Collector] = TimingOnly
+
+    def validate(self, checks: FieldChecks) -> Callable[[Any], Event | str]:
+        """What judges the events of one run."""
+        if self.validator is not None:
+            return self.validator(checks)
+        check = self.check
+        return _unchecked if check is None else partial(_checked, check, checks.config)
+
+
+def _unchecked(event: Event) -> Event | str:
+    return event
+
+
+def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
+    return check(event, config)
+
+
+class Joined(Protocol):
+    """One topic without a jump where a piece of the recording was cut out."""
+
+    def join(self, event: Event, shift: int) -> Event:
+        """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """How far the robot turned over a step.
+
+    Attributes:
+        yaw: [rad], rid of the bias.
+        variance: [rad²], of the noise and of what the bias may be off.
+        noise: [rad²], of the noise alone.
+    """
+
+    yaw: float
+    variance: float
+    noise: float = 0.0
+
+
+class MotionRole(StrEnum):
+    """What a motion source is to the others."""
+
+    ODOMETER = "odometer"  # always there, and what others are compared to
+    MODEL = "model"  # predicts the motion from control inputs
+    RATE = "rate"  # measures the turn alone
+
+
+class Rank(IntEnum):
+    """Where a parameter of the installation stands in the state."""
+
+    GAIN = 0
+    CLOCK = 1
+    MODEL = 2
+
+
+class Parameter(NamedTuple):
+    """A parameter of the installation that motions depend on.
+
+    Attributes:
+        name: ``sensor.parameter``.
+        sigma: of the prior; 0: it is exact.
+        rank: its place among the parameters of all sensors.
+    """
+
+    name: str
+    sigma: float
+    rank: Rank = Rank.GAIN
+
+
+class FoundRow(NamedTuple):
+    """A value of ``metrics.json`` that a parameter makes: ``at + gain * parameter``."""
+
+    name: str
+    parameter: str
+    at: float
+    gain: float
+
+
+class InstallationState(Protocol):
+    """What a run has found of the installation."""
+
+    def value(self, name: str) -> float:
+        """Of a parameter; 0 if it is no state."""
+
+    def setting(self, name: str, given: float, found: float, gains: Mapping[str, float]) -> Iterator[Setting]:
+        """A setting that depends on parameters with these derivatives; none if it depends on no state."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionInstallation:
+    """The parameters of one motion source.
+
+    Attributes:
+        parameters: with their priors, from all settings and the roles that there are.
+        found: rows of ``metrics.json``, from all settings.
+        settings: the lines of ``robot.yaml`` that a run makes of what it found.
+        sigmas: the setting that takes the sigma of another one back, by that one.
+    """
+
+    parameters: Callable[[Config, Collection[MotionRole]], tuple[Parameter, ...]]
+    found: Callable[[Config], tuple[FoundRow, ...]]
+    settings: Callable[[InstallationState, Config], Iterator[Setting]]
+    sigmas: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltIn:
+    """What a sensor of fgloc itself brings: as much of `Sensor` as it shares with those of other packages.
+
+    Attributes:
+        name: of its rows in ``steps.csv``, and in the counts.
+        streams: what it reads.
+        title: in sentences; "": its name.
+        role: as a motion source; None: it is none.
+        installation: what it is off by; of a motion source.
+        failing_as: by what name failures call it; "": by its own.
+        failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
+        carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
+            its streams is changed. None: nothing is special about it.
+        measures: from a `fgloc.sensors.landmarks.SightingContext` to what makes measurements of its events; None: it
+            sees no landmarks.
+        measured: classes of measurements that have its name in ``steps.csv``.
+        joined: makes its events count on across a piece of the recording that was cut out; None: they count nothing.
+    """
+
+    name: str
+    streams: tuple[Stream, ...] = ()
+    title: str = ""
+    role: MotionRole | None = None
+    installation: MotionInstallation | None = None
+    failing_as: str = ""
+    failures: Callable[[], tuple[type[Any], ...]] = tuple
+    carried: Callable[[Any], Callable[[Event], Event]] | None = None
+    joined: Callable[[], Joined] | None = None
+    measures: Callable[[Any], Callable[[Any], Iterator[LandmarkSighting]]] | None = None
+    measured: tuple[type[LandmarkSighting], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +221,7 @@ class Sensor(Protocol):
         name: key of ``robot.yaml`` and name of the entry point.
         Config: the section under that key. All its values need defaults.
         streams: what it reads.
-        failures: subclasses of `fgloc.ablation.failures.base.Failure`, for ``fgloc ablate``.
+        failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         notes: what the user should know, one sentence each.
     """
 

@@ -10,10 +10,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.types import (
-    CornerMeasurement,
     FloatArray,
+    FrameMeasurement,
     LandmarkMeasurement,
-    MarkerPoseMeasurement,
+    PixelMeasurement,
     PoseMeasurement,
     Step,
 )
@@ -34,7 +34,7 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         moved = se2.compose_cov(cov, m.T_keyframe_then, known)
         return dataclasses.replace(m, T_keyframe_then=se2.compose(motion, m.T_keyframe_then), motion_cov=moved)
     ad = se2.adjoint(motion)
-    if isinstance(m, CornerMeasurement):
+    if isinstance(m, PixelMeasurement):
         x, y, yaw = motion
         T = np.eye(4)
         T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
@@ -42,7 +42,7 @@ def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> Landma
         camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
         spread = cov if m.motion_cov is None else cov + m.motion_cov
         return dataclasses.replace(m, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ m.twist)
-    if isinstance(m, MarkerPoseMeasurement):
+    if isinstance(m, FrameMeasurement):
         pose = se2.compose(motion, m.pose)
         return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
     x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
@@ -89,11 +89,11 @@ class MotionCompensation:
             twist = self.twist(step, exposure_ns)
             late: list[LandmarkMeasurement] = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
             late = [
-                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, CornerMeasurement) else m for m in late
+                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
             ]
             if exposure_ns != step.stamp_ns:
                 motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)
-                if self._gyro is not None and step.imu and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
+                if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
                     motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
                 late = [carry(m, motion, cov) for m in late]
             measured.extend(late)
@@ -108,14 +108,14 @@ class MotionCompensation:
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
         """``T_keyframe_then`` for another time, with its covariance."""
         motion, cov = self._wheels.carry(step, step.stamp_ns, at_ns)
-        if self._gyro is not None and step.imu and abs(at_ns - step.stamp_ns) < _SHORT_NS:
-            turned = self._gyro.rates_at(step.imu, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
+        if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
+            turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
             motion = np.array([*motion[:2], turned])
         return motion, cov
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Of the base at a time near the step's end."""
         twist = self._wheels.twist(step, at_ns)
-        if self._gyro is not None and step.imu:
-            twist[2] = self._gyro.rates_at(step.imu, (at_ns,))[0]
+        if self._gyro is not None and step.inertial:
+            twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]
         return twist

@@ -1,40 +1,197 @@
-"""The sensors that are installed beside the built-in ones, by role and by event."""
+"""All sensors, the built-in ones and those of installed packages, by role and by event."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fgloc.extensions import outside_sensors
-from fgloc.sensors.base import Context, Converter, Sensor, Stream
-from fgloc.types import Event
+from fgloc.files.section import Section
+from fgloc.sensors.base import (
+    BuiltIn,
+    Context,
+    Converter,
+    Joined,
+    MotionInstallation,
+    MotionRole,
+    Parameter,
+    Sensor,
+    Stream,
+)
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.learned.config import MotionConfig, shipped_name
+from fgloc.sensors.markers.config import MarkersConfig
+from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.types import Event, LandmarkSighting
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+    from fgloc.sensors.failures import Carriage
+    from fgloc.sensors.landmarks import SightingContext
+
+__all__ = ["SensorSections", "built_in", "shipped_name"]
+
+
+class SensorSections(Section):
+    """Settings of the built-in sensors, by their keys of ``robot.yaml``: one line each."""
+
+    wheels: WheelsConfig = WheelsConfig()
+    gyro: GyroConfig = GyroConfig()
+    camera: CameraConfig = CameraConfig()
+    markers: MarkersConfig = MarkersConfig()
+    landmarks: LandmarksConfig = LandmarksConfig()
+    motion: MotionConfig = MotionConfig()
+
+
+@cache
+def built_in() -> tuple[BuiltIn, ...]:
+    """The built-in sensors: one line each."""
+    from fgloc.sensors.commands import COMMANDS
+    from fgloc.sensors.gyro.sensor import GYRO
+    from fgloc.sensors.learned.sensor import LEARNED
+    from fgloc.sensors.marker_pose.sensor import MARKER_POSE
+    from fgloc.sensors.markers.sensor import MARKERS
+    from fgloc.sensors.range_bearing.sensor import RANGE_BEARING
+    from fgloc.sensors.wheels.sensor import WHEELS
+
+    return (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
 
 
 def sensors() -> tuple[type[Sensor], ...]:
-    """All registered sensors.
+    """The sensors of installed packages.
 
     Raises:
-        ConfigError: an installed one cannot be used.
+        ConfigError: one cannot be used.
     """
     return outside_sensors()
 
 
-def streams() -> Mapping[str, Stream]:
-    """Their streams, by role."""
-    return {stream.role: stream for sensor in sensors() for stream in sensor.streams}
+def streams() -> tuple[Stream, ...]:
+    """Streams of all sensors, the built-in ones first."""
+    return _streams(sensors())
+
+
+@cache
+def _streams(outside: tuple[type[Sensor], ...]) -> tuple[Stream, ...]:
+    own = [stream for sensor in built_in() for stream in sensor.streams]
+    return (*own, *(stream for sensor in outside for stream in sensor.streams))
+
+
+@cache
+def _role_by_class(outside: tuple[type[Sensor], ...]) -> dict[type[Event], str]:
+    return {stream.event: stream.role for stream in _streams(outside)}
+
+
+def streams_of(role: str) -> tuple[Stream, ...]:
+    """Streams that a role may have: for each class of events one."""
+    return tuple(stream for stream in streams() if stream.role == role)
 
 
 def converters(role: str) -> Mapping[str, Converter]:
-    """Converters of a registered role, by message type; empty if it is none."""
-    stream = streams().get(role)
-    return {} if stream is None else stream.converters
+    """Converters of a role, by message type; empty if no sensor has it."""
+    return {kind: converter for stream in streams_of(role) for kind, converter in stream.converters.items()}
+
+
+def usual_names(role: str) -> tuple[str, ...]:
+    """Topics that are taken for a role without asking."""
+    return tuple(name for stream in streams_of(role) for name in stream.usual_names)
 
 
 def role_of_event(event: Event) -> str | None:
-    """Role of a registered sensor's event; None if it is of none."""
-    return next((role for role, stream in streams().items() if isinstance(event, stream.event)), None)
+    """Role of a sensor's event; None if it is of none."""
+    return _role_by_class(sensors()).get(type(event))
+
+
+def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
+    """Classes of events by the name that failures have for their sensor."""
+    found: dict[str, tuple[type[Event], ...]] = {}
+    for sensor in built_in():
+        name = sensor.failing_as or sensor.name
+        found[name] = (*found.get(name, ()), *(stream.event for stream in sensor.streams))
+    return found | {s.name: tuple(stream.event for stream in s.streams) for s in sensors()}
+
+
+def failures() -> tuple[type[Section], ...]:
+    """Failures of all sensors."""
+    return tuple(
+        failure for own in (*(s.failures() for s in built_in()), *(s.failures for s in sensors())) for failure in own
+    )
+
+
+def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
+    """What becomes of the events of a robot that is carried, by class; those of other classes are left as they are."""
+    made: dict[type[Event], Callable[[Event], Event]] = {}
+    for sensor in built_in():
+        if sensor.carried is not None:
+            made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.carried(carriage))
+    return made
+
+
+class MotionNames(NamedTuple):
+    """Names of the motion sources: of their measurements, in ``steps.csv``, of their sections of the installation."""
+
+    odometer: str
+    model: str
+    rate: str
+
+
+@cache
+def motion_names() -> MotionNames:
+    """Which sensor has which role as a motion source."""
+    names = {sensor.role: sensor.name for sensor in built_in() if sensor.role is not None}
+    return MotionNames(*(names[role] for role in MotionRole))
+
+
+def title_of(name: str) -> str:
+    """Of a sensor, in sentences."""
+    return next((sensor.title for sensor in built_in() if sensor.name == name and sensor.title), name)
+
+
+def motion_installations() -> tuple[MotionInstallation, ...]:
+    """What the motion sources are off by: odometer, rate sensor, model."""
+    order = (MotionRole.ODOMETER, MotionRole.RATE, MotionRole.MODEL)
+    by_role = {sensor.role: sensor.installation for sensor in built_in()}
+    return tuple(made for role in order if (made := by_role[role]) is not None)
+
+
+def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+    """Parameters of the motion sources in the order in which they stand in the state."""
+    made = [p for installation in motion_installations() for p in installation.parameters(config, roles)]
+    return tuple(sorted(made, key=lambda p: p.rank))
+
+
+def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:
+    """What makes measurements of the sightings of one run, by class of event."""
+    made: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = {}
+    for sensor in built_in():
+        if sensor.measures is not None:
+            made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.measures(context))
+    return made
+
+
+def kind_of(measured: type[LandmarkSighting]) -> str:
+    """Name of a landmark measurement in ``steps.csv``: that of the sensor whose it is."""
+    return _kinds()[measured]
+
+
+@cache
+def _kinds() -> dict[type, str]:
+    return {measured: sensor.name for sensor in built_in() for measured in sensor.measured}
+
+
+def landmark_kinds() -> tuple[str, ...]:
+    """Names of all landmark measurements."""
+    return tuple(sensor.name for sensor in built_in() if sensor.measured)
+
+
+def joiner_of(event: Event) -> Callable[[], Joined] | None:
+    """What joins the events of a topic on to those before a cut; None if they count nothing."""
+    return next((s.joined for s in built_in() if any(type(event) is stream.event for stream in s.streams)), None)
 
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:
-    """The sensors of one run, of those that have a context."""
+    """The sensors of installed packages for one run, of those that have a context."""
     built = (s.build(context_of[s.name]) for s in sensors() if s.name in context_of)
     return tuple(sensor for sensor in built if sensor is not None)

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fgloc
-from fgloc.config import GateConfig, load_config
+from fgloc.config import GateConfig, load_config, role_names
 from fgloc.errors import FglocError, ModelError
 from fgloc.files.documents import parse, plain
 from fgloc.intake.validation import EventValidator
-from fgloc.recording.decode import CONVERTERS
+from fgloc.recording.decode import converters_of
 from fgloc.recording.messages import default_typestore
 from fgloc.sensors.learned import load_model
 from tests.fuzz import zygote
@@ -28,7 +28,7 @@ from tests.fuzz.samples import SAMPLES, make_samples
 REGRESSIONS = Path(__file__).parent / "regressions"
 QUICK = settings(max_examples=25, deadline=2000, derandomize=True, suppress_health_check=list(HealthCheck))
 STORE = default_typestore()
-ROLES = [(role, kind) for role, kinds in CONVERTERS.items() for kind in kinds]
+ROLES = [(role, kind) for role in role_names() for kind in converters_of(role)]
 
 YAML = st.text(alphabet="abc019:-[]{}&*!|>%#'\"\n\t ,.<?eE+_~\\\0é", max_size=60) | st.lists(
     st.sampled_from(
@@ -117,7 +117,7 @@ def test_absurd_numbers_in_every_field_are_judged(role, kind):
             message = _filled(kind, data.draw)
             with np.errstate(all="ignore"):
                 try:
-                    event = CONVERTERS[role][kind](message, (1_700_000_000_000_000_000 + k, k, "/t"))
+                    event = converters_of(role)[kind](message, (1_700_000_000_000_000_000 + k, k, "/t"))
                 except (ValueError, OverflowError, TypeError):
                     return  # such a message is counted as one that cannot be decoded
             gate.check(event)

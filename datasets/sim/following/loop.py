@@ -34,7 +34,8 @@ from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.decode import events_of
-from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.types import Event, FloatArray
 
 PROCESSING_S = 0.03  # on one core: detection in 640 x 480 takes 15 ms, an update 6 ms (99 %: 10 ms)
 _RESTS_S = 0.5  # at the end

@@ -3,57 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from functools import reduce
+from operator import or_
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Failure, Scene
-from fgloc.ablation.failures.camera import Darkness, FrameRate, MirroredImage
 from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.ablation.failures.lift import Lift
-from fgloc.ablation.failures.messages import (
-    EncoderFrozen,
-    EncoderRollover,
-    ImuBias,
-    OdometryReset,
-    WheelNan,
-    WrongCovariance,
-)
 from fgloc.ablation.failures.sightings import DuplicatedId, MovedMarker, OccludedIds, SightingNoise, WrongIds
 from fgloc.ablation.failures.timing import ClockOffset, Dropout, DuplicatedMessages, Latency, Truncated
-from fgloc.ablation.failures.wheels import EncoderDead, EncoderQuantized, WheelScaleDrift, WheelSlip
+from fgloc.sensors import registry
+from fgloc.sensors.failures import Failure, Scene
 from fgloc.types import Event
 
-BuiltInFailure = (
-    Dropout
-    | Darkness
-    | FrameRate
-    | MirroredImage
-    | SightingNoise
-    | OccludedIds
-    | WrongIds
-    | DuplicatedId
-    | MovedMarker
-    | Latency
-    | ClockOffset
-    | DuplicatedMessages
-    | Truncated
-    | Kidnap
-    | Lift
-    | WheelSlip
-    | EncoderDead
-    | EncoderFrozen
-    | EncoderQuantized
-    | EncoderRollover
-    | WheelScaleDrift
-    | OdometryReset
-    | WheelNan
-    | WrongCovariance
-    | ImuBias
+_OF_ANY_SENSOR = (
+    Dropout,
+    SightingNoise,
+    OccludedIds,
+    WrongIds,
+    DuplicatedId,
+    MovedMarker,
+    Latency,
+    ClockOffset,
+    DuplicatedMessages,
+    Truncated,
+    Kidnap,
+    Lift,
 )
-AnyFailure = Annotated[BuiltInFailure, Field(discriminator="kind")]
-"""Any failure of a built-in sensor, by its ``kind``; a suite knows those of other packages' sensors too."""
+if TYPE_CHECKING:
+    AnyFailure = Failure
+else:
+    AnyFailure = Annotated[reduce(or_, (*_OF_ANY_SENSOR, *registry.failures())), Field(discriminator="kind")]
+    """Any failure by its ``kind``: those of any sensor, and those that the installed sensors bring."""
 
 
 def corrupt(
@@ -81,4 +64,4 @@ def generators(count: int, seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng([seed, index]) for index in range(count)]
 
 
-__all__ = ["AnyFailure", "BuiltInFailure", "Failure", "Scene", "corrupt", "generators"]
+__all__ = ["AnyFailure", "Failure", "Scene", "corrupt", "generators"]

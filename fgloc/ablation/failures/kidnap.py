@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
 from pydantic import model_validator
 
-from fgloc import se2
-from fgloc.ablation.failures.base import Failure, Scene, When, by_receipt
-from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
+from fgloc.sensors import registry
+from fgloc.sensors.base import Joined
+from fgloc.sensors.failures import Failure, Scene, When, by_receipt
+from fgloc.types import Event
 
 
 class Kidnap(Failure):
@@ -36,7 +35,7 @@ class Kidnap(Failure):
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The events that are left, in order of receipt."""
         cuts = _merged([(_ns(a), _ns(b)) for a, b in self.when.schedule(scene).intervals])
-        joints: dict[str, _Joined] = {}
+        joined: dict[str, Joined] = {}
 
         def kept() -> Iterator[tuple[int, Event]]:
             for event in events:
@@ -45,46 +44,14 @@ class Kidnap(Failure):
                 if shift is None:
                     self.touch(scene)
                     continue
-                if isinstance(event, JointsEvent | OdometryEvent):
-                    event = joints.setdefault(event.topic, _Joined()).join(event, shift)
+                if (joiner := registry.joiner_of(event)) is not None:
+                    event = joined.setdefault(event.topic, joiner()).join(event, shift)
                 now_ns = event.received_ns - _removed_until(cuts, received_ns)
                 if shift:
                     event = replace(event, stamp_ns=event.stamp_ns - shift, received_ns=event.received_ns - shift)
                 yield now_ns, event
 
         return by_receipt(kept())
-
-
-class _Joined:
-    """One topic of wheel angles or odometry poses without a jump at the cuts."""
-
-    def __init__(self) -> None:
-        self._shift = 0
-        self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
-        self._last: FloatArray | None = None  # as reported
-
-    def join(self, event: JointsEvent | OdometryEvent, shift: int) -> JointsEvent | OdometryEvent:
-        angles = isinstance(event, JointsEvent)
-        now = event.position if isinstance(event, JointsEvent) else _pose(event)
-        carried, self._shift = shift != self._shift, shift
-        if carried and self._last is not None and len(self._last) == len(now):
-            self._offset = self._last - now if angles else se2.compose(self._last, se2.inverse(now))
-        if self._offset is not None and len(self._offset) == len(now):
-            now = now + self._offset if angles else se2.compose(self._offset, now)
-            event = _told(event, now)
-        self._last = now
-        return event
-
-
-def _pose(event: OdometryEvent) -> FloatArray:
-    return np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
-
-
-def _told(event: JointsEvent | OdometryEvent, now: FloatArray) -> JointsEvent | OdometryEvent:
-    if isinstance(event, JointsEvent):
-        return replace(event, position=now)
-    position = np.array([now[0], now[1], event.position[2]])
-    return replace(event, position=position, orientation=yaw_quaternion(float(now[2])))
 
 
 def _ns(seconds: float) -> int:

@@ -10,20 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Change, EventFailure, Failure, Scene
 from fgloc.frames import rpy_matrix
-from fgloc.types import (
-    CornersEvent,
-    Event,
-    LandmarkMap,
-    MarkerCorners,
-    MarkerPose,
-    MarkerPosesEvent,
-    RangeBearing,
-    RangeBearingEvent,
-)
-
-Sighting = MarkerCorners | MarkerPose | RangeBearing
+from fgloc.sensors.failures import Change, EventFailure, Failure, Scene
+from fgloc.types import Event, LandmarkMap, Sighting, SightingsEvent
 
 
 class SightingFailure(EventFailure):
@@ -33,19 +22,19 @@ class SightingFailure(EventFailure):
 
     def targets(self) -> tuple[type[Event], ...]:
         """Sightings of all kinds."""
-        return (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
+        return (SightingsEvent,)
 
     def begin(self, scene: Scene) -> Change:
         """Apply `alter` to each sighting of a message."""
         alter = self.alter(scene)
 
         def change(event: Event) -> Event | None:
-            before: Any = event
-            after = tuple(s for s in map(alter, before.sightings) if s is not None)
-            same = len(after) == len(before.sightings) and all(
-                a is b for a, b in zip(after, before.sightings, strict=True)
+            assert isinstance(event, SightingsEvent)
+            after = tuple(s for s in map(alter, event.sightings) if s is not None)
+            same = len(after) == len(event.sightings) and all(
+                a is b for a, b in zip(after, event.sightings, strict=True)
             )
-            return event if same else replace(before, sightings=after)
+            return event if same else replace(event, sightings=after)
 
         return change
 
@@ -65,26 +54,8 @@ class SightingNoise(SightingFailure):
 
     def alter(self, scene: Scene) -> Callable[[Sighting], Sighting | None]:
         """Add the noise of the sighting's kind."""
-
-        def noisy(s: Sighting) -> Sighting:
-            rng = scene.rng
-            if isinstance(s, MarkerCorners):
-                if not self.corner_px:
-                    return s
-                return replace(s, corners_px=s.corners_px + rng.normal(0.0, self.corner_px, s.corners_px.shape))
-            if isinstance(s, MarkerPose):
-                if not self.position_m:
-                    return s
-                return replace(s, position=s.position + rng.normal(0.0, self.position_m, 3))
-            if not (self.range_m or self.bearing_rad):
-                return s
-            return replace(
-                s,
-                range_m=s.range_m + float(rng.normal(0.0, self.range_m)),
-                bearing_rad=s.bearing_rad + float(rng.normal(0.0, self.bearing_rad)),
-            )
-
-        return noisy
+        sigmas = {name: getattr(self, name) for name in ("corner_px", "range_m", "bearing_rad", "position_m")}
+        return lambda s: s.noisy(sigmas, scene.rng)
 
 
 class OccludedIds(SightingFailure):
@@ -99,7 +70,7 @@ class OccludedIds(SightingFailure):
         others = [i for i in scene.landmark_ids if i not in self.ids]
         order = scene.rng.permutation(len(others))  # drawn whole: a larger part holds the smaller one
         hidden = {*self.ids, *(others[k] for k in order[: round(self.part * len(others))])}
-        return lambda s: None if _id(s) in hidden else s
+        return lambda s: None if s.landmark_id in hidden else s
 
 
 class WrongIds(SightingFailure):
@@ -112,10 +83,10 @@ class WrongIds(SightingFailure):
         """Draw another id of the map."""
 
         def misread(s: Sighting) -> Sighting:
-            others = [i for i in scene.landmark_ids if i != _id(s)]
+            others = [i for i in scene.landmark_ids if i != s.landmark_id]
             if not others or scene.rng.uniform() >= self.probability:
                 return s
-            return _with_id(s, others[int(scene.rng.integers(len(others)))])
+            return replace(s, landmark_id=others[int(scene.rng.integers(len(others)))])
 
         return misread
 
@@ -135,7 +106,7 @@ class DuplicatedId(SightingFailure):
         renamed = self.other if self.other is not None else next((i for i in drawn if i != kept), None)
         if kept is None or renamed is None:
             return lambda s: s
-        return lambda s: _with_id(s, kept) if _id(s) == renamed else s
+        return lambda s: replace(s, landmark_id=kept) if s.landmark_id == renamed else s
 
 
 class MovedMarker(Failure):
@@ -170,13 +141,3 @@ class MovedMarker(Failure):
             moved[i] = replace(landmark, position=landmark.position - shift, rotation=rotation)
             self.touch(scene)
         return replace(landmark_map, landmarks=moved)
-
-
-def _id(sighting: Sighting) -> int:
-    return sighting.landmark_id if isinstance(sighting, RangeBearing) else sighting.marker_id
-
-
-def _with_id(sighting: Sighting, number: int) -> Sighting:
-    if isinstance(sighting, RangeBearing):
-        return replace(sighting, landmark_id=number)
-    return replace(sighting, marker_id=number)

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from fgloc.ablation.failures.base import Change, EventFailure, Failure, Scene, Sensor, by_receipt, events_of
+from fgloc.sensors.failures import Change, EventFailure, Failure, Scene, Sensor, by_receipt, events_of
 from fgloc.types import Event
 
 

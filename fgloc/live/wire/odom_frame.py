@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc.config import RecordingConfig
 from fgloc.frames import BASE_NAMES, quaternion_yaw
-from fgloc.types import Event, FloatArray, OdometryEvent, TransformEvent
+from fgloc.types import Event, FloatArray, MotionEvent, TransformEvent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +35,12 @@ class OdomFrame:
 
     def add(self, event: Event) -> None:
         """Take in any event."""
-        if isinstance(event, OdometryEvent):
-            pose = _planar(event.position, event.orientation)
+        if isinstance(event, MotionEvent):
+            if (told := event.odometer) is None:
+                return
             with self._lock:
-                self._child = event.child_frame_id.lstrip("/")
-                self._by_topic = OdomPose(event.stamp_ns, event.frame_id.lstrip("/") or "odom", pose)
+                self._child = event.base_frame_id.lstrip("/")
+                self._by_topic = OdomPose(event.stamp_ns, told.frame_id.lstrip("/") or "odom", told.pose)
         elif isinstance(event, TransformEvent):
             parent, child = event.parent.lstrip("/"), event.child.lstrip("/")
             with self._lock:

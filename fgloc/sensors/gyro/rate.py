@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import math
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fgloc.config import GyroConfig
-from fgloc.types import FloatArray, ImuEvent, Step
+from fgloc.sensors.base import Turn
+from fgloc.sensors.gyro import installation
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
@@ -20,19 +21,6 @@ _STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
 _GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
 _APART_S = 2.0  # ... and another one after at least this long
 _REST_M, _REST_RAD = 1e-3, 1e-3  # of wheel motion a second: quantization is no motion
-
-
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """How far the robot turned over a step.
-
-    Attributes:
-        yaw: [rad], rid of the bias.
-        variance: [rad²], of the noise and of what the bias may be off.
-    """
-
-    yaw: float
-    variance: float
 
 
 class Gyro:
@@ -87,7 +75,7 @@ class Gyro:
             None if the gyro was silent; once it has spoken, that is counted.
         """
         dt = step.dt
-        raw = None if dt <= 0.0 else self._integral(step.imu, step.start_ns, step.stamp_ns)
+        raw = None if dt <= 0.0 else self._integral(step.inertial, step.start_ns, step.stamp_ns)
         if raw is None:
             self._standing_s = 0.0
             if self._heard:
@@ -99,14 +87,18 @@ class Gyro:
         yaw = raw - self.bias * dt
         drift = self.bias_variance * ((since_fix_s + dt) ** 2 - since_fix_s**2)
         noise = self._config.yaw_per_sqrt_s**2 * dt
-        return Turn(yaw, noise + drift)
+        return Turn(yaw, noise + drift, noise)
 
-    def rates_at(self, events: tuple[ImuEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
+    def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
         """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
         times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
         rates = np.array([event.angular_velocity for event in events]) @ self._up
         at = np.array([(stamp - stamps_ns[0]) * 1e-9 for stamp in stamps_ns])
         return np.asarray(np.interp(at, times, rates) - self.bias)
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a motion whose turn is this gyro's, by what the gyro is off by."""
+        return installation.derivatives(motion)
 
     def turned(self, yaw: float, seconds: float) -> None:
         """The robot went on by a step over which `measure` gave this turn [rad]."""
@@ -152,7 +144,7 @@ class Gyro:
         self.bias_variance *= 1.0 - gain
         self._turned -= change * self._turned_s  # what was turned since the last fix, with the bias of now
 
-    def _integral(self, events: tuple[ImuEvent, ...], start_ns: int, end_ns: int) -> float | None:
+    def _integral(self, events: tuple[InertialEvent, ...], start_ns: int, end_ns: int) -> float | None:
         """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""
         if not events:
             return None

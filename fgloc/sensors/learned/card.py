@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from fgloc.config import NoiseDensity, Section
+from fgloc.config import Section
+from fgloc.sensors.wheels.config import NoiseDensity
 
 FORMAT = "fgloc-motion"
 VERSION = 1
@@ -175,6 +176,11 @@ class ModelCard(Section):
     def measured(self) -> tuple[str, ...]:
         """Inputs that sensors measure during the step, in the network's order."""
         return tuple(name for name in CHANNELS if name in self.inputs)
+
+    @property
+    def reads_gyro(self) -> bool:
+        """Whether the model reads the gyro: its motion then has the gyro's turn in it."""
+        return "gyro" in self.inputs
 
     @property
     def reads_wheels(self) -> bool:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 
 _FOREVER_S = 1e4  # a last command holds on; who asks decides for how long
 _MIN_CAPACITY = 4096
 
 
-class CommandTrack:
+class CommandHistory:
     """Zero-order hold over commands, integrated once so that any mean over time is two look-ups.
 
     Before the first command the robot is taken to be at rest.
     """
 
-    def __init__(self, commands: tuple[CommandEvent, ...], origin_ns: int | None = None) -> None:
+    def __init__(self, commands: tuple[ControlEvent, ...], origin_ns: int | None = None) -> None:
         """Integrate.
 
         Args:
@@ -36,7 +36,7 @@ class CommandTrack:
         np.cumsum(np.multiply([complex(c.v, c.omega) for c in commands[:-1]], steps), out=self._integrals[1:n])
         self._extend(())
 
-    def following(self, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+    def following(self, commands: tuple[ControlEvent, ...]) -> CommandHistory:
         """This track, extended by what is new in the next step's commands; a new one if they do not continue it."""
         last = self._events[-1]
         i = len(commands) - 1
@@ -45,7 +45,7 @@ class CommandTrack:
         first = len(self._events) - 1 - i  # our index of commands[0], if they are the same
         full = len(self._events) + len(commands) - i >= len(self._times)
         if i < 0 or first < 0 or self._events[first] is not commands[0] or full:
-            return CommandTrack(commands)
+            return CommandHistory(commands)
         self._extend(commands[i + 1 :])
         return self
 
@@ -66,7 +66,7 @@ class CommandTrack:
         """
         return np.asarray(np.diff(self.integrals(limits_s), axis=-2) / np.diff(limits_s)[..., None])
 
-    def _extend(self, events: tuple[CommandEvent, ...]) -> None:
+    def _extend(self, events: tuple[ControlEvent, ...]) -> None:
         """Append, then one more entry, overwritten by the next command: the last one holds.
 
         In plain floats: reading single elements of arrays would take most of the time.

@@ -8,11 +8,11 @@ import numpy as np
 
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import Kinematics, ModelCard
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
 from fgloc.sensors.learned.network import Answering, Float32Array
 from fgloc.sensors.learned.signals import Signal, Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.types import ControlEvent, FloatArray
 
 _MIN_DENSITY = 1e-8  # m²/s, m²/s, rad²/s: nobody knows motion better than this
 _MAX_LOG_VARIANCE = 10.0
@@ -44,11 +44,11 @@ class DisplacementModel:
         self._spread_gain = 2.0 * _DISAGREEMENT_S * np.array(card.variance_scale)
         self._n_bins = 2 * len(self._widths)
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
-        self._track: CommandTrack | None = None
+        self._track: CommandHistory | None = None
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -89,7 +89,7 @@ class DisplacementModel:
         np.log(variances + self._spread_gain * spread**2, out=pooled[:, 3:])
         return np.asarray(pooled)
 
-    def _inputs(self, track: CommandTrack, start: float, dt: float, n: int) -> tuple[FloatArray, Float32Array]:
+    def _inputs(self, track: CommandHistory, start: float, dt: float, n: int) -> tuple[FloatArray, Float32Array]:
         """By the commands, one row a sub-step: twists of the calibrated kinematics times dt ``(n, 3)``, inputs."""
         plan = self._plans.get(n)
         if plan is None:

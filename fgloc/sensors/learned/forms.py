@@ -14,13 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import Kinematics, ModelCard
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.signals import Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.types import ControlEvent, FloatArray
 
 _SMALL = 1e-9
 Triple = Sequence[float]  # of x, y and yaw
@@ -43,7 +43,7 @@ class MotionModel(Protocol):
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -67,7 +67,7 @@ class MotionModel(Protocol):
         ...
 
 
-def calibrated(kinematics: Kinematics, track: CommandTrack, limits: FloatArray) -> FloatArray:
+def calibrated(kinematics: Kinematics, track: CommandHistory, limits: FloatArray) -> FloatArray:
     """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
     return np.asarray(track.means(limits - kinematics.delay_s) @ gains(kinematics))
 
@@ -124,7 +124,7 @@ def joint_of(card: ModelCard) -> JointCalibration | None:
     return None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
 
 
-def duration_of(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) -> float:
+def duration_of(commands: tuple[ControlEvent, ...], start_ns: int, end_ns: int) -> float:
     """Length of the step [s]; raises `ModelError` if there is none, or no command."""
     if not commands:
         raise ModelError("no command to predict from; the step needs the last command at or before its start")
@@ -133,9 +133,9 @@ def duration_of(commands: tuple[CommandEvent, ...], start_ns: int, end_ns: int) 
     return (end_ns - start_ns) * 1e-9
 
 
-def follow(track: CommandTrack | None, commands: tuple[CommandEvent, ...]) -> CommandTrack:
+def follow(track: CommandHistory | None, commands: tuple[ControlEvent, ...]) -> CommandHistory:
     """The track of these commands, continued from the last step's where it can be."""
-    return CommandTrack(commands) if track is None else track.following(commands)
+    return CommandHistory(commands) if track is None else track.following(commands)
 
 
 def sub_steps(duration: float, longest_s: float) -> int:

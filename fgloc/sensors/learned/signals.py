@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 
 from fgloc.sensors.learned.card import ModelCard, WheelJoints
 from fgloc.sensors.wheels.encoders import wheel_names
-from fgloc.types import FloatArray, ImuEvent, JointsEvent, Step
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import FloatArray, InertialEvent, Step
 
 MAX_GAP_S = 0.25  # a signal that was silent for longer has a hole
-_E = TypeVar("_E", ImuEvent, JointsEvent)
-_FOREVER_S = 1e4  # the first and the last values hold on; who asks decides for how long
+_E = TypeVar("_E", InertialEvent, JointsEvent)
+_FOREVER_S = 1e4  # the first and the last values hold on; who asks decides whether to believe them
 
 
 class Signal:
@@ -102,7 +103,7 @@ class SignalReader:
         self._joints = card.joints
         self._back_ns = round((card.signal_edges_s[-1] + card.wheel_kinematics.delay_s) * 1e9)
         self._reached: tuple[int, int] | None = None
-        self._imu_events: list[ImuEvent] = []
+        self._imu_events: list[InertialEvent] = []
         self._joints_events: list[JointsEvent] = []
 
     def fork(self) -> SignalReader:
@@ -120,8 +121,8 @@ class SignalReader:
             self._joints_events.clear()
         self._reached = (step.segment, step.stamp_ns)
         oldest = step.start_ns - self._back_ns
-        _follow(self._imu_events, step.imu, oldest)
-        _follow(self._joints_events, step.joints, oldest)
+        _follow(self._imu_events, step.inertial, oldest)
+        _follow(self._joints_events, step.of(JointsEvent), oldest)
         found = signals_of(
             self._wanted, self._imu_events, self._joints_events, self._joints, step.start_ns, gyro_bias, self._up
         )
@@ -134,7 +135,7 @@ class SignalReader:
 
 def signals_of(
     wanted: Sequence[str],
-    imu: Sequence[ImuEvent],
+    imu: Sequence[InertialEvent],
     joints: Sequence[JointsEvent],
     wheel_joints: WheelJoints | None,
     origin_ns: int,
@@ -170,7 +171,7 @@ def _follow(events: list[_E], new: Sequence[_E], oldest_ns: int) -> None:
     del events[:first]
 
 
-def _gyro(events: Sequence[ImuEvent], origin_ns: int, bias: ArrayLike, up: ArrayLike) -> Signal | None:
+def _gyro(events: Sequence[InertialEvent], origin_ns: int, bias: ArrayLike, up: ArrayLike) -> Signal | None:
     if not events:
         return None
     rates = np.concatenate([e.angular_velocity for e in events]).reshape(-1, 3) @ np.asarray(up) - np.asarray(bias)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
+from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
-from fgloc.config import MotionConfig
+from fgloc import se2
+from fgloc.sensors.learned import installation
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.signals import SignalReader
 from fgloc.types import FloatArray, MotionMeasurement, Step
@@ -36,6 +39,7 @@ class LearnedMotion:
         self.model = model
         self.rejections: Counter[str] = Counter()
         self._use = config.use
+        self._scale = config.scale
         self._reader = SignalReader(model.card, imu_up)
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
@@ -79,7 +83,7 @@ class LearnedMotion:
             return None
         if velocity is None and self._reached == (step.segment, step.start_ns):
             velocity = self._velocity
-        prediction = self.model.predict(step.commands, step.start_ns, step.stamp_ns, velocity, signals)
+        prediction = self.model.predict(step.controls, step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
             return None
@@ -87,8 +91,21 @@ class LearnedMotion:
         self._reached = (step.segment, step.stamp_ns)
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
+    def measure_scaled(
+        self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0
+    ) -> MotionMeasurement | None:
+        """As `measure`, for this robot: distances are ``motion.scale`` times the model's."""
+        m, scale = self.measure(step, velocity, gyro_bias), self._scale
+        if m is None or scale == 1.0:
+            return m
+        return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a motion of this source by what it is off by."""
+        return installation.derivatives(motion)
+
     def _unusable(self, step: Step) -> str:
-        for command in reversed(step.commands):
+        for command in reversed(step.controls):
             if command.stamp_ns <= step.stamp_ns:
                 stale = (step.stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
                 return "learned.stale_commands" if stale else ""

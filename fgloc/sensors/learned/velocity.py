@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import ModelCard
-from fgloc.sensors.learned.commands import CommandTrack
+from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.forms import (
     MotionPrediction,
     calibrated,
@@ -21,7 +20,8 @@ from fgloc.sensors.learned.forms import (
 )
 from fgloc.sensors.learned.network import Answering
 from fgloc.sensors.learned.signals import Signals
-from fgloc.types import CommandEvent, FloatArray
+from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.types import ControlEvent, FloatArray
 
 
 class NaiveModel:
@@ -32,11 +32,11 @@ class NaiveModel:
         self.card = card
         self.joint = joint_of(card)
         self._noise = _noise(card)
-        self._track: CommandTrack | None = None
+        self._track: CommandHistory | None = None
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -70,11 +70,11 @@ class VelocityModel:
         self._delay = card.kinematics.delay_s if card.lag is None else card.lag.delay_s
         self._scale = np.array(card.output_scale)
         self._gains = gains(card.kinematics)
-        self._track: CommandTrack | None = None
+        self._track: CommandHistory | None = None
 
     def predict(
         self,
-        commands: tuple[CommandEvent, ...],
+        commands: tuple[ControlEvent, ...],
         start_ns: int,
         end_ns: int,
         velocity: FloatArray | None,
@@ -95,7 +95,7 @@ class VelocityModel:
         twists[:, ::2] = middles
         return _prediction(twists, self._noise, dt, states[-1])
 
-    def _roll(self, track: CommandTrack, start: float, duration: float, velocity: FloatArray) -> FloatArray:
+    def _roll(self, track: CommandHistory, start: float, duration: float, velocity: FloatArray) -> FloatArray:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
         n = sub_steps(duration, self.card.dt_s)
         dt = duration / n

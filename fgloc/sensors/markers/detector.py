@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from fgloc.config import MarkersConfig
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
 from fgloc.sensors.markers.edges import refine_all
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, ImageError, decode
-from fgloc.types import CornersEvent, Event, FloatArray, ImageEvent, MarkerCorners
+from fgloc.types import Event, FloatArray
 
 _SMALLEST = 0.03  # perimeter of the smallest marker, in units of the image's longer side
 _SUBPIX_WINDOW_PX, _SUBPIX_SHARE = 10, 0.5  # half the window of a corner: at most, and as a share of a cell

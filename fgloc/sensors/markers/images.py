@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc.errors import RecordingError
-from fgloc.types import ImageEvent
+from fgloc.sensors.markers.events import ImageEvent
 
 GrayImage = NDArray[np.uint8]
 

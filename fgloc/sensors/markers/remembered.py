@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.files.atomic import atomic_file
 from fgloc.sensors.markers.detector import Detector
-from fgloc.types import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 
 Detections = tuple[MarkerCorners, ...]
 """Of one image."""
@@ -99,6 +99,6 @@ def _write(path: Path, known: dict[bytes, Detections]) -> None:
             file,
             keys=np.frombuffer(b"".join(known), dtype=np.uint8).reshape(len(known), 32),
             counts=np.array([len(sightings) for sightings in known.values()], dtype=np.int64),
-            ids=np.array([s.marker_id for s in found], dtype=np.int64),
+            ids=np.array([s.landmark_id for s in found], dtype=np.int64),
             corners=np.array([s.corners_px for s in found], dtype=float).reshape(len(found), 4, 2),
         )

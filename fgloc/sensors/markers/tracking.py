@@ -11,8 +11,9 @@ from collections import Counter, deque
 import numpy as np
 
 from fgloc.sensors.markers.detector import Box, MarkerDetector
+from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, decode
-from fgloc.types import CornersEvent, FloatArray, ImageEvent, MarkerCorners
+from fgloc.types import FloatArray
 
 Found = list[tuple[int, FloatArray]]
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.timeline import Twist
 from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
-from fgloc.types import FloatArray, JointsEvent
+from fgloc.types import FloatArray
 
 _PATIENCE = 20  # messages without the wheels' joints before that is said
 
@@ -22,7 +23,7 @@ class TicksTrack(Track):
     """
 
     kind = "ticks"
-    events = "joints"
+    events = JointsEvent
 
     def __init__(self, config: WheelsConfig) -> None:
         """Start with nothing heard.

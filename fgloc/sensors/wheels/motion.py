@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Container
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import WheelsConfig
+from fgloc.sensors.wheels import installation
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.encoders import TicksTrack
 from fgloc.sensors.wheels.odometry import OdometryTrack
 from fgloc.sensors.wheels.timeline import TwistTimeline
@@ -91,6 +93,11 @@ class WheelMotion:
             notes.append(f"no wheel motion was known for {self._silent_s:.1f} s in {self._silent_steps} steps")
         return tuple(notes)
 
+    @property
+    def track_m(self) -> float | None:
+        """Distance of the wheels [m], by which left is told from right; None: not known."""
+        return self._config.track
+
     def measure(self, step: Step) -> MotionMeasurement | None:
         """Motion over the step. Measured again, the same step gives the same.
 
@@ -137,6 +144,14 @@ class WheelMotion:
         """Of the base ``(3,)`` [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
         motion, _ = self.carry(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
         return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
+
+    def derivatives(self, step: Step, m: MotionMeasurement, wanted: Container[str] = ()) -> dict[str, FloatArray]:
+        """Of a step's motion by what the wheels are off by; those of the clock only where they are wanted."""
+        change = None
+        if any(name in wanted for name in installation.OF_CLOCK):
+            start, end = self.twist(step, step.start_ns), self.twist(step, step.stamp_ns)
+            change = end - se2.adjoint(se2.inverse(m.motion)) @ start
+        return installation.derivatives(m, change, self._config)
 
     def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
         return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)

@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from fgloc.config import WheelsConfig
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.timeline import Twist, TwistTimeline
-from fgloc.types import CommandEvent, Step
+from fgloc.types import ControlEvent, MotionEvent, Step
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
 MAX_GAP_S = 5.0  # over a longer silence no difference is trusted: the robot may have been restarted
@@ -27,7 +27,7 @@ class Track:
     """
 
     kind = ""
-    events = ""  # the step's field that it reads
+    events: type[MotionEvent] = MotionEvent  # that it reads
 
     def __init__(self, config: WheelsConfig) -> None:
         """Start with nothing heard."""
@@ -41,7 +41,7 @@ class Track:
 
     def ingest(self, step: Step) -> None:
         """Take in the step's events that are newer than all before."""
-        found: Sequence[Any] = getattr(step, self.events)
+        found: Sequence[Any] = step.of(self.events)
         first = 0 if self._last_ns is None else bisect_right(found, self._last_ns, key=lambda e: e.stamp_ns)
         for event in found[first:]:
             if self._last_ns is None or event.stamp_ns > self._last_ns:
@@ -93,12 +93,12 @@ class CommandTrack(Track):
     """Commands stand in for wheels: each holds until the next, for ``hold_s`` at most."""
 
     kind = "command"
-    events = "commands"
+    events = ControlEvent
 
     def _forget(self) -> None:
         self._command: Twist | None = None
 
-    def _take(self, event: CommandEvent) -> None:
+    def _take(self, event: ControlEvent) -> None:
         self._extend(event.stamp_ns, None, self._command)
         self._command = (event.v, 0.0, event.omega)
         self._reach(event.stamp_ns, self._command)

@@ -1,27 +1,94 @@
-"""Checks of what was seen: images, calibration and marker sightings."""
+"""What looks wrong with a topic of a recording, for ``fgloc info``: what the sensors' checks share."""
 
 from __future__ import annotations
 
 from array import array
 from collections import Counter
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fgloc.config import Config
-from fgloc.recording.checks_base import Table, count, times
-from fgloc.types import (
-    CameraInfoEvent,
-    CornersEvent,
-    Event,
-    FloatArray,
-    ImageEvent,
-    MarkerPosesEvent,
-    RangeBearingEvent,
-)
+from fgloc.types import Event, FloatArray, RawEvent, SightingsEvent
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+
+_UNIT_TOLERANCE = 0.05
 
 
-class ImageChecks:
-    """Empty images; remembers sizes and frame."""
+class Collector(Protocol):
+    """Takes in the events of one topic and tells what is wrong with them."""
+
+    def add(self, event: Event) -> None:
+        """Take in one event."""
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """What is wrong; ``seconds`` ``(n,)`` are the receive times from the recording's start."""
+
+
+class TimingOnly:
+    """Nothing but the timing is checked."""
+
+    def add(self, event: Event) -> None:
+        """Take in one event."""
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """Nothing."""
+        return []
+
+
+class Table:
+    """Rows of floats, compact."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._values = array("d")
+
+    def add(self, *values: float) -> None:
+        """Add a row."""
+        self._values.extend(values)
+
+    def array(self) -> FloatArray:
+        """All rows ``(n, width)``."""
+        return np.array(self._values, dtype=float).reshape(-1, self._width)
+
+
+def finite_rows(rows: FloatArray) -> NDArray[np.bool_]:
+    """Which rows hold neither NaN nor infinity."""
+    return np.asarray(np.isfinite(rows).all(axis=1))
+
+
+def count(mask: NDArray[np.bool_]) -> str:
+    """How many of how many."""
+    return f"{int(mask.sum())} of {mask.size}"
+
+
+def times(n: int) -> str:
+    """Once, or n times."""
+    return "once" if n == 1 else f"{n} times"
+
+
+def spikes(topic: str, name: str, unit: str, values: FloatArray, bound: float, seconds: FloatArray) -> list[str]:
+    """Values beyond a bound, with the largest."""
+    beyond = values > bound
+    if not beyond.any():
+        return []
+    at = int(np.argmax(np.where(beyond, values, 0.0)))
+    return [
+        f"{topic}: {count(beyond)} have a {name} beyond {bound:g} {unit} (up to {values[at]:.4g}, at "
+        f"{seconds[at]:.1f} s) and will be rejected."
+    ]
+
+
+def unit_length(topic: str, quaternions: FloatArray) -> list[str]:
+    """Quaternions ``(n, 4)`` that are not of unit length."""
+    off = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > _UNIT_TOLERANCE
+    return [f"{topic}: {count(off)} have a quaternion that is not of unit length."] if off.any() else []
+
+
+class RawChecks:
+    """Images without data; remembers sizes and frame."""
 
     def __init__(self) -> None:
         self._empty = 0
@@ -31,12 +98,12 @@ class ImageChecks:
 
     def add(self, event: Event) -> None:
         """Take in one event."""
-        assert isinstance(event, ImageEvent)
+        assert isinstance(event, RawEvent)
         self._count += 1
         self.frame_id = self.frame_id or event.frame_id
-        self._empty += len(event.data) == 0
-        if not event.compressed:
-            self.sizes[event.width, event.height] += 1
+        self._empty += event.empty
+        if event.size is not None:
+            self.sizes[event.size] += 1
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
         """What is wrong."""
@@ -49,71 +116,29 @@ class ImageChecks:
         return found
 
 
-class CameraInfoChecks:
-    """A calibration that is none, or that changes."""
-
-    def __init__(self) -> None:
-        self.size = (0, 0)
-        self.frame_id = ""
-        self._zero = 0
-        self._no_distortion = 0
-        self._count = 0
-        self._calibrations: set[bytes] = set()
-
-    def add(self, event: Event) -> None:
-        """Take in one event."""
-        assert isinstance(event, CameraInfoEvent)
-        self._count += 1
-        self.size = event.width, event.height
-        self.frame_id = self.frame_id or event.frame_id
-        self._zero += not event.K.any()
-        self._no_distortion += len(event.D) == 0
-        if len(self._calibrations) < 10:
-            self._calibrations.add(event.K.tobytes() + event.D.tobytes())
-
-    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
-        found = []
-        if self._zero:
-            found.append(
-                f"{topic}: K is all zero in {self._zero} of {self._count} messages: the camera is not calibrated; "
-                "give a calibration (camera.file in the configuration)."
-            )
-        elif self._no_distortion:
-            found.append(f"{topic}: no distortion coefficients; they are taken as zero.")
-        if len(self._calibrations) > 1:
-            found.append(f"{topic}: the calibration changes during the recording; the first one is used.")
-        return found
-
-
 class SightingsChecks:
     """Which markers were seen, and where."""
 
     def __init__(self) -> None:
         self.ids: Counter[int] = Counter()
         self.frame_id = ""
-        self.corners = False
+        self.in_pixels = False
         self._filled = array("b")  # whether each message holds a sighting
         self._positions = Table(3)
         self._ranges = Table(1)
 
     def add(self, event: Event) -> None:
         """Take in one event."""
-        assert isinstance(event, CornersEvent | MarkerPosesEvent | RangeBearingEvent)
+        assert isinstance(event, SightingsEvent)
         self._filled.append(bool(event.sightings))
         self.frame_id = self.frame_id or event.frame_id
-        if isinstance(event, RangeBearingEvent):
-            self.ids.update(s.landmark_id for s in event.sightings)
-            for landmark in event.sightings:
-                self._ranges.add(landmark.range_m)
-        elif isinstance(event, MarkerPosesEvent):
-            self.ids.update(s.marker_id for s in event.sightings)
-            for marker in event.sightings:
-                self._positions.add(*marker.position)
-                self._ranges.add(float(np.linalg.norm(marker.position)))
-        else:
-            self.corners = True
-            self.ids.update(s.marker_id for s in event.sightings)
+        self.in_pixels = event.in_pixels
+        self.ids.update(s.landmark_id for s in event.sightings)
+        for sighting in event.sightings:
+            if (place := sighting.place()) is not None:
+                self._positions.add(*place)
+            if (distance := sighting.distance()) is not None:
+                self._ranges.add(distance)
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
         """What is wrong."""

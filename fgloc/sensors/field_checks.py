@@ -1,4 +1,4 @@
-"""Is this a covariance, a quaternion, a marker? Pure judgements that the gate acts on.
+"""Is this a covariance, a quaternion, a landmark of the map? Judgements that the sensors' validators share.
 
 A judgement is the thing itself (perhaps a repaired copy) or a ``str``: the reason why it cannot be used.
 """
@@ -6,19 +6,26 @@ A judgement is the thing itself (perhaps a repaired copy) or a ``str``: the reas
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fgloc.config import GateConfig
-from fgloc.types import FloatArray
+from fgloc.types import MAX_LANDMARK_ID, FloatArray, Sighting, SightingsEvent
+
+if TYPE_CHECKING:
+    from fgloc.config import GateConfig
 
 _ASYMMETRY = 1e-4  # of a correlation: less is rounding, more is a mistake
 _INDEFINITE = 1e-6  # an eigenvalue of a correlation matrix may be this negative
-_MAX_PIXEL = 1e5
 Changes = dict[str, Any]  # fields of a repaired copy
 PLANAR = (0, 1, 5)  # x, y, yaw of a ROS covariance
+EMPTIED = "emptied"  # reason of an event all parts of which were rejected, and counted, one by one
+_SHOWN_IDS = 12
+_KEPT_IDS = 1000
+E = TypeVar("E", bound=SightingsEvent)
 
 
 def judge_quaternion(quaternion: FloatArray, tolerance: float) -> FloatArray | str:
@@ -87,35 +94,76 @@ def _indefinite(r: list[float], diagonal: list[float]) -> bool:
     return bool(np.linalg.eigvalsh(matrix, UPLO="L")[0] < -_INDEFINITE)
 
 
-def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
-    """Reason why four corners ``(4, 2)`` are no marker, or "": finite, convex and not too small."""
-    if corners_px.shape != (4, 2):
-        return "corners_degenerate"
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners_px.tolist()
-    spread = abs(ax) + abs(ay) + abs(bx) + abs(by) + abs(cx) + abs(cy) + abs(dx) + abs(dy)
-    if not spread <= 8.0 * _MAX_PIXEL:  # also NaN
-        return "non_finite"
-    abx, aby, bcx, bcy, cdx, cdy, dax, day = bx - ax, by - ay, cx - bx, cy - by, dx - cx, dy - cy, ax - dx, ay - dy
-    side = (math.hypot(abx, aby) + math.hypot(bcx, bcy) + math.hypot(cdx, cdy) + math.hypot(dax, day)) / 4.0
-    turns = (abx * bcy - aby * bcx, bcx * cdy - bcy * cdx, cdx * day - cdy * dax, dax * aby - day * abx)
-    flat = 1e-3 * side * side
-    if not (min(turns) > flat or max(turns) < -flat):  # crossed, dented, or on a line
-        return "corners_degenerate"
-    return "corners_small" if side < min_side_px else ""
-
-
 class FieldChecks:
-    """Judges the quaternions and covariances of events; what was assumed is noted."""
+    """What the validators of one run share: bounds, notes, what was rejected, and which landmarks are known.
 
-    def __init__(self, config: GateConfig, note: Callable[[str], None]) -> None:
-        """Set up with the bounds and a place for notes."""
-        self._config = config
+    Attributes:
+        config: bounds.
+        rejections: parts of events that were rejected, by "role.reason"; whole events are counted by `EventValidator`.
+    """
+
+    def __init__(
+        self,
+        config: GateConfig,
+        note: Callable[[str], None],
+        rejections: Counter[str] | None = None,
+        known_ids: Collection[int] | None = None,
+    ) -> None:
+        """Set up with a place for notes and counts; ``known_ids`` None: every id passes."""
+        self.config = config
+        self.rejections: Counter[str] = Counter() if rejections is None else rejections
         self._note = note
+        self._known = None if known_ids is None else frozenset(known_ids)
+        self._unknown: set[int] = set()
         self._covs: dict[tuple[str, str], tuple[bytes, FloatArray | str]] = {}  # last covariance and its verdict
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which ids were ignored."""
+        if not self._unknown:
+            return ()
+        ids = ", ".join(str(i) for i in sorted(self._unknown)[:_SHOWN_IDS])
+        more = ", ..." if len(self._unknown) > _SHOWN_IDS else ""
+        return (f"sightings of ids that are not in the map are ignored: {ids}{more}",)
+
+    def note(self, text: str) -> None:
+        """Tell the user once."""
+        self._note(text)
+
+    def sift(self, event: E, judge: Callable[[str, Any], Sighting | str]) -> E | str:
+        """The event, a copy without the bad entries, or the reason for rejection.
+
+        Args:
+            event: sightings.
+            judge: from topic and entry to the entry, a repaired copy, or the reason why it cannot be used.
+        """
+        kept: list[Sighting] = []
+        changed = False
+        for sighting in event.sightings:
+            number = sighting.landmark_id
+            verdict: Sighting | str = "id_bound"
+            if 0 <= number <= MAX_LANDMARK_ID:
+                verdict = "unknown_id" if self._is_unknown(number) else judge(event.topic, sighting)
+            if isinstance(verdict, str):
+                self.rejections[f"sightings.{verdict}"] += 1
+                changed = True
+            else:
+                kept.append(verdict)
+                changed = changed or verdict is not sighting
+        if not changed:
+            return event
+        return replace(event, sightings=tuple(kept)) if kept else EMPTIED
+
+    def _is_unknown(self, landmark_id: int) -> bool:
+        if self._known is None or landmark_id in self._known:
+            return False
+        if len(self._unknown) < _KEPT_IDS:
+            self._unknown.add(landmark_id)
+        return True
 
     def quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
         """Reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
-        verdict = judge_quaternion(quaternion, self._config.quaternion_tolerance)
+        verdict = judge_quaternion(quaternion, self.config.quaternion_tolerance)
         if isinstance(verdict, str):
             return verdict
         if verdict is not quaternion:
@@ -132,7 +180,7 @@ class FieldChecks:
         if last is not None and last[0] == raw:  # most drivers send the same one for ever
             verdict = last[1]
         else:
-            verdict, was = judge_covariance(cov, axes, self._config.max_variance)
+            verdict, was = judge_covariance(cov, axes, self.config.max_variance)
             if was:
                 self._note(f"{topic}: {what} covariance is {was}; the configured default is used")
             self._covs[key] = (raw, verdict)

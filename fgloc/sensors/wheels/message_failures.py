@@ -1,4 +1,4 @@
-"""Failures of the content of motion messages: frozen, reset, rolled over, not a number, wrong covariance, bias."""
+"""Failures of what the wheels' messages say: frozen, reset, rolled over, not a number, wrong covariance."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from fgloc import se2
-from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Failure, Scene
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, ImuEvent, JointsEvent, OdometryEvent
+from fgloc.sensors.failures import Change, EventFailure, Failure, Scene
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
 
 
 class EncoderFrozen(Failure):
@@ -28,7 +29,7 @@ class EncoderFrozen(Failure):
         schedule = self.when.schedule(scene)
         last: dict[str, Event] = {}
         for event in events:
-            if not isinstance(event, EVENTS["wheels"]):
+            if not isinstance(event, (OdometryEvent, JointsEvent)):
                 yield event
             elif schedule.hits(event) and event.topic in last:
                 self.touch(scene)
@@ -94,7 +95,7 @@ class WheelNan(EventFailure):
 
     def targets(self) -> tuple[type[Event], ...]:
         """Odometry and joints."""
-        return EVENTS["wheels"]
+        return (OdometryEvent, JointsEvent)
 
     def begin(self, scene: Scene) -> Change:
         """Fill with NaN."""
@@ -126,29 +127,3 @@ class WrongCovariance(EventFailure):
             return replace(event, pose_cov=event.pose_cov * self.factor, twist_cov=event.twist_cov * self.factor)
 
         return scale
-
-
-class ImuBias(EventFailure):
-    """The gyroscope's yaw rate is off by ``yaw_rate`` and the accelerometer by ``acceleration``."""
-
-    kind: Literal["imu_bias"] = "imu_bias"
-    yaw_rate: float = Field(0.05, description="rad/s, about z")
-    acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")
-
-    def targets(self) -> tuple[type[Event], ...]:
-        """IMU messages."""
-        return (ImuEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Add."""
-        rates, accelerations = np.array([0.0, 0.0, self.yaw_rate]), np.array(self.acceleration)
-
-        def bias(event: Event) -> Event:
-            assert isinstance(event, ImuEvent)
-            return replace(
-                event,
-                angular_velocity=event.angular_velocity + rates,
-                linear_acceleration=event.linear_acceleration + accelerations,
-            )
-
-        return bias

@@ -12,10 +12,11 @@ import numpy as np
 from pydantic import Field
 
 from fgloc import se2
-from fgloc.ablation.failures.base import Failure, Scene
-from fgloc.config import WheelsConfig
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.types import Event, FloatArray, JointsEvent, OdometryEvent
+from fgloc.sensors.failures import Failure, Scene
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
 
 
 @dataclass(frozen=True, slots=True)

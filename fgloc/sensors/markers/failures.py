@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fgloc.ablation.failures.base import EVENTS, Change, EventFailure, Scene
+from fgloc.sensors.failures import Change, EventFailure, Scene, events_of
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import ImageError, decode
-from fgloc.types import Event, ImageEvent
+from fgloc.types import Event
 
 
 class Darkness(EventFailure):
@@ -60,7 +61,7 @@ class FrameRate(EventFailure):
 
     def targets(self) -> tuple[type[Event], ...]:
         """Everything that a camera reports."""
-        return EVENTS["camera"]
+        return events_of("camera")
 
     def begin(self, scene: Scene) -> Change:
         """Drop what follows the last one too soon (5 % of jitter is let through)."""

@@ -1,4 +1,4 @@
-"""What all failures share: when they are active, what they may know, and how they pass events on."""
+"""What all failures of sensors share: when they are active, what they may know, and how they pass events on."""
 
 from __future__ import annotations
 
@@ -14,26 +14,8 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from fgloc.config import Config, Section
-from fgloc.extensions import outside_sensors
-from fgloc.types import (
-    CommandEvent,
-    CornersEvent,
-    Event,
-    ImageEvent,
-    ImuEvent,
-    JointsEvent,
-    LandmarkMap,
-    MarkerPosesEvent,
-    OdometryEvent,
-    RangeBearingEvent,
-)
-
-EVENTS: dict[str, tuple[type[Event], ...]] = {
-    "camera": (ImageEvent, CornersEvent, MarkerPosesEvent, RangeBearingEvent),
-    "wheels": (OdometryEvent, JointsEvent),
-    "command": (CommandEvent,),
-    "imu": (ImuEvent,),
-}
+from fgloc.sensors import registry
+from fgloc.types import Event, LandmarkMap
 
 
 def _known_sensor(name: str) -> str:
@@ -45,15 +27,15 @@ Sensor = Annotated[str, AfterValidator(_known_sensor)]
 
 
 def events_of(sensor: str) -> tuple[type[Event], ...]:
-    """Kinds of events of a built-in sensor, or of one that another package brings.
+    """Kinds of events of a sensor, by the name that failures have for it.
 
     Raises:
         ValueError: there is no sensor of this name.
     """
-    outside = {s.name: tuple(stream.event for stream in s.streams) for s in outside_sensors()}
-    if sensor not in EVENTS | outside:
-        raise ValueError(f"expected one of {', '.join(EVENTS | outside)}")
-    return EVENTS[sensor] if sensor in EVENTS else outside[sensor]
+    known = registry.events_by_sensor()
+    if sensor not in known:
+        raise ValueError(f"expected one of {', '.join(known)}")
+    return known[sensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,3 +206,31 @@ def by_receipt(events: Iterator[tuple[int, Event]]) -> Iterator[Event]:
             yield heapq.heappop(waiting)[2]
     while waiting:
         yield heapq.heappop(waiting)[2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carriage:
+    """How a robot is carried: each sensor says what it then measures (`BuiltIn.carried`).
+
+    Attributes:
+        intervals: from when until when it is in the air [s].
+        spin_m_s: speed of the wheels' rims in the air.
+        height_m: to which it is lifted.
+        rise_s: that lifting and setting down take.
+        scene: of the run.
+    """
+
+    intervals: tuple[tuple[float, float], ...]
+    spin_m_s: float
+    height_m: float
+    rise_s: float
+    scene: Scene
+
+    def interval(self, event: Event) -> tuple[float, float] | None:
+        """The interval in which an event was measured; None: on the floor."""
+        t = self.seconds(event)
+        return next(((a, b) for a, b in self.intervals if a <= t < b), None)
+
+    def seconds(self, event: Event) -> float:
+        """Stamp of an event [s from the recording's first message]."""
+        return (event.stamp_ns - self.scene.start_ns) * 1e-9

@@ -1,0 +1,90 @@
+"""Control inputs: what the robot was told to do. Wheels and learned motion read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.sensors.base import BuiltIn, Stream, When
+from fgloc.sensors.field_checks import FieldChecks
+from fgloc.sensors.topic_checks import Table, spikes
+from fgloc.types import ControlEvent, Event, FloatArray
+
+if TYPE_CHECKING:
+    from fgloc.sensors.failures import Carriage
+
+
+def from_twist(message: Any, when: When) -> Event:
+    """From ``geometry_msgs/Twist``."""
+    return ControlEvent(*when, float(message.linear.x), float(message.angular.z))
+
+
+def from_twist_stamped(message: Any, when: When) -> Event:
+    """From ``geometry_msgs/TwistStamped``."""
+    return from_twist(message.twist, when)
+
+
+def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:
+    """Commands within the gate's bounds."""
+    bounds = checks.config
+
+    def validate(event: ControlEvent) -> Event | str:
+        if not math.isfinite(event.v + event.omega):
+            return "non_finite"
+        if abs(event.v) > bounds.max_speed:
+            return "speed_bound"
+        return "yaw_rate_bound" if abs(event.omega) > bounds.max_yaw_rate else event
+
+    return validate
+
+
+class CommandChecks:
+    """Commands against the gate's bounds."""
+
+    def __init__(self) -> None:
+        self._rows = Table(2)
+
+    def add(self, event: Event) -> None:
+        """Take in one event."""
+        assert isinstance(event, ControlEvent)
+        self._rows.add(event.v, event.omega)
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """What is wrong."""
+        rows = np.abs(self._rows.array())
+        found = spikes(topic, "yaw rate", "rad/s", rows[:, 1], config.gate.max_yaw_rate, seconds)
+        found += spikes(topic, "speed", "m/s", rows[:, 0], config.gate.max_speed, seconds)
+        if not rows.any():
+            found.append(f"{topic}: all {len(rows)} commands are zero.")
+        return found
+
+
+def carried(carriage: Carriage) -> Callable[[Event], Event]:
+    """In the air the wheels are told to stand, or to spin."""
+
+    def tell(event: Event) -> Event:
+        assert isinstance(event, ControlEvent)
+        return event if carriage.interval(event) is None else replace(event, v=carriage.spin_m_s, omega=0.0)
+
+    return tell
+
+
+COMMANDS = BuiltIn(
+    name="command",
+    streams=(
+        Stream(
+            "command",
+            ControlEvent,
+            {"geometry_msgs/msg/Twist": from_twist, "geometry_msgs/msg/TwistStamped": from_twist_stamped},
+            ("cmd_vel",),
+            validator=validator,
+            findings=CommandChecks,
+        ),
+    ),
+    carried=carried,
+)

@@ -1,0 +1,73 @@
+"""The wheels as a sensor: their topics, settings and failures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from fgloc.sensors.base import BuiltIn, Joined, MotionRole, Stream
+from fgloc.sensors.wheels import messages, validation
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.findings import OdometryChecks
+from fgloc.sensors.wheels.installation import INSTALLATION
+from fgloc.types import Event
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+    from fgloc.sensors.failures import Carriage
+
+
+def _failures() -> tuple[type[Section], ...]:
+    from fgloc.sensors.wheels import failures as speeds
+    from fgloc.sensors.wheels import message_failures as contents
+
+    return (
+        speeds.WheelSlip,
+        speeds.EncoderDead,
+        contents.EncoderFrozen,
+        speeds.EncoderQuantized,
+        contents.EncoderRollover,
+        speeds.WheelScaleDrift,
+        contents.OdometryReset,
+        contents.WheelNan,
+        contents.WrongCovariance,
+    )
+
+
+def _carried(carriage: Carriage) -> Callable[[Event], Event]:
+    from fgloc.sensors.wheels.carried import carried
+
+    return carried(carriage)
+
+
+def _joined() -> Joined:
+    from fgloc.sensors.wheels.carried import JoinedWheels
+
+    return JoinedWheels()
+
+
+WHEELS = BuiltIn(
+    name="wheels",
+    streams=(
+        Stream(
+            "odometry",
+            OdometryEvent,
+            {"nav_msgs/msg/Odometry": messages.odometry},
+            ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
+            validator=validation.odometry,
+            findings=OdometryChecks,
+        ),
+        Stream(
+            "joints",
+            JointsEvent,
+            {"sensor_msgs/msg/JointState": messages.joints},
+            ("joint_states",),
+            validator=validation.joints,
+        ),
+    ),
+    role=MotionRole.ODOMETER,
+    installation=INSTALLATION,
+    failures=_failures,
+    carried=_carried,
+    joined=_joined,
+)
