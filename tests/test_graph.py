@@ -463,46 +463,6 @@ def test_what_a_moved_landmark_did_stays_undone_when_the_window_is_built_again(k
     assert estimator.update(7 * 10**8, 0.1, step).pose == pytest.approx((0.7, 0.5, 0.0), abs=1e-6)
 
 
-def test_weights_refuse_what_the_prediction_excludes_but_believe_after_dead_reckoning():
-    landmarks = wall_map()
-    factors = LandmarkFactors(landmarks)
-    weights = Association(Config(), factors)
-    truth = np.zeros(3)
-    m = corner_sighting(np.array([0.0, 0.6, 0.1]), landmarks.landmarks[0])
-    sure = PoseWithCovariance(truth, np.diag([1e-4, 1e-4, 1e-4]))
-    accepted, rejected, decisions = weights.judge(0, 0, [m], sure)
-    assert not accepted
-    assert [d.reason for d in decisions] == ["gate"]
-    assert weights.rejections["sightings.gate"] == 1
-    unsure = PoseWithCovariance(truth, np.diag([0.5, 0.5, 0.1]))
-    accepted, rejected, _ = weights.judge(1, 0, [m], unsure)
-    assert len(accepted) == 1
-    assert not rejected
-
-
-def test_weights_refuse_markers_behind_the_camera():
-    landmarks = wall_map()
-    weights = Association(Config(), LandmarkFactors(landmarks))
-    m = corner_sighting(np.zeros(3), landmarks.landmarks[0])
-    _, refused, decisions = weights.judge(0, 0, [m], PoseWithCovariance(np.array([6.0, 0.0, 0.0]), np.eye(3)))
-    assert len(refused) == 1
-    assert decisions[0].reason == "behind_camera"
-
-
-def test_repeated_sightings_share_their_information():
-    config = Config.model_validate({"landmarks": {"repeat_s": 1.0}})
-    landmarks = wall_map()
-    weights = Association(config, LandmarkFactors(landmarks))
-    belief = PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-2)
-    first = point_sighting(np.zeros(3), landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
-    later = PointMeasurement(250_000_000, 9, first.range_m, first.bearing_rad, first.cov)
-    a, _, _ = weights.judge(0, 0, [first], belief)
-    b, _, decisions = weights.judge(1, 250_000_000, [later], belief)
-    assert np.allclose(a[0].measurement.cov, first.cov)
-    assert np.allclose(b[0].measurement.cov, 4.0 * first.cov)
-    assert decisions[0].weight == pytest.approx(0.25)
-
-
 @pytest.mark.slow
 def test_fault_68_a_batch_of_many_poses_does_not_overflow_the_stack():
     n, motion = 120_000, np.array([0.02, 0.0, 0.01])
