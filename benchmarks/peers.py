@@ -35,9 +35,9 @@ from benchmarks.installed_runs import floor, kept, processor_times
 from benchmarks.peers_localizer import GRID, KINDS, Kind, Localizer, Settings
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
-from fgloc.config import WheelsConfig
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.matching import match
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, Step, Trajectory
 
