@@ -26,12 +26,13 @@ from rosbags.highlevel import AnyReader
 from datasets.sim.record import describe, is_recorded, robot_settings
 from datasets.sim.scenario import Scenario
 from datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
-from fgloc.config import Config, MarkersConfig
+from fgloc.config import Config
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import ImageError

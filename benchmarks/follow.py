@@ -53,9 +53,9 @@ def wanted() -> Iterator[Wanted]:
     for case, truth in (("ice", "ice"), ("dark20", "ice"), ("onewheel", "flat30"), ("moved", "flat30")):
         yield Wanted(f"{case}.track_mm", ((case, "fgloc"),), _mean("track_mm", "mm"))
         yield Wanted(f"{case}.track_over_truth", ((case, "fgloc"), (truth, "truth")), _over("track_mm"))
-    without = (("dark20", "fgloc-no-model"), ("dark20", "fgloc"))
+    without: tuple[Key, ...] = (("dark20", "fgloc-no-model"), ("dark20", "fgloc"))
     yield Wanted("dark20.no_model_over_model", without, _over("track_mm"))
-    bare = (("dark20", "fgloc-no-model-no-gyro"), ("dark20", "fgloc"))
+    bare: tuple[Key, ...] = (("dark20", "fgloc-no-model-no-gyro"), ("dark20", "fgloc"))
     yield Wanted("dark20.no_model_no_gyro_over_model", bare, _over("track_mm"))
     yield Wanted("dark20.no_model_pose_over_model", without, _over("pose_mm"))
     yield Wanted("dark20.no_model_seconds_over_model", without, _over("seconds"))

@@ -25,8 +25,8 @@ from datasets.sim.record import record
 from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from datasets.sim.sensors import streams
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
-from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
 

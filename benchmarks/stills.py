@@ -25,9 +25,10 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
 from benchmarks.equal import SAMPLES
-from fgloc.config import MarkersConfig, load_config
+from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector, use_one_thread
 from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.events import ImageEvent

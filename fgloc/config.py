@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, create_model, model_validator
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from fgloc.errors import ConfigError
 from fgloc.extensions import outside_sensors
+from fgloc.files.section import SHIPPED
+from fgloc.files.section import Section as Section
 from fgloc.files.settings_file import Settings
-
-
-class Section(BaseModel):
-    """A part of the configuration: unknown keys are errors, numbers are finite, values are immutable."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
+from fgloc.sensors import registry
 
 _Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
 _Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
@@ -47,6 +44,12 @@ def _known_role(role: str) -> str:
     if role not in role_names():
         raise ValueError(f"expected one of {', '.join(role_names())}")
     return role
+
+
+def _known_source(name: str) -> str:
+    if name not in registry.motion_names():
+        raise ValueError(f"expected one of {', '.join(registry.motion_names())}")
+    return name
 
 
 _KnownRole = Annotated[str, AfterValidator(_known_role)]
@@ -130,204 +133,12 @@ class KeyframesConfig(Section):
         return self
 
 
-class NoiseDensity(Section):
-    """White-noise densities: standard deviation per square root of distance, rotation or time.
-
-    The variance over a step is the sum of each squared density times the metres, radians and seconds travelled, so that
-    splitting a step leaves the covariance as it was.
-    """
-
-    x_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="m/√m, along the motion")
-    y_per_sqrt_m: float = Field(0.015, ge=0, le=100, description="m/√m, across the motion")
-    yaw_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="rad/√m")
-    xy_per_sqrt_rad: float = Field(0.01, ge=0, le=100, description="m/√rad")
-    yaw_per_sqrt_rad: float = Field(0.05, ge=0, le=100, description="rad/√rad")
-    xy_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="m/√s, also at rest")
-    yaw_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="rad/√s, also at rest")
-
-
-class WheelsConfig(Section):
-    """Wheel odometry."""
-
-    source: Literal["auto", "twist", "pose", "ticks", "command", "none"] = Field(
-        "auto",
-        description="twist or pose differences of the odometry, wheel angles of the joints, or (no encoder) the "
-        "commands; auto: ticks if the wheels' geometry is given, else twist unless it is zero while the pose moves, "
-        "else pose, else command",
-    )
-    left_joint: str | None = None
-    right_joint: str | None = None
-    left_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
-    right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
-    track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
-    angle_range: float | None = Field(
-        None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
-    )
-    scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
-    scale_omega: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported yaw rate")
-    yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
-    slowdown: float = Field(
-        0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
-    )
-    delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
-    hold_s: float = Field(0.5, gt=0, le=60, description="a twist is held for this long when the next one is missing")
-    zero_speed: float = Field(0.0, ge=0, le=10, description="m/s below which a reported speed is rest")
-    zero_yaw_rate: float = Field(0.0, ge=0, le=10, description="rad/s below which a reported rate is rest")
-    noise: NoiseDensity = NoiseDensity()
-    scale_sigma: float = Field(
-        0.01,
-        ge=0,
-        le=0.5,
-        description="how far the radii of both wheels may be off alike; estimated, as all sigmas here",
-    )
-    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
-    time_offset_sigma_s: float = Field(
-        0.005, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
-    )
-    yaw_per_m_sigma: float = Field(
-        0.015,
-        ge=0,
-        le=1,
-        description="rad/m: how far yaw_per_m may be off: 0.4 % of unequal radii at a track of 0.26 m",
-    )
-    slowdown_sigma: float = Field(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
-    delay_sigma_s: float = Field(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
-
-
-class GyroConfig(Section):
-    """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
-
-    use: bool = True
-    scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported rate")
-    yaw_per_sqrt_s: float = Field(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
-    scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
-    bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
-    bias_walk: float = Field(0.0003, ge=0, le=10, description="rad/s/√s")
-
-
-class CameraConfig(Section):
-    """The camera, where the recording does not say."""
-
-    file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
-    rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
-    focal_scale: float = Field(1.0, ge=0.01, le=100, description="true focal length over that of the calibration")
-    cx_px: float | None = Field(
-        None, ge=-1e5, le=1e5, description="px: principal point; None, as below: the calibration's"
-    )
-    cy_px: float | None = Field(None, ge=-1e5, le=1e5, description="px")
-    k1: float | None = Field(None, ge=-100, le=100, description="of plumb_bob; other models are taken as they are")
-    k2: float | None = Field(None, ge=-100, le=100)
-    position_sigma_m: float = Field(
-        0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
-    )
-    rotation_sigma_rad: float = Field(0.007, ge=0, le=0.5, description="rad: likewise, about each axis (0.4 degrees)")
-    focal_sigma: float = Field(0.003, ge=0, le=0.5, description="how far the focal length may be off, as a share")
-    principal_sigma_px: float = Field(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
-    distortion_sigma: float = Field(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
-    time_offset_sigma_s: float = Field(
-        0.012,
-        ge=0,
-        le=1.0,
-        description="s: how far its clock may be off that of the gyro (without one: of the wheels); estimated",
-    )
-    time_jitter_s: float = Field(0.002, ge=0, le=0.1, description="s: what each stamp is off by on its own")
-
-
-class MarkersConfig(Section):
-    """Marker detection in images."""
-
-    dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
-    default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, for maps that give none")
-    sigma_px: float = Field(0.5, ge=1e-3, le=100, description="noise of one corner coordinate")
-    blur_s: float = Field(
-        2e-4,
-        ge=0,
-        le=0.1,
-        description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
-    )
-    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
-    max_sightings: int = Field(12, gt=0, le=1000, description="the largest markers of an image that are used")
-
-
-class LandmarksConfig(Section):
-    """Range/bearing and marker-pose sightings."""
-
-    range_sigma_m: float = Field(0.1, ge=1e-4, le=100)
-    range_sigma_per_m: float = Field(0.0, ge=0, le=10, description="added range sigma per metre of range")
-    bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2)
-    range_scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported range")
-    range_along_axis: bool = Field(
-        False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
-    )
-    range_bias_m: float = Field(0.0, ge=-100, le=100, description="subtracted from the reported range")
-    bearing_bias_rad: float = Field(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
-    range_scale_sigma: float = Field(
-        0.005, ge=0, le=0.5, description="how far range_scale may be off; estimated during the run"
-    )
-    bearing_bias_sigma_rad: float = Field(
-        0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
-    )
-    time_offset_sigma_s: float = Field(
-        0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
-    )
-    yaw_sigma_rad: float | None = Field(
-        None,
-        ge=1e-5,
-        le=3.2,
-        description="of a marker pose's yaw; None: marker poses are used as range and bearing only",
-    )
-    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
-    min_sightings: int = Field(
-        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is used"
-    )
-    repeat_s: float = Field(
-        0.0,
-        ge=0,
-        le=1e6,
-        description="correlation time of one landmark's errors: sightings closer than this share their information",
-    )
-
-
 class MapConfig(Section):
     """How well the landmarks of the map were surveyed, where the map does not say it of each."""
 
     position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
     rotation_sigma_rad: float = Field(
         0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"
-    )
-
-
-def model_path(given: Any) -> Any:
-    """The file of a motion model; ``shipped:NAME`` is one that comes with the package.
-
-    Raises:
-        ValueError: no model of this name is shipped; those that are get listed.
-    """
-    if not str(given).startswith(_SHIPPED):
-        return given
-    path = _MODELS / (str(given).removeprefix(_SHIPPED) + ".safetensors")
-    if path.is_file():
-        return path
-    names = ", ".join(
-        sorted(f"{_SHIPPED}{p.relative_to(_MODELS).with_suffix('')}" for p in _MODELS.rglob("*.safetensors"))
-    )
-    raise ValueError(f"{given} is not shipped; there are {names}")
-
-
-class MotionConfig(Section):
-    """The learned motion model."""
-
-    model: Annotated[Path | None, BeforeValidator(model_path)] = Field(
-        None,
-        description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
-    )
-    use: bool = True
-    scale: float = Field(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
-    scale_sigma: float = Field(
-        0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
-    )
-    correlation: Literal["joint", "independent"] = Field(
-        "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
     )
 
 
@@ -352,7 +163,7 @@ class EstimatorConfig(Section):
 class Distrust(Section):
     """A time in which a motion source is known to be wrong."""
 
-    source: Literal["wheels", "learned", "gyro"]
+    source: Annotated[str, AfterValidator(_known_source)]
     start_s: float = Field(ge=-1e9, le=1e9, description="since the first step of the run")
     end_s: float = Field(ge=-1e9, le=1e9)
 
@@ -403,19 +214,13 @@ class TruthConfig(Section):
     max_gap_s: float = Field(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
 
 
-class Config(Section):
+class Config(registry.SensorSections):
     """Everything. ``robot.yaml`` holds the parts that differ from these defaults."""
 
     recording: RecordingConfig = RecordingConfig()
     gate: GateConfig = GateConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
-    wheels: WheelsConfig = WheelsConfig()
-    gyro: GyroConfig = GyroConfig()
-    camera: CameraConfig = CameraConfig()
-    markers: MarkersConfig = MarkersConfig()
-    landmarks: LandmarksConfig = LandmarksConfig()
     map: MapConfig = MapConfig()
-    motion: MotionConfig = MotionConfig()
     estimator: EstimatorConfig = EstimatorConfig()
     weights: WeightsConfig = WeightsConfig()
     batch: BatchConfig = BatchConfig()
@@ -460,21 +265,22 @@ def config_of(content: Any) -> Config:
     return config_type().model_validate(content)
 
 
-_PATH_KEYS = (("camera", "file"), ("motion", "model"))
-_SHIPPED = "shipped:"
-_MODELS = Path(__file__).parent / "sensors" / "learned" / "models"
+def _files(config: type[Config]) -> Iterator[tuple[str, str]]:
+    """Section and key of each setting that is a file."""
+    for name, section in config.model_fields.items():
+        if isinstance(section.annotation, type) and issubclass(section.annotation, Section):
+            for key, field in section.annotation.model_fields.items():
+                if Path in (field.annotation, *get_args(field.annotation)):
+                    yield name, key
 
 
 def yaml_of(config: Config, folder: Path) -> str:
     """What `load_config` reads back from a file in this folder: the values that were given, without the defaults."""
     data = config.model_dump(mode="json", exclude_unset=True)
-    for section, key in _PATH_KEYS:
+    for section, key in _files(type(config)):
         path = getattr(getattr(config, section), key)
         if path is not None:
-            shipped = path.is_relative_to(_MODELS)
-            data[section][key] = (
-                f"{_SHIPPED}{path.relative_to(_MODELS).with_suffix('')}" if shipped else os.path.relpath(path, folder)
-            )
+            data[section][key] = registry.shipped_name(path) or os.path.relpath(path, folder)
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
 
 
@@ -485,8 +291,8 @@ def load_config(path: Path) -> Config:
         ConfigError: the file is missing, is not YAML, or has an unknown key or a value out of range; all are named.
     """
     settings = Settings(path, "give a YAML file with --config")
-    for section, key in _PATH_KEYS:
+    for section, key in _files(config_type()):
         part = settings.content.get(section)
-        if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(_SHIPPED):
+        if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(SHIPPED):
             settings.content[section] = part | {key: path.parent / part[key]}
     return settings.validated(config_type())

@@ -8,8 +8,9 @@ import numpy as np
 
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.config import Config, WheelsConfig
+from fgloc.config import Config
 from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, Event, FloatArray
 from training.config import DataConfig

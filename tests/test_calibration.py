@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 from datasets.bag import BagWriter
 from fgloc import cli, se2
 from fgloc.calibration.multi_run import calibrate
-from fgloc.config import Config, load_config, model_path, yaml_of
+from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
+from fgloc.sensors.learned.config import model_path
 
 START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (4.0, 0.5), 1: (0.5, 4.0), 2: (-4.0, -0.5), 3: (-0.5, -4.0)}

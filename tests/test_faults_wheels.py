@@ -10,12 +10,14 @@ import pytest
 from motion_models import make_card, make_tensors
 from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
 
-from fgloc.config import BatchConfig, GyroConfig, MotionConfig
+from fgloc.config import BatchConfig
 from fgloc.graph.batch import BatchSmoother
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Kinematics
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels.events import OdometryEvent
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from fgloc.config import GyroConfig
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.types import Step, by_class

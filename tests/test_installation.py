@@ -24,7 +24,7 @@ from robot_world import (
 )
 
 from fgloc import se2
-from fgloc.config import BatchConfig, Config, EstimatorConfig, GyroConfig
+from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.factors import LandmarkFactors
@@ -34,6 +34,7 @@ from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.markers.events import CornersEvent

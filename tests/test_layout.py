@@ -18,7 +18,10 @@ from fgloc.sensors.maps import load_map
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
 BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
-UPWARD = {("types", "fgloc.evaluation.report")}  # RunResult.write, imported when it is called
+UPWARD = {
+    ("types", "fgloc.evaluation.report"),  # RunResult.write, imported when it is called
+    ("config", "fgloc.sensors"),  # the registry: sensors bring their sections
+}
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
 ONLY = {  # the one place that may import a library

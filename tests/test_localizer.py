@@ -27,10 +27,10 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import MotionConfig
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.pose_fit import joint_fit
 from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.motion_compensation import carry
 from fgloc.types import LandmarkMap, Mode, PixelMeasurement

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from marker_scenes import forward_camera, image_event, project, render, standing, texture
 
-from fgloc.config import MarkersConfig
 from fgloc.errors import ConfigError
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector, detect_stream, suggest_dictionary
 from fgloc.sensors.markers.dictionaries import dictionary_names, load_dictionary
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent

@@ -11,7 +11,6 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
-from fgloc.config import MotionConfig, NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned import (
     DisplacementModel,
@@ -24,7 +23,9 @@ from fgloc.sensors.learned import (
 )
 from fgloc.sensors.learned.card import Kind
 from fgloc.sensors.learned.commands import CommandHistory
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import noise_density
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import ControlEvent, Step, by_class
 
 SECOND = 1_000_000_000

@@ -10,10 +10,10 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
-from fgloc.config import MotionConfig
 from fgloc.errors import ConfigError, ModelError
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import LearnedMotion, load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.signals import Signal, SignalReader, Signals
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, MotionEvent, Step, by_class

@@ -13,7 +13,7 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse, predict
@@ -24,9 +24,11 @@ from fgloc.robust.motion_faults import FaultVerdict
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels.motion import WheelMotion

@@ -11,7 +11,7 @@ from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import read_record
 from fgloc.ablation.suite import Suite, expand
 from fgloc.cli.runs import SAMPLE
-from fgloc.config import MarkersConfig
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import ImageError
 from fgloc.sensors.markers.remembered import RememberedDetections

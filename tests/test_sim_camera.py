@@ -10,8 +10,8 @@ from datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
 from datasets.sim.mjcf import camera_rotation, intrinsics
 from datasets.sim.physics import Log, Scene, make_scene, simulate
 from datasets.sim.scenario import Camera, Control, Scenario
-from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
 

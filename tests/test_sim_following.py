@@ -269,6 +269,11 @@ def test_other_poses_guide_the_robot_too(pose: str, tmp_path: Path) -> None:
     assert f"{done.score.track_mm:.1f} mm" in table({"hook": (drive, done)})
 
 
+def test_fgloc_cannot_guide_a_robot_without_camera() -> None:
+    with pytest.raises(ConfigError, match="scenario 'room' shows the robot no markers"):
+        follow(Drive(ROOM.model_copy(update={"camera": None}), HOOK, "fgloc"))
+
+
 # --- The benchmark ----------------------------------------------------------------------------------------------------
 
 

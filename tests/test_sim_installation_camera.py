@@ -15,8 +15,8 @@ from datasets.sim.installed import MountedCamera, load_installed
 from datasets.sim.physics import Log, make_scene, simulate
 from datasets.sim.record import record
 from datasets.sim.scenario import Camera, Control, Scenario
-from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, Landmark
 

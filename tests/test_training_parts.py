@@ -13,10 +13,10 @@ from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from datasets.bag import BagWriter
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import ControlEvent, Trajectory
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig

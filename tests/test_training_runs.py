@@ -10,10 +10,11 @@ import yaml
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
 from datasets.bag import BagWriter
-from fgloc.config import Config, WheelsConfig
+from fgloc.config import Config
 from fgloc.errors import RecordingError
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import load_model
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Event
 from training import train as training

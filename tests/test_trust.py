@@ -113,7 +113,7 @@ class Witness:
 
     class model:  # noqa: N801
         class card:  # noqa: N801
-            reads_wheels = False
+            reads_wheels = reads_gyro = False
             inputs = ("commands",)
 
 

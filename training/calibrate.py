@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
-from fgloc.config import NoiseDensity
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, Row
 from fgloc.sensors.learned.forms import calibrated
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import FloatArray
 from training.config import CalibrationConfig
 from training.data import Run

@@ -8,12 +8,14 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fgloc.config import Config, GyroConfig, WheelsConfig
+from fgloc.config import Config
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.learned.card import WheelJoints
 from fgloc.sensors.learned.signals import Signals, signals_of
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Event, FloatArray, Step

@@ -21,10 +21,10 @@ from rosbags.highlevel import AnyReader
 from datasets.sim.ground import make_ground, outline
 from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import EPOCH_NS
-from fgloc.config import MarkersConfig
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, LandmarkMap
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from fgloc.calibration.contradictions import contradicted
 from fgloc.config import Config
+from fgloc.sensors import registry
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
@@ -82,7 +83,7 @@ def clock_note(
     late = given - setting
     if abs(late) < _LATE_S:
         return None
-    has_gyro = any(s.name == "gyro.scale" for s in result.found.settings)
+    has_gyro = any(s.name.startswith(f"{registry.motion_names().rate}.") for s in result.found.settings)
     name, against = _names(trial.role, has_gyro)
     sentence = (
         f"The stamps of the {name} are {abs(late):.3f} ± {sigma:.3f} s {'late' if late > 0 else 'early'} against the "
@@ -104,7 +105,10 @@ def _with(config: Config, trial: Trial) -> Config:
 def _names(role: str, has_gyro: bool) -> tuple[str, str]:
     """Of the clock that is wrong, and of those that it is compared to."""
     if role == "imu":
-        return "gyro", "wheels and sightings, which agree"
+        return registry.motion_names().rate, "wheels and sightings, which agree"
     if role in _WHEELS:
-        return "wheels", "sightings and gyro" if has_gyro else "sightings (either clock may be wrong)"
+        return (
+            registry.motion_names().odometer,
+            "sightings and gyro" if has_gyro else "sightings (either clock may be wrong)",
+        )
     return "sightings", "wheels and gyro, which agree" if has_gyro else "wheels (either clock may be wrong)"

@@ -53,8 +53,9 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     """
     from pydantic import ValidationError
 
-    from fgloc.config import MotionConfig, config_of, load_config
+    from fgloc.config import config_of, load_config
     from fgloc.recording.files import find_beside
+    from fgloc.sensors.learned.config import MotionConfig
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = config_of({}) if file is None else load_config(file)

@@ -15,6 +15,7 @@ from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
 from fgloc.diagnosis.turning import GyroWitness, Turning
 from fgloc.diagnosis.window import PRIOR_SIGMAS, PRIOR_SIGMAS_NO_MAP, Fault, Fit, Window, fit_window
+from fgloc.sensors import registry
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.types import Camera, FloatArray, LandmarkMap, MotionMeasurement, Step
 
@@ -160,13 +161,13 @@ class Diagnosis:
 
     def _drifts(self) -> Iterator[str]:
         yield from self._drift(self._faults, Fault.LATE, "sightings")
-        yield from self._drift(self._gyro.pool, Turning.LATE, "gyro")
+        yield from self._drift(self._gyro.pool, Turning.LATE, registry.motion_names().rate)
 
     def _offsets(self, faults: Pooled, source: str) -> Iterator[tuple[Role, str, float, float, str]]:
         """Role, name, lateness and its sigma [s], and the clocks that it is late against; none if a clock drifts."""
         if any(self._drifts()):  # then there is no constant offset to be set
             return
-        gyro = self._gyro.pool.constant()
+        gyro, names = self._gyro.pool.constant(), registry.motion_names()
         late, late_sigma = faults.values[Fault.LATE], faults.sigmas[Fault.LATE]
         gyro_late, gyro_sigma = gyro.values[Turning.LATE], gyro.sigmas[Turning.LATE]
         sightings_off = _sure(faults, Fault.LATE, _MIN_LATE_S)
@@ -174,12 +175,12 @@ class Diagnosis:
         wheels: Role = "joints" if source == "ticks" else "odometry"
         same = abs(late - gyro_late) < max(_MIN_LATE_S, 3.0 * math.hypot(late_sigma, gyro_sigma))
         if sightings_off and gyro_off and same:
-            yield wheels, "wheels", -float(gyro_late), float(gyro_sigma), "sightings and gyro"
+            yield wheels, names.odometer, -float(gyro_late), float(gyro_sigma), "sightings and gyro"
         else:
             if sightings_off:
-                yield self._seen_by, "sightings", float(late), float(late_sigma), "wheels"
+                yield self._seen_by, "sightings", float(late), float(late_sigma), names.odometer
             if gyro_off:
-                yield "imu", "gyro", float(gyro_late), float(gyro_sigma), "wheels"
+                yield "imu", names.rate, float(gyro_late), float(gyro_sigma), names.odometer
 
     def _offset(self, role: Role, name: str, late_s: float, sigma_s: float, others: str) -> str:
         known = self._config.recording.stamp_offset_s.get(role, 0.0)

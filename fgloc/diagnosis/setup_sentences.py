@@ -14,6 +14,7 @@ from fgloc.diagnosis.pose_text import pose_text, sensor_pose
 from fgloc.diagnosis.setup_changes import Change, angle_of, k1_of
 from fgloc.diagnosis.setup_fit import Setup
 from fgloc.diagnosis.setup_motion import EXTRAS
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, LandmarkMap
 
 _SAID_DEG = 1.0  # degrees: less is not put into words
@@ -57,9 +58,9 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
         case "image_clock":
             return _clock(given, image, "images" if image == "image" else "sightings", values["late_s"])
         case "wheel_clock":
-            return _clock(given, wheels, "wheels", -values["late_s"])
+            return _clock(given, wheels, registry.motion_names().odometer, -values["late_s"])
         case "gyro_clock":
-            return _clock(given, "imu", "gyro", -values["gyro_late_s"])
+            return _clock(given, "imu", registry.motion_names().rate, -values["gyro_late_s"])
         case _:
             return _wheels(change, given, source)
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc.calibration.contradictions import SURE_SIGMAS, contradicted
 from fgloc.evaluation.judgement_effects import effect, plural
+from fgloc.sensors import registry
 from fgloc.types import Decision, IntArray, RunResult, Trajectory
 
 Kind = Literal[
@@ -68,7 +69,6 @@ _OF_PLACES: Mapping[str, Kind] = {
     "landmark_moved": "landmark_moved",
 }
 _OF_MODES: Mapping[str, Kind] = {"dead_reckoning": "outage", "lost": "lost", "unconfirmed": "unconfirmed"}
-_MOTIONS = ("wheels", "learned", "gyro")
 _JOIN_NS = 1_000_000_000  # rows of one kind and subject further apart than this are two episodes ...
 _LASTING = ("landmark_moved", "misread", "initial_pose_contradicted")  # ... but for these
 _FEW = 2  # sightings rejected: as few of a landmark in a row are outliers, and all outliers one judgement
@@ -156,11 +156,11 @@ def episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[Judg
 
 def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
     """Rows by what they say, and of what."""
-    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in _MOTIONS}
+    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in registry.motion_names()}
     moved = {d.landmark_id for d in decisions if d.reason in ("quarantined", "landmark_moved")}
     grouped: dict[tuple[Kind, str], list[Decision]] = defaultdict(list)
     for i, d in enumerate(decisions):
-        if d.kind in _MOTIONS and last[d.step, d.kind] != i:
+        if d.kind in registry.motion_names() and last[d.step, d.kind] != i:
             continue  # judged again further down
         if (named := _named(d, moved)) is not None:
             grouped[named].append(d)
@@ -173,7 +173,7 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
     """Kind and subject of a row; None: nothing is wrong, or another row says it."""
     if not d.reason:
         return None
-    if d.kind in _MOTIONS:
+    if d.kind in registry.motion_names():
         return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
     if d.kind == "mode":
         return _OF_MODES[d.reason], "pose"
@@ -250,7 +250,7 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
         return f"{statistic:.1f} s without an accepted sighting{bound}; {count}"
     if not math.isfinite(statistic) or statistic == 0.0:
         return count
-    names = {"wheels": "GLR", "learned": "NIS", "gyro": "NIS", "place": "NIS"}
+    names = {registry.motion_names().odometer: "GLR"}
     names |= {"lift": f"{worst.reason.replace('_', ' ')}: NIS"}
     name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
     bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""

@@ -32,9 +32,10 @@ from fgloc.evaluation.style import (
     shade_modes,
     tidy,
 )
+from fgloc.sensors import registry
 from fgloc.types import Decision, FloatArray, IntArray, RunResult
 
-_SOURCES = ("wheels", "learned", "gyro", "unknown")
+_SOURCES = (*registry.motion_names(), "unknown")
 _NOT_SEEN = (*_SOURCES, "place", "prior", "mode", "clock")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20

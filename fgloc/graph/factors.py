@@ -22,6 +22,7 @@ from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import Observations
+from fgloc.sensors import registry
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,
@@ -139,7 +140,7 @@ def sighting_factors(
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
     """Between-factor from keyframe k - 1 to k; a kernel other than "none" is put on the wheels' alone."""
     noise = gaussian(m.cov)
-    if m.source == "wheels" and kernel != "none":
+    if m.source == registry.motion_names().odometer and kernel != "none":
         noise = gtsam.noiseModel.Robust.Create(_KERNELS[kernel], noise)
     return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), noise)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgloc.sensors import registry
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
@@ -60,11 +61,12 @@ class NoiseBudget:
         That of the learned motion follows the wheels' up to what it is worth beside wrong wheels; below 1 by the root,
         as it is not known which of the two has too large a covariance.
         """
-        if "wheels" in self.rejected:
-            return {"learned": _LEARNED_BESIDE_WRONG_WHEELS}
+        names = registry.motion_names()
+        if names.odometer in self.rejected:
+            return {names.model: _LEARNED_BESIDE_WRONG_WHEELS}
         scale = self.scale
         learned = min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)
-        return {"wheels": scale, "learned": learned}
+        return {names.odometer: scale, names.model: learned}
 
     def combine(self, readings: MotionReadings, rules: FusionRules) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other; none where no source that is left measured the distance.
@@ -76,13 +78,13 @@ class NoiseBudget:
             rules: how they depend on each other.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
-        scales = self.scales
+        scales, names = self.scales, registry.motion_names()
         if wheels is not None:
-            wheels = _scaled(wheels, scales.get("wheels", 1.0))
-        learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
-        if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
+            wheels = _scaled(wheels, scales.get(names.odometer, 1.0))
+        learned = None if learned is None or names.model in self.rejected else _scaled(learned, scales[names.model])
+        if gyro is None or names.rate in self.rejected or (learned is not None and rules.learned_has_gyro):
             gyro = None
-        if wheels is not None and "wheels" in self.rejected:
+        if wheels is not None and names.odometer in self.rejected:
             wheels = None if learned is not None else self._with_slip(wheels, rules)
         elif wheels is not None and learned is not None:
             if rules.wheels_are_commands:
@@ -100,7 +102,7 @@ class NoiseBudget:
 
     def _with_slip(self, wheels: MotionMeasurement, rules: FusionRules) -> MotionMeasurement:
         """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip."""
-        slips = self.rejected["wheels"] == "slip"
+        slips = self.rejected[wheels.source] == "slip"
         speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = max((wheels.stamp_ns - wheels.start_ns) * 1e-9, 1e-3)
         speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds

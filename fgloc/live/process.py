@@ -38,7 +38,7 @@ _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.li
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
 # Motion events only matter to the estimation when a sighting or a question comes.
-_GATHER_S = 0.01  # for which they wait for one another: waking both processes costs more than sending
+_GATHER_S = 0.005  # for which they wait for one another: waking both processes costs more than sending
 _END_S = 10.0  # that it may take to use what it has and to save its state
 _ANSWERING = 4  # its threads that answer questions
 

@@ -11,6 +11,7 @@ from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.motion_faults import FaultVerdict
+from fgloc.sensors import registry
 from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
 
 JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...
@@ -38,19 +39,20 @@ def motion_decisions(
     rows = []
     overruled = "" if budget.overruled_cov is None else OVERRULED
     used = {m.source: m for m in motions}
-    for source in ("wheels", "learned", "gyro", "unknown"):
-        reading = getattr(readings, source, None) or used.get(source)
+    unknown = [m for m in motions if m.source == "unknown"]
+    for reading in (readings.wheels, readings.learned, readings.gyro, *unknown):
+        source = "" if reading is None else reading.source
         why = budget.rejected.get(source, overruled)
         if reading is None or (source not in used and not why):
             continue
         nis, threshold, shift = 0.0, math.nan, math.nan
-        reference = readings.learned if source == "wheels" else readings.wheels
-        if source == "wheels" and math.isfinite(verdict.nis):
+        reference = readings.learned if reading is readings.wheels else readings.wheels
+        if reading is readings.wheels and math.isfinite(verdict.nis):
             nis, threshold = verdict.nis, verdict.threshold
         if reference is not None:
             difference: FloatArray = se2.log(se2.between(reference.motion, reading.motion))
-            shift = math.nan if source == "gyro" else float(difference[0])
-            if source != "wheels":
+            shift = math.nan if reading is readings.gyro else float(difference[0])
+            if reading is not readings.wheels:
                 nis = float(difference @ np.linalg.solve(reference.cov + reading.cov, difference))
         weight = 0.0 if why else 1.0 / budget.scales.get(source, 1.0)
         rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why, threshold, shift))
@@ -94,5 +96,4 @@ def flag_notes(flags: Mapping[str, int]) -> Iterator[str]:
     """Of sources that were flagged, by "source.reason"."""
     for kind, n in sorted(flags.items()):
         source, reason = kind.split(".")
-        name = "learned motion" if source == "learned" else source
-        yield f"the {name} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"
+        yield f"the {registry.title_of(source)} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"

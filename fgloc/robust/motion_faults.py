@@ -13,6 +13,7 @@ from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.glr_test import GlrTest
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, MotionReadings, Step
 
 _MOVED = 0.25  # of the reference source's travel: a wheel that turned less than this while it did more stood still
@@ -75,7 +76,7 @@ class MotionFaultMonitor:
     def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
         """Take in the readings of a step that follows the last one."""
         rejected = self._known_failures(step)
-        if "wheels" in rejected:  # nothing to be found out
+        if registry.motion_names().odometer in rejected:  # nothing to be found out
             self.reset()
         readings = replace(readings, **dict.fromkeys(rejected))
         difference = source_difference(readings, self._sources) if self._config.adaptive else None
@@ -92,11 +93,11 @@ class MotionFaultMonitor:
             self._reason = "slip"
         reason = self._failure(verdict.since)
         if verdict.since or reason != self._reason:
-            self.flags[f"wheels.{reason}"] += 1
+            self.flags[f"{registry.motion_names().odometer}.{reason}"] += 1
             if not verdict.since:  # the same failure, seen better now
-                self.flags -= Counter({f"wheels.{self._reason}": 1})
+                self.flags -= Counter({f"{registry.motion_names().odometer}.{self._reason}": 1})
             self._reason = reason
-        budget = NoiseBudget({"wheels": reason, **rejected})
+        budget = NoiseBudget({registry.motion_names().odometer: reason, **rejected})
         return FaultVerdict(budget, max(verdict.since, 1), verdict.nis, self._config.alarm)
 
     def _known_failures(self, step: Step) -> dict[str, str]:

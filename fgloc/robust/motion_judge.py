@@ -19,11 +19,11 @@ from fgloc.robust.decision_log import flag_notes, motion_decisions
 from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources
+from fgloc.sensors import registry
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
 
 _WORTH_A_REVISION = 4.0  # times the scale on its covariances: a step that disagrees more than it did is combined anew
-_CARRIED = NoiseBudget({"wheels": "carried", "learned": "carried"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ class MotionJudge:
         self.sources = MotionSources(config, sensors, estimator.factors)
         self.rejections: Counter[str] = Counter()
         self._estimator = estimator
-        self._faults = MotionFaultMonitor(config.weights, self.sources, config.wheels.track)
+        self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m)
         self._lift = LiftMonitor()
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
@@ -113,7 +113,7 @@ class MotionJudge:
         revisions = self._revise(verdict)
         factors = tuple(self.combine(step, readings, verdict.budget))
         if self._lift.carried:
-            return JudgedMotion(factors, MotionReadings(), _CARRIED, verdict, revisions)
+            return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
         if factors[0].source == "unknown":
             self.rejections["motion.silent"] += 1
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
@@ -164,13 +164,19 @@ class MotionJudge:
         return tuple(decisions)
 
 
+def _carried() -> NoiseBudget:
+    names = registry.motion_names()
+    return NoiseBudget({names.odometer: "carried", names.model: "carried"})
+
+
 def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:
     """The budget of an earlier step by what is known now; None: it stays."""
     before = frame.budget
-    if "wheels" in now.rejected:
-        if "wheels" in before.rejected:
+    odometer = registry.motion_names().odometer
+    if odometer in now.rejected:
+        if odometer in before.rejected:
             return None
-        return replace(before, rejected={**before.rejected, "wheels": now.rejected["wheels"]})
+        return replace(before, rejected={**before.rejected, odometer: now.rejected[odometer]})
     if now.scale >= _WORTH_A_REVISION * max(before.scale, 1.0):
         return replace(before, scale=now.scale)
     return None

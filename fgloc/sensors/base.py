@@ -11,12 +11,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
 
-from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.field_checks import FieldChecks
 from fgloc.sensors.topic_checks import Collector, TimingOnly
 from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement, Setting
+
+if TYPE_CHECKING:
+    from fgloc.config import Config, GateConfig, Section
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
@@ -24,7 +26,7 @@ When = tuple[int, int, str]
 Converter = Callable[[Any, When], Event]
 """From a decoded message (fields as the message definition names them) to an event."""
 
-Check = Callable[[Any, GateConfig], Event | str]
+Check = Callable[[Any, "GateConfig"], Event | str]
 """Validates an event: the event, a repaired copy, or in one word why it is rejected."""
 
 Validator = Callable[[FieldChecks], Callable[[Any], Event | str]]

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fgloc.config import CameraConfig
 from fgloc.errors import CameraError
 from fgloc.files.documents import Item, read_document
+from fgloc.sensors.sighting_config import CameraConfig
 from fgloc.types import Camera, CameraInfoEvent, FloatArray
 
 # What ROS, OpenCV and Kalibr call the models. The number of coefficients tells plumb_bob and rational_polynomial apart.

@@ -9,12 +9,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from fgloc.config import GateConfig
 from fgloc.types import MAX_LANDMARK_ID, FloatArray, Sighting, SightingsEvent
+
+if TYPE_CHECKING:
+    from fgloc.config import GateConfig
 
 _ASYMMETRY = 1e-4  # of a correlation: less is rounding, more is a mistake
 _INDEFINITE = 1e-6  # an eigenvalue of a correlation matrix may be this negative

@@ -7,6 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fgloc.extensions import outside_sensors
+from fgloc.files.section import Section
 from fgloc.sensors.base import (
     BuiltIn,
     Context,
@@ -18,12 +19,30 @@ from fgloc.sensors.base import (
     Sensor,
     Stream,
 )
+from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.learned.config import MotionConfig, shipped_name
+from fgloc.sensors.markers.config import MarkersConfig
+from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.types import Event, LandmarkSighting
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, Section
+    from fgloc.config import Config
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
+
+__all__ = ["SensorSections", "built_in", "shipped_name"]
+
+
+class SensorSections(Section):
+    """Settings of the built-in sensors, by their keys of ``robot.yaml``: one line each."""
+
+    wheels: WheelsConfig = WheelsConfig()
+    gyro: GyroConfig = GyroConfig()
+    camera: CameraConfig = CameraConfig()
+    markers: MarkersConfig = MarkersConfig()
+    landmarks: LandmarksConfig = LandmarksConfig()
+    motion: MotionConfig = MotionConfig()
 
 
 @cache

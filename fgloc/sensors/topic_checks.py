@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.config import Config
 from fgloc.types import Event, FloatArray, RawEvent, SightingsEvent
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
 
 _UNIT_TOLERANCE = 0.05
 

@@ -9,9 +9,9 @@ from collections import Counter
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fgloc.config import GyroConfig
 from fgloc.sensors.base import Turn
 from fgloc.sensors.gyro import installation
+from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from fgloc.config import NoiseDensity, Section
+from fgloc.config import Section
+from fgloc.sensors.wheels.config import NoiseDensity
 
 FORMAT = "fgloc-motion"
 VERSION = 1

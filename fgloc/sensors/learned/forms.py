@@ -14,12 +14,12 @@ from typing import Protocol
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.signals import Signals
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray
 
 _SMALL = 1e-9

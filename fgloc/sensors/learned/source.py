@@ -9,8 +9,8 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from fgloc import se2
-from fgloc.config import MotionConfig
 from fgloc.sensors.learned import installation
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.signals import SignalReader
 from fgloc.types import FloatArray, MotionMeasurement, Step

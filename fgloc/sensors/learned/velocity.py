@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.config import NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import ModelCard
 from fgloc.sensors.learned.commands import CommandHistory
@@ -21,6 +20,7 @@ from fgloc.sensors.learned.forms import (
 )
 from fgloc.sensors.learned.network import Answering
 from fgloc.sensors.learned.signals import Signals
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from fgloc.config import MarkersConfig
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
 from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners

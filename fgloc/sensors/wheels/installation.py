@@ -16,7 +16,8 @@ from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, 
 from fgloc.types import FloatArray, MotionMeasurement, Setting
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, WheelsConfig
+    from fgloc.config import Config
+    from fgloc.sensors.wheels.config import WheelsConfig
 
 _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
 OF_CLOCK = ("wheels.time_offset_s", "wheels.delay_s")

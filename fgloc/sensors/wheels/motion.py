@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import WheelsConfig
 from fgloc.sensors.wheels import installation
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.encoders import TicksTrack
 from fgloc.sensors.wheels.odometry import OdometryTrack
 from fgloc.sensors.wheels.timeline import TwistTimeline
@@ -92,6 +92,11 @@ class WheelMotion:
         if self._silent_steps:
             notes.append(f"no wheel motion was known for {self._silent_s:.1f} s in {self._silent_steps} steps")
         return tuple(notes)
+
+    @property
+    def track_m(self) -> float | None:
+        """Distance of the wheels [m], by which left is told from right; None: not known."""
+        return self._config.track
 
     def measure(self, step: Step) -> MotionMeasurement | None:
         """Motion over the step. Measured again, the same step gives the same.

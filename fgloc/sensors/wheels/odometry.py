@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from fgloc import se2
-from fgloc.config import WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.frames import quaternion_yaw
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.timeline import Twist
 from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist

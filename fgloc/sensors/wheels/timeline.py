@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fgloc.config import NoiseDensity
 from fgloc.se2 import wrap
+from fgloc.sensors.wheels.config import NoiseDensity
 from fgloc.types import FloatArray
 
 Twist = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s] in the body frame

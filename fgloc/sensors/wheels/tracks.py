@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from fgloc.config import WheelsConfig
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.timeline import Twist, TwistTimeline
 from fgloc.types import ControlEvent, MotionEvent, Step
 
