@@ -15,11 +15,11 @@ from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
 from fgloc.sensors.base import Sensor
+from fgloc.sensors.detection import SensorDetector
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, LandmarkMap
 
@@ -31,7 +31,7 @@ class Assembly:
     config: Config
     landmark_map: LandmarkMap | None
     gate: EventValidator
-    detector: MarkerDetector | None
+    detector: SensorDetector | None
     detections: EventValidator  # what the detector found has the stamps of its images, which the gate has seen
     stepper: KeyframeBuilder
     wheels: WheelMotion

@@ -16,9 +16,9 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
+from fgloc.sensors.detection import SensorDetector
 from fgloc.sensors.learned import LearnedMotion, load_model
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -54,7 +54,7 @@ class SensorSetup:
 
     config: Config
     landmark_map: LandmarkMap | None
-    detector: MarkerDetector | None
+    detector: SensorDetector | None
     camera: Camera | None
     T_base_sensor: FloatArray | None
     learned: LearnedMotion | None
@@ -107,20 +107,13 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
-    detector = _detector(landmark_map, config) if "image" in facts.roles else None
+    detector = registry.detector(config, landmark_map) if "image" in facts.roles else None
     learned = imu_up = None
     if config.motion.use and config.motion.model is not None:
         learned = LearnedMotion(load_model(config.motion.model), config.motion, mounted_up(facts, config, facts.first))
     if "imu" in facts.roles and config.gyro.use:
         imu_up = mounted_up(facts, config, facts.first)
     return SensorSetup(config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, sensors, tuple(notes))
-
-
-def _detector(landmark_map: LandmarkMap | None, config: Config) -> MarkerDetector:
-    dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
-    if not dictionary:
-        raise ConfigError("no marker dictionary: set markers.dictionary (such as DICT_4X4_50) in --config or the map")
-    return MarkerDetector(dictionary, config.markers)
 
 
 def _need_motion(facts: StreamFacts) -> None:

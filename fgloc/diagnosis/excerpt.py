@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,20 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
-from fgloc.sensors.markers.detector import Detector
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.detection import DetectionError, Detector
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Event, FloatArray, InertialEvent, IntArray, MotionEvent, Step, TruthEvent, by_class
+from fgloc.types import (
+    Event,
+    FloatArray,
+    InertialEvent,
+    IntArray,
+    MotionEvent,
+    RawEvent,
+    SightingsEvent,
+    Step,
+    TruthEvent,
+    by_class,
+)
 
 STRETCHES = 5
 STRETCH_S = 4.0  # within it wheels err by centimetres only
@@ -32,7 +42,7 @@ class Picture:
     """The markers of the map in one image."""
 
     stamp_ns: int
-    seen: tuple[MarkerCorners, ...]
+    seen: tuple[Any, ...]  # sightings in pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,13 +135,13 @@ class ExcerptCollector:
         role = self._role_of.get(event.topic)
         if role is not None:
             self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
-        if isinstance(event, ImageEvent | CornersEvent):
+        if isinstance(event, RawEvent) or (isinstance(event, SightingsEvent) and event.in_pixels):
             self._take_image(event)
         else:
             _take_motion(self.found, self._gate, event)
         return True
 
-    def _take_image(self, event: ImageEvent | CornersEvent) -> None:
+    def _take_image(self, event: RawEvent | SightingsEvent) -> None:
         if self._first_image is None:
             self._first_image = event.stamp_ns
             self._end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
@@ -142,7 +152,7 @@ class ExcerptCollector:
         self._last_image = event.stamp_ns
         corners = _corners(event, self._detector)
         passed = None if corners is None else self._gate.check(corners)
-        if isinstance(passed, CornersEvent):
+        if isinstance(passed, SightingsEvent):
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
         elif corners is not None:
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
@@ -158,14 +168,15 @@ def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
         found.truth.append(passed)
 
 
-def _corners(event: ImageEvent | CornersEvent, detector: Detector | None) -> CornersEvent | None:
-    if isinstance(event, CornersEvent):
+def _corners(event: RawEvent | SightingsEvent, detector: Detector | None) -> SightingsEvent | None:
+    if isinstance(event, SightingsEvent):
         return event
     if detector is None:
         return None
     try:
-        return detector.detect(event)
-    except ImageError:
+        found: SightingsEvent = detector.detect(event)
+        return found
+    except DetectionError:
         return None
 
 

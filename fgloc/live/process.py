@@ -28,8 +28,7 @@ from fgloc.live.anchors import Anchor, MotionParts, Outlet
 from fgloc.live.estimation import Estimation, Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.types import Estimate, Event
+from fgloc.types import Estimate, Event, RawEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
@@ -79,10 +78,10 @@ class EstimationProcess:
         """As `Estimation.put`."""
         with self._changed:
             self._queue(event)
-            if isinstance(event, ImageEvent):
+            if isinstance(event, RawEvent):
                 self._images += 1
                 if self._images > self._most_images:
-                    self._drop(next(e for e in self._waiting if isinstance(e, ImageEvent)))
+                    self._drop(next(e for e in self._waiting if isinstance(e, RawEvent)))
             if len(self._waiting) > _MOST_WAITING:
                 self._drop(next(e for e in self._waiting if isinstance(e, Event)))
 
@@ -144,7 +143,7 @@ class EstimationProcess:
 
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
-        self._images -= isinstance(event, ImageEvent)
+        self._images -= isinstance(event, RawEvent)
         self._dropped[role_of(event)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:

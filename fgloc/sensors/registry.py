@@ -24,12 +24,14 @@ from fgloc.sensors.learned.config import MotionConfig, shipped_name
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
 from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.types import Event, LandmarkSighting
+from fgloc.types import Event, LandmarkSighting, RawEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config
+    from fgloc.sensors.detection import SensorDetector
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
+    from fgloc.types import LandmarkMap
 
 __all__ = ["SensorSections", "built_in", "shipped_name"]
 
@@ -160,6 +162,30 @@ def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Pa
     """Parameters of the motion sources in the order in which they stand in the state."""
     made = [p for installation in motion_installations() for p in installation.parameters(config, roles)]
     return tuple(sorted(made, key=lambda p: p.rank))
+
+
+def detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetector:
+    """The detector of the sensor that has raw data.
+
+    Raises:
+        ConfigError: the settings and the map do not say what is to be detected.
+    """
+    from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
+
+    return configured_detector(config, landmark_map)
+
+
+def fitting_dictionary(recording: Any) -> str | None:
+    """The dictionary of landmarks that fits the raw data of a recording; None if none does."""
+    from fgloc.sensors.markers.hints import fitting_dictionary as fitting
+
+    return fitting(recording)
+
+
+def detected_kinds() -> tuple[str, ...]:
+    """Names of the landmark measurements that are made of raw data."""
+    raw = [s for s in built_in() if any(issubclass(stream.event, RawEvent) for stream in s.streams)]
+    return tuple(sensor.name for sensor in raw if sensor.measured)
 
 
 def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:
