@@ -11,19 +11,23 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-all check equal format bench clean
+.PHONY: help demo follow test test-all check equal format bench clean
 
 help:
 	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
+	@echo "make follow    a simulated robot drives itself along waypoints: a picture and a table, in follow-out/"
 	@echo "make test      the quick tests"
 	@echo "make test-all  all tests"
 	@echo "make check     ruff format, ruff, mypy"
 	@echo "make equal     whether the bundled samples' results are those of the committed file, bit by bit"
 	@echo "make bench     the figures of the README"
-	@echo "make clean     remove .venv, caches and demo-out/"
+	@echo "make clean     remove .venv, caches, demo-out/ and follow-out/"
 
 demo: .venv/.base
 	$(BIN)/fgloc demo
+
+follow: .venv/.sim
+	$(BIN)/python -m datasets.sim follow-demo --out follow-out --jobs $(JOBS)
 
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
@@ -47,7 +51,7 @@ bench: .venv/.dev
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
 
 clean:
-	rm -rf .venv build demo-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf .venv build demo-out follow-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || \
@@ -58,6 +62,10 @@ clean:
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	@touch $@
 
+.venv/.sim: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[sim]'
+	@touch $@
+
 .venv/.dev: pyproject.toml constraints.txt | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@touch .venv/.base $@
+	@touch .venv/.base .venv/.sim $@

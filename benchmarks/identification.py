@@ -43,7 +43,7 @@ from training.train import leave_one_out, train
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODEL = _ROOT / "fgloc" / "motion" / "models" / "mrclam" / "all.safetensors"
+_MODEL = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam" / "all.safetensors"
 _HORIZONS_S = (10.0, 30.0, 60.0)
 _SHARES = (0.6, 0.7)  # of a run: what trains ends, what validates ends
 _WHOLE = DataConfig()

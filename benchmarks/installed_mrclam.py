@@ -30,7 +30,7 @@ from fgloc.types import Estimate, Step, Trajectory
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODELS = _ROOT / "fgloc" / "motion" / "models" / "mrclam"
+_MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
 _MODES = ("batch", "online")
 IDS = (
     "mrclam.first_pose_s",

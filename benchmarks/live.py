@@ -4,6 +4,8 @@
   that is, exposure to pose less the recorded transport delay.
 - ``live.extrapolated_over_keyframe``: meanwhile the newest pose is asked for at 50 Hz: its mean error over that of the
   keyframes.
+- ``live.extrapolated_gripping``: likewise of those poses only since whose keyframe no wheel has slipped: the beginning
+  of a slip is in no measurement before the next sighting.
 - ``live.disorder_ate_ratio``: simulated recordings as installed, with all that `benchmarks.live_streams` calls
   disordered, over the orderly stream: mean error of the keyframes; ``live.disorder_now_ratio``: of the newest pose,
   which has a camera that is 300 ms late behind it.
@@ -29,12 +31,16 @@ from fgloc import se2
 from fgloc.config import load_config
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose
+from fgloc.recording.cdr import Messages
 from fgloc.recording.reader import open_recording
+from fgloc.recording.storage import Storage
 from fgloc.sensors.markers.events import ImageEvent
-from fgloc.types import Estimate, Event, FloatArray, TruthEvent
+from fgloc.types import Estimate, Event, FloatArray, IntArray, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 _TIMED = ("installed_run", "patches_run", "light_drop_run")
+_SLIPPING = "/truth/slipping"  # std_msgs/Bool, at 50 Hz
+_TOLD_NS = 20_000_000
 _QUICK_S = 10.0
 _ASK_HZ = 50.0
 _ASK_EVERY = 20  # events, where the stream is faster than real time
@@ -54,15 +60,17 @@ def measure(quick: bool) -> Iterator[Row]:
 def timed(samples: Iterable[str], seconds: float | None) -> Iterator[Row]:
     """Latency, and the error of poses at 50 Hz."""
     latencies: list[float] = []
-    ratios = []
+    ratios, gripping = [], []
     for name in samples:
         sample = _Timed(SAMPLES / name, seconds)
         sample.run()
         latencies += sample.latencies_ms
-        ratios.append(sample.ratio)
+        ratios.append(sample.ratio())
+        gripping.append(sample.ratio(gripping=True))
     yield Row("live.latency_ms_p50", float(np.percentile(latencies, 50)), n=len(latencies), unit="ms")
     yield Row("live.latency_ms_p99", float(np.percentile(latencies, 99)), n=len(latencies), unit="ms")
     yield Row("live.extrapolated_over_keyframe", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
+    yield Row("live.extrapolated_gripping", float(np.mean(gripping)), float(np.std(gripping)), len(gripping))
 
 
 class _Timed:
@@ -81,6 +89,7 @@ class _Timed:
         self._stamps = np.array([e.stamp_ns for e in truths])
         self._truth = np.array([(*e.position[:2], quaternion_yaw(e.orientation)) for e in truths])
         self._map = folder / "map.yaml"
+        self._slips = _slips(folder / "bag")
         self._pushed: dict[int, float] = {}
         self._estimates: list[Estimate] = []
         self._asked: list[LivePose] = []
@@ -117,15 +126,30 @@ class _Timed:
             due += 1.0 / _ASK_HZ
             time.sleep(max(0.0, due - time.perf_counter()))
 
-    @property
-    def ratio(self) -> float:
-        """Mean error of the poses at 50 Hz over that of the keyframes."""
-        return self._error(self._asked) / self._error(self._estimates)
+    def ratio(self, gripping: bool = False) -> float:
+        """Mean error of the poses at 50 Hz over that of the keyframes; ``gripping``: while no wheel slips."""
+        asked, made = self._asked, self._estimates
+        if gripping:
+            asked = [p for p in asked if not self._slipped(p.keyframe_ns, p.stamp_ns)]
+            made = [e for e in made if not self._slipped(e.stamp_ns, e.stamp_ns)]
+        return self._error(asked) / self._error(made)
+
+    def _slipped(self, start_ns: int, end_ns: int) -> bool:
+        first, last = np.searchsorted(self._slips, [start_ns - _TOLD_NS, end_ns + _TOLD_NS])
+        return bool(last > first)
 
     def _error(self, told: Iterable[Estimate | LivePose]) -> float:
         inside = [p for p in told if self._stamps[0] <= p.stamp_ns <= self._stamps[-1]]
         truth = se2.interpolate(self._stamps, self._truth, np.array([p.stamp_ns for p in inside]))
         return float(np.hypot(*(np.array([p.pose for p in inside]) - truth)[:, :2].T).mean())
+
+
+def _slips(bag: Path) -> IntArray:
+    """Times ``(n,)`` at which a wheel slips, as the simulation has it."""
+    storage, messages = Storage(bag), Messages()
+    told = [(stamp, messages.decode(kind, raw).data) for _, kind, stamp, raw in storage.messages({_SLIPPING})]
+    storage.close()
+    return np.array([stamp for stamp, slips in told if slips], dtype=np.int64)
 
 
 # --- Disorder ---------------------------------------------------------------------------------------------------------

@@ -70,7 +70,9 @@ def _send(outputs: Outputs, count: int) -> None:
         time.sleep(0.01)
     for k in range(count):
         x = 0.5 * k
-        state = BaseState(k * 1_000_000_000, np.array([x, 0.0, 0.0]), np.diag([1.0, 1.0, x]), np.array([0.0, 0.0, x]))
+        state = BaseState(
+            k * 1_000_000_000, np.array([x, 0.0, 0.0]), np.diag([1.0, 1.0, x]), np.array([0.0, 0.0, x]), np.eye(3)
+        )
         outputs.odometry(state, "base_link")
         time.sleep(1.0 / _RATE_HZ)
 

@@ -30,7 +30,7 @@ from fgloc.types import PointMeasurement, RunResult
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODELS = _ROOT / "fgloc" / "motion" / "models" / "mrclam"
+_MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
 _SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
 _MRCLAM_UNITS = {
     "ate_mean_m": "m",

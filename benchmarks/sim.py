@@ -18,10 +18,11 @@ from rosbags.highlevel import AnyReader
 from benchmarks.common import Row, main, not_run
 from datasets.bag import BagWriter
 from datasets.sim.camera import RenderError, frames, pose_at
+from datasets.sim.floor import Floor
 from datasets.sim.mjcf import camera_rotation, intrinsics
 from datasets.sim.physics import Log, Scene, base_twist, center_of_mass, make_scene, simulate, slipping, wheel_twist
 from datasets.sim.record import record
-from datasets.sim.scenario import Camera, Control, Floor, Robot, Scenario, World
+from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from datasets.sim.sensors import streams
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.frames import quaternion_matrix

@@ -168,10 +168,8 @@ def _odometry(bag: BagWriter, events: Sequence[OdometryEvent]) -> Iterator[Messa
                 e.received_ns,
                 pose,
                 twist,
-                pose_cov=e.pose_cov,
-                twist_cov=e.twist_cov,
-                frame_id=e.frame_id,
-                child_frame_id=e.child_frame_id,
+                covs=(e.pose_cov, e.twist_cov),
+                frames=(e.frame_id, e.child_frame_id),
             ),
         )
 

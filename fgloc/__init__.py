@@ -10,6 +10,8 @@ The public API. Everything else may change from one version to the next::
     result = fgloc.run(Path("bag"), Path("map.yaml"), config, "batch")
     result.write(Path("out"))
 
+A sensor of another package is a class like `Sensor`; docs/adding-a-sensor.md goes through one.
+
 Names are imported when they are first used: the estimator's libraries take a second to load.
 """
 
@@ -34,17 +36,28 @@ from fgloc.errors import (
 )
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, load_config
+    from fgloc.config import Config, Section, load_config
     from fgloc.evaluation.results import Results, read_results
     from fgloc.live import Live
     from fgloc.runner import run
+    from fgloc.sensors.base import Context, Sensor, Stream
     from fgloc.sensors.maps import load_map
-    from fgloc.types import Decision, Estimate, LandmarkMap, Mode, RunResult, Trajectory
+    from fgloc.types import (
+        Decision,
+        Estimate,
+        LandmarkMap,
+        Mode,
+        PoseMeasurement,
+        RunResult,
+        SensorEvent,
+        Trajectory,
+    )
 
 __all__ = [
     "CameraError",
     "Config",
     "ConfigError",
+    "Context",
     "CovarianceError",
     "Decision",
     "Estimate",
@@ -56,9 +69,14 @@ __all__ = [
     "Mode",
     "ModelError",
     "OutputError",
+    "PoseMeasurement",
     "RecordingError",
     "Results",
     "RunResult",
+    "Section",
+    "Sensor",
+    "SensorEvent",
+    "Stream",
     "Trajectory",
     "TrajectoryError",
     "WireError",
@@ -70,17 +88,23 @@ __all__ = [
 
 _IMPORTED_LATE = {
     "Config": "fgloc.config",
+    "Section": "fgloc.config",
     "load_config": "fgloc.config",
     "Results": "fgloc.evaluation.results",
     "read_results": "fgloc.evaluation.results",
     "Live": "fgloc.live",
     "run": "fgloc.runner",
+    "Context": "fgloc.sensors.base",
+    "Sensor": "fgloc.sensors.base",
+    "Stream": "fgloc.sensors.base",
     "load_map": "fgloc.sensors.maps",
     "Decision": "fgloc.types",
     "Estimate": "fgloc.types",
     "LandmarkMap": "fgloc.types",
     "Mode": "fgloc.types",
+    "PoseMeasurement": "fgloc.types",
     "RunResult": "fgloc.types",
+    "SensorEvent": "fgloc.types",
     "Trajectory": "fgloc.types",
 }
 

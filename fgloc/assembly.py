@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgloc.config import Config, Role
-from fgloc.diagnosis import Diagnosis
+from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.stream_facts import StreamFacts
 from fgloc.intake.validation import EventValidator

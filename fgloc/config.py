@@ -115,7 +115,7 @@ class GateConfig(Section):
     gap_s: float = Field(1.0, gt=0, le=1e9, description="a silence of a sensor longer than this is reported")
     clock_jump_s: float = Field(60.0, gt=0, le=1e9, description="a jump ahead larger than this starts a new segment")
     clock_back_s: float = Field(1.0, gt=0, le=1e9, description="a jump back larger than this starts a new segment")
-    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is not believed")
+    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is rejected")
 
 
 class KeyframesConfig(Section):

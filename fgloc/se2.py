@@ -37,6 +37,14 @@ def compose(a: Triple, b: Triple) -> FloatArray:
     return np.array([ax + c * bx - s * by, ay + s * bx + c * by, wrap(at + bt)])
 
 
+def compose_array(a: FloatArray, b: FloatArray) -> FloatArray:
+    """`compose` of poses ``(n, 3)`` with others."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    x = a[:, 0] + c * b[:, 0] - s * b[:, 1]
+    y = a[:, 1] + s * b[:, 0] + c * b[:, 1]
+    return np.stack([x, y, wrap_array(a[:, 2] + b[:, 2])], axis=1)
+
+
 def inverse(a: Triple) -> FloatArray:
     """``T_a⁻¹``."""
     ax, ay, at = a

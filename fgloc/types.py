@@ -471,7 +471,7 @@ class Decision:
     threshold: float = math.nan  # that the NIS is held against; NaN: none
     shift_m: float = (
         math.nan
-    )  # of a motion: how much further forward than its reference; of a place: from the believed pose
+    )  # of a motion: how much further forward than its reference; of a place: from the estimated pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)

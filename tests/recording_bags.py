@@ -20,13 +20,13 @@ def write_drive(folder: Path, storage: str = "mcap", n: int = 200, start_ns: int
     K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]
     with BagWriter(folder, storage=storage) as bag:
         bag.static_transform(start_ns, "base_link", "camera_optical", (0.1, 0.0, 0.3), (-0.5, 0.5, -0.5, 0.5))
-        bag.camera_info("/camera/camera_info", start_ns, 640, 480, K, [0.1, -0.2, 0.0, 0.0, 0.0])
+        bag.camera_info("/camera/camera_info", start_ns, (640, 480), K, [0.1, -0.2, 0.0, 0.0, 0.0])
         for k in range(n):
             stamp = start_ns + k * TICK_NS
             received = stamp + 2_000_000
             angle = 0.02 * k
             pose = (math.sin(angle), 1.0 - math.cos(angle), angle)
-            bag.odometry("/odom", stamp, pose, (0.4, 0.4), received, np.eye(6) * 1e-3, np.eye(6) * 1e-3)
+            bag.odometry("/odom", stamp, pose, (0.4, 0.4), received, (np.eye(6) * 1e-3, np.eye(6) * 1e-3))
             bag.command("/cmd_vel", stamp, 0.4, 0.4, received)
             bag.joints("/joint_states", stamp, ["left", "right"], [0.1 * k, 0.12 * k], received_ns=received)
             truth = (pose[0], pose[1], 0.0), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))

@@ -34,7 +34,7 @@ def write_bag(folder, motion=True, info=(640, 480), image=(640, 480), camera_fra
     with BagWriter(folder / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "camera_optical", (0.1, 0.0, 0.3), OPTICAL)
         if info is not None:
-            bag.camera_info("/camera/camera_info", START_NS, *info, K, [0.0] * 5, frame_id=camera_frame)
+            bag.camera_info("/camera/camera_info", START_NS, info, K, [0.0] * 5, frame_id=camera_frame)
         for k in range(20):
             stamp = START_NS + k * 50_000_000
             if motion:

@@ -269,3 +269,10 @@ def test_notes_are_sentences(bag, tmp_path):
     notes = [line.removeprefix("note: ") for line in stdout.splitlines() if line.startswith("note: ")]
     assert len(notes) > 1
     assert all(note.endswith(".") and (note.startswith("/") or note[0].isupper()) for note in notes), notes
+
+
+def test_help_loads_no_library_but_the_command_lines():
+    script = "import sys; from fgloc import cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert "typer" in loaded
+    assert {"numpy", "pydantic", "gtsam", "cv2", "scipy", "rosbags", "matplotlib", "yaml"}.isdisjoint(loaded)

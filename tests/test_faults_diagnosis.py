@@ -28,7 +28,7 @@ from datasets import mrclam, pioneer, turtlebot3
 from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
-from fgloc.diagnosis import Diagnosis
+from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder

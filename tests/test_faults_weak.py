@@ -65,7 +65,7 @@ def test_fault_38_a_run_says_that_the_distortion_is_taken_as_zero(tmp_path):
     png = cv2.imencode(".png", np.full((480, 640), 128, np.uint8))[1].tobytes()
     with BagWriter(tmp_path / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "camera", (0.1, 0.0, 0.3), (-0.5, 0.5, -0.5, 0.5))
-        bag.camera_info("/camera/camera_info", START_NS, 640, 480, K, [], frame_id="camera")
+        bag.camera_info("/camera/camera_info", START_NS, (640, 480), K, [], frame_id="camera")
         for k in range(60):
             stamp = START_NS + k * 50_000_000
             bag.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.4, 0.0))

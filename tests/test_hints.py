@@ -34,7 +34,7 @@ def short_bag(folder: Path, pictures, change) -> Path:
         bag.static_transform(10**18, "base_link", "camera_optical", [0, 0, 0.2], [-0.5, 0.5, -0.5, 0.5])
         for i, image in enumerate(pictures):
             stamp = 10**18 + i * 10**8
-            bag.camera_info("/camera/camera_info", stamp, 640, 480, K, [0, 0, 0, 0, 0])
+            bag.camera_info("/camera/camera_info", stamp, (640, 480), K, [0, 0, 0, 0, 0])
             bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (0.0, 0.0))
             coded = cv2.imencode(".png", np.ascontiguousarray(change(image)))[1].tobytes()
             bag.compressed_image("/camera/image/compressed", stamp, coded, "png")

@@ -28,7 +28,7 @@ from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.ekf import ExtendedKalmanFilter
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationBelief, installation_of
+from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationEstimate, installation_of
 from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.joint import correct, fuse_installed, joint_cov, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -108,10 +108,10 @@ def seen_from(pose, i: int, rng, twist=(0.4, 0.0, 0.3)) -> PointMeasurement:
     return PointMeasurement(0, i, float(distance), float(bearing), R, np.array(twist))
 
 
-def correlated(rng, n: int) -> tuple[PoseWithCovariance, InstallationBelief]:
+def correlated(rng, n: int) -> tuple[PoseWithCovariance, InstallationEstimate]:
     A = rng.normal(size=(3 + n, 3 + n)) * 0.003
     P = A @ A.T + 1e-6 * np.eye(3 + n)
-    known = InstallationBelief(rng.normal(0.0, 0.005, n), P[3:, 3:])
+    known = InstallationEstimate(rng.normal(0.0, 0.005, n), P[3:, 3:])
     return PoseWithCovariance(np.array([0.3, -0.2, 0.4]), P[:3, :3], P[:3, 3:], known), known
 
 
@@ -182,7 +182,7 @@ def test_a_correction_that_does_not_settle_says_so():
     factors = LandmarkFactors(POINTS, Installation({}))
     m = replace(seen_from(np.zeros(3), 0, np.random.default_rng(0)), range_m=math.nan)
     belief = PoseWithCovariance(np.zeros(3), np.eye(3))
-    assert correct(belief, InstallationBelief(np.zeros(0), np.zeros((0, 0))), [m], factors) is None
+    assert correct(belief, InstallationEstimate(np.zeros(0), np.zeros((0, 0))), [m], factors) is None
 
 
 # --- online against batch ---------------------------------------------------------------------------------------------
@@ -247,7 +247,7 @@ def readings_with(theta: dict[str, float], later_s: float = 0.0, **gains):
     settings = Config.model_validate({"wheels": {"source": "command", "track": 0.3, **gains}})
     installation = Installation(dict.fromkeys(theta, 0.01))
     factors = LandmarkFactors(None, installation)
-    factors.believed = replace(factors.believed, mean=np.array(list(theta.values())))
+    factors.estimated = replace(factors.estimated, mean=np.array(list(theta.values())))
     sensors = MotionSensors(WheelMotion(settings.wheels), gyro=Gyro(GyroConfig()))
     some = MotionSources(settings, sensors, factors)
     some.read(turning(0, later_s=later_s))
@@ -347,7 +347,7 @@ def found_in(world: World, settings: Config, name: str, gyro: bool = True):
     chain = Chain(settings, world.map, keep_all=True, gyro=Gyro(settings.gyro) if gyro else None)
     estimates = chain.run(world.events())
     factors = chain.localizer.factors
-    online = factors.believed
+    online = factors.estimated
     i = factors.installation.index[name]
     log = chain.localizer.estimator.log
     batch = BatchSmoother(log, factors, settings.batch, settings.estimator.gate_probability).installed()
@@ -407,7 +407,7 @@ def test_scale_and_offset_of_ranges_and_bearings_are_found_with_an_honest_sigma(
         world = World(beacons(), seed=seed, range_scale=scale, bearing_bias=bias)
         pairs, prior, chain, estimates = found_in(world, settings, "sightings.range_scale", gyro=False)
         check_found(pairs, -math.log(scale), prior, 0.2)
-        known, index = chain.localizer.factors.believed, chain.localizer.factors.installation.index
+        known, index = chain.localizer.factors.estimated, chain.localizer.factors.installation.index
         rows = [index["sightings.range_scale"], index["sightings.bearing_offset_rad"]]
         error = known.mean[rows] - [-math.log(scale), bias]
         sizes.append(error @ np.linalg.solve(known.cov[np.ix_(rows, rows)], error))

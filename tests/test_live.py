@@ -27,7 +27,8 @@ from fgloc.runner import run
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.tracking import TrackingDetector
-from fgloc.types import Mode
+from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.types import Mode, TransformEvent, TruthEvent
 
 SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes
@@ -141,6 +142,29 @@ def test_poses_between_keyframes_are_as_good_as_their_covariance_says():
     assert max(p.stamp_ns - p.keyframe_ns for p, _ in beyond) > 0.1e9
     assert np.mean([np.hypot(*(p.pose - t)[:2]) for p, t in beyond]) < 0.03
     assert 0.2 < np.mean([nees(p, t) for p, t in beyond]) / 3.0 < 2.0
+
+
+def test_a_slip_that_has_just_begun_does_not_carry_the_pose_away():
+    """The wheels spin on a patch from 14.28 s on, by up to 0.2 m/s: the learned motion reads their torque."""
+    sample = SAMPLES / "patches_run"
+    settings = load_config(sample / "robot.yaml")
+    with open_recording(sample / "bag", settings.recording) as recording:
+        events, roles = until(15.0, recording.events()), recording.roles
+    start = events[0].received_ns
+    events = [e for e in events if e.received_ns > start + 12e9 or isinstance(e, TransformEvent)]
+    truth = [e for e in events if isinstance(e, TruthEvent)]
+    stamps, x, y = (np.array(c) for c in zip(*((e.stamp_ns, *e.position[:2]) for e in truth), strict=True))
+    apart = []
+    with Live(settings, sample / "map.yaml", roles=roles) as live:
+        for event in events:
+            live.push(event)
+            if event.received_ns > start + 14.2e9 and isinstance(event, JointsEvent):
+                assert live.wait(PATIENCE_S)
+                pose = live.pose_at()
+                at = np.interp(pose.stamp_ns, stamps, x), np.interp(pose.stamp_ns, stamps, y)
+                apart.append(np.hypot(*(pose.pose[:2] - at)))
+    assert len(apart) > 30
+    assert max(apart) < 0.03
 
 
 def test_the_covariance_grows_with_the_time_beyond_the_last_message():

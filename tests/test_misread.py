@@ -6,14 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from robot_world import CAMERA, SIGMA_PX, Chain, World, config, position_error, project, room, standing
+from robot_world import Chain, World, config, position_error, room, standing
 
-from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.robust.association import Association
 from fgloc.sensors.markers.events import CornersEvent
-from fgloc.types import Landmark, LandmarkMap, PixelMeasurement
+from fgloc.types import Landmark
 
 SHARE = 0.4
 
@@ -21,12 +17,6 @@ SHARE = 0.4
 def hanging(landmark_id: int, along: float) -> Landmark:
     """On a wall 3 m ahead."""
     return standing(landmark_id, 3.0, along, math.pi)
-
-
-def measured(world_map: LandmarkMap, landmark_id: int, read: int | None = None) -> PixelMeasurement:
-    """As seen from the origin, and the id that was read."""
-    corners = project(np.zeros(3), world_map.landmarks[landmark_id])
-    return PixelMeasurement(10**9, landmark_id if read is None else read, corners, SIGMA_PX, CAMERA)
 
 
 def misread(events, ids, share: float, seed: int = 5):
@@ -71,25 +61,3 @@ def test_a_misread_marker_is_used_as_what_hangs_there():
 def test_sound_markers_are_not_read_again():
     _, estimates = follow(room(), World(room(), seed=2, seconds=8.0).events())
     assert not any(d.reason == "misread" for e in estimates for d in e.decisions)
-
-
-@pytest.mark.parametrize("believed", [True, False], ids=["beside a believed one", "alone"])
-def test_without_another_that_is_believed_it_may_be_the_robot_that_is_elsewhere(believed):
-    """A robot that was carried on by the spacing of equal markers must not take each of them for the next one."""
-    row = LandmarkMap({i: hanging(i, -1.2 + 0.6 * i) for i in range(5)}, "DICT_4X4_50")
-    seen = [measured(row, 1, read=4), measured(row, 2)] if believed else [measured(row, i, read=i + 1) for i in (1, 2)]
-    weights = Association(config(), LandmarkFactors(row))
-    sightings, refused, decisions = weights.judge(1, 10**9, seen, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-6))
-    assert sorted(s.measurement.landmark_id for s in sightings) == ([1, 2] if believed else [])
-    assert [d.reason for d in decisions if d.landmark_id in (3, 4)].count("misread") == believed
-    assert len(refused) == (0 if believed else 2)
-
-
-def test_of_two_that_hang_there_neither_is_taken():
-    twins = [hanging(1, -0.4), hanging(2, 0.2), hanging(3, -0.401), hanging(4, 1.2)]
-    row = LandmarkMap({m.landmark_id: m for m in twins}, "DICT_4X4_50")
-    seen = [measured(row, 2), measured(row, 1, read=4)]
-    weights = Association(config(), LandmarkFactors(row))
-    sightings, _, decisions = weights.judge(1, 10**9, seen, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-6))
-    assert [s.measurement.landmark_id for s in sightings] == [2]
-    assert [d.reason for d in decisions] == ["", "gate"]

@@ -176,14 +176,14 @@ def end_pose(dt: float, sigmas, off=(0.0, 0.0, 0.0)) -> PoseWithCovariance:
     names_ = ("wheels.radius", "wheels.track", "wheels.yaw_per_m")
     factors = LandmarkFactors(None, Installation(dict(zip(names_, sigmas, strict=True))))
     if len(factors.installation):
-        factors.believed = replace(factors.believed, mean=np.array(off))
+        factors.estimated = replace(factors.estimated, mean=np.array(off))
     settings = Config.model_validate({"wheels": {"source": "command", "noise": {}}})
     some = MotionSources(settings, MotionSensors(WheelMotion(settings.wheels)), factors)
     belief = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
     for i in range(round(10.0 / dt)):
         readings = some.read(step(i, dt))
         if readings.wheels is not None:
-            belief = predict(belief, factors.believed, factors.installation, [readings.wheels])
+            belief = predict(belief, factors.estimated, factors.installation, [readings.wheels])
     return belief
 
 

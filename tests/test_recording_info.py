@@ -37,7 +37,7 @@ def write_odometry(
     with BagWriter(folder) as bag:
         for k in range(n):
             received = START_NS + k * TICK_NS + 1_000_000
-            bag.odometry("/odom", stamp(k), pose(k), twist(k), received, np.eye(6), np.eye(6), **options)
+            bag.odometry("/odom", stamp(k), pose(k), twist(k), received, (np.eye(6), np.eye(6)), **options)
     return folder
 
 
@@ -104,7 +104,7 @@ def test_early_and_drifting_clocks_are_reported(tmp_path):
 def test_fault_21_gaps_are_reported_with_their_place(tmp_path):
     with BagWriter(tmp_path / "run") as bag:
         for k in [*range(100), *range(1300, 1400)]:
-            bag.odometry("/odom", START_NS + k * TICK_NS, (0.05 * k, 0, 0), (1, 0), pose_cov=np.eye(6))
+            bag.odometry("/odom", START_NS + k * TICK_NS, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6), None))
     info = inspect(tmp_path / "run", CONFIG)
     assert "1 gap of more than 1 s, the longest of 60.1 s from 5.0 s on" in one(info, "/odom", "gap")
     assert not [line for line in info.findings if "jumps" in line]  # 60 m in 60 s is a drive
@@ -150,10 +150,10 @@ def write_images(folder: Path, info: bool, tf: bool, K: float = 500.0) -> Path:
     with BagWriter(folder) as bag:
         for k in range(10):
             stamp = START_NS + k * TICK_NS
-            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), pose_cov=np.eye(6), twist_cov=np.eye(6))
+            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6), np.eye(6)))
             bag.compressed_image("/camera/image/compressed", stamp, b"" if k == 3 else b"\xff\xd8\xff")
             if info:
-                bag.camera_info("/camera/camera_info", stamp, 640, 480, np.diag([K, K, K and 1]), [])
+                bag.camera_info("/camera/camera_info", stamp, (640, 480), np.diag([K, K, K and 1]), [])
         if tf:
             bag.static_transform(START_NS, "base_link", "camera_optical", (0, 0, 0), (0, 0, 0, 1))
     return folder
@@ -181,7 +181,7 @@ def test_truth_in_bursts_and_blackouts_are_reported(tmp_path):
     with BagWriter(tmp_path / "run") as bag:
         for k in range(400):
             stamp = START_NS + k * TICK_NS
-            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), pose_cov=np.eye(6), twist_cov=np.eye(6))
+            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6), np.eye(6)))
             if k % 20 < 10:
                 bag.truth("/truth", stamp, (0.05 * k, 0, 0), (0, 0, 0, 1))
             bag.range_bearing("/seen", stamp, [(7, 2.0, 0.0)] if k < 200 else [])

@@ -26,7 +26,7 @@ def assembled(folder, frame="lidar", tf=True, images=False, first_ns=0, **topics
                 bag.range_bearing("/landmarks", stamp, [(1, 2.0, 0.0)], frame_id=frame)
             if images:
                 bag.compressed_image("/camera/image/compressed", stamp, b"none", "jpeg", frame_id="camera")
-                bag.camera_info("/camera/camera_info", stamp, 640, 480, K, [0.0] * 5, frame_id="camera")
+                bag.camera_info("/camera/camera_info", stamp, (640, 480), K, [0.0] * 5, frame_id="camera")
     (folder / "map.yaml").write_text("dictionary: DICT_4X4_50\nlandmarks:\n  - {id: 1, position: [2.0, 0.0]}\n")
     config = Config.model_validate({"recording": {"topics": topics}})
     with open_recording(folder / "bag", config.recording) as recording:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from datasets.sim.floor import Floor, Patch
 from datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
 from datasets.sim.readings import odometry
 from datasets.sim.record import is_recorded, record
-from datasets.sim.scenario import Camera, Control, Floor, Patch, Robot, Scenario, World
+from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from fgloc.config import load_config
 from fgloc.sensors.maps import load_map
 

@@ -7,22 +7,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from datasets.sim.camera import light_level
 from datasets.sim.control import Driver, make_function
 from datasets.sim.figures import draw
+from datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
 from datasets.sim.ground import make_ground
-from datasets.sim.physics import base_twist, make_scene, simulate, slipping, wheel_twist
+from datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
 from datasets.sim.record import record
+from datasets.sim.room import make_map
 from datasets.sim.scenario import (
     Control,
     ControlKind,
-    Floor,
-    Humps,
     LightStep,
     Markers,
-    Patch,
-    Ramp,
+    PlacedMarker,
     Robot,
     Scenario,
     World,
@@ -30,6 +30,7 @@ from datasets.sim.scenario import (
 from datasets.sim.section import channel_rng
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.errors import ConfigError, RecordingError
+from fgloc.types import FloatArray
 
 SUITE = load_suite(BUNDLED)
 KINDS: tuple[ControlKind, ...] = (
@@ -71,6 +72,68 @@ def test_ramp_is_climbed() -> None:
     assert log.positions[:, 2].max() == pytest.approx(np.tan(np.radians(7.0)), abs=0.01)
     pitch = 2 * np.arcsin(log.quaternions[:, 1])
     assert np.degrees(pitch.min()) == pytest.approx(-7.0, abs=1.5)
+
+
+def pitch_deg(log: Log) -> FloatArray:
+    """Nose up is negative."""
+    x, y, z, w = log.quaternions.T
+    return np.degrees(np.arcsin(np.clip(2 * (w * y - x * z), -1, 1)))
+
+
+@pytest.mark.parametrize("angle", [10.0, 15.0])
+def test_truth_pitches_as_the_ramp_does(angle: float) -> None:
+    ramp = Ramp(start_x=0.3, angle_deg=angle, rise_m=1.5, width_m=3.0)
+    scenario = Scenario(
+        name="ramp", duration_s=8.0, camera=None, world=World(size_m=(9.0, 6.0), floor=Floor(ramp=ramp)),
+        control=Control(waypoints=((4.0, 0.0),), speed=0.3),
+    )  # fmt: skip
+    log = simulate(make_scene(scenario, 1))
+    x = log.positions[:, 0]
+    on_slope = (x > 0.7) & (x < 1.6)  # wheels and caster
+    assert on_slope.sum() > 100
+    assert x[-1] > 1.8
+    np.testing.assert_allclose(np.median(pitch_deg(log)[on_slope]), -angle, atol=0.3)
+    np.testing.assert_allclose(log.positions[on_slope, 2], (x[on_slope] - 0.3) * np.tan(np.radians(angle)), atol=0.01)
+
+
+def test_a_tilted_floor_leans_and_its_walls_carry_the_markers() -> None:
+    tilt = Tilt(slope_deg=5.0, direction_deg=90.0)
+    scenario = Scenario(
+        name="tilt", duration_s=3.0, camera=None, world=World(floor=Floor(tilt=tilt)),
+        control=Control(rest_s=10.0), start=(0.0, 1.0, np.pi / 2),
+    )  # fmt: skip
+    scene = make_scene(scenario, 2)
+    log = simulate(scene)
+    np.testing.assert_allclose(pitch_deg(log)[-100:], -5.0, atol=0.3)
+    np.testing.assert_allclose(log.positions[-1, 2], np.tan(np.radians(5.0)), atol=0.01)
+    low, high = scenario.world.markers.heights_m
+    for landmark in scene.landmarks.landmarks.values():
+        above = landmark.position[2] - tilt.height(landmark.position[0], landmark.position[1])
+        assert low - 1e-3 < above < high + 1e-3
+
+
+def test_a_rough_floor_is_as_high_as_it_is_said_to_be() -> None:
+    world = World(floor=Floor(rough=Rough(height_m=0.03)))
+    ground, again, other = (make_ground(world, seed) for seed in (1, 1, 2))
+    assert ground.height is not None
+    np.testing.assert_allclose((ground.height.min(), ground.height.max()), (-0.03, 0.03))
+    np.testing.assert_array_equal(ground.height, again.height)
+    assert np.abs(ground.height - other.height).max() > 0.01
+    scenario = Scenario(name="rough", duration_s=5.0, camera=None, world=world, control=Control(functions=("turns",)))
+    log = simulate(make_scene(scenario, 1))
+    beneath = [ground.height_at(x, y) for x, y in log.positions[::40, :2]]
+    np.testing.assert_allclose(log.positions[::40, 2], beneath, atol=0.012)
+    assert np.ptp(pitch_deg(log)) > 1.0
+
+
+def test_markers_hang_where_they_are_placed() -> None:
+    ceiling = PlacedMarker(id=14, position=(0.0, 0.0, 2.0), facing_deg=0.0, elevation_deg=-90.0)
+    post = PlacedMarker(id=15, position=(1.0, 0.0, 0.3), facing_deg=180.0)
+    landmarks = make_map(World(markers=Markers(placed=(ceiling, post))), 1).landmarks
+    np.testing.assert_allclose(landmarks[14].rotation[:, 2], (0, 0, -1), atol=1e-12)
+    np.testing.assert_allclose(landmarks[15].rotation.T, [(0, -1, 0), (0, 0, 1), (-1, 0, 0)], atol=1e-12)
+    with pytest.raises(ValidationError, match="placed marker 3"):
+        Markers(placed=(ceiling.model_copy(update={"id": 3}),))
 
 
 def test_humps_shake_the_robot() -> None:

@@ -30,7 +30,7 @@ def write_world(folder: Path, *worlds: World, body=(0.0, 0.0, 0.0), sightings: b
     received = 0
     with BagWriter(folder / "bag") as bag:
         if worlds[0].sees_corners:
-            bag.camera_info("/camera_info", worlds[0].start_ns, 640, 480, CAMERA.K, [0.0] * 4, frame_id="cam")
+            bag.camera_info("/camera_info", worlds[0].start_ns, (640, 480), CAMERA.K, [0.0] * 4, frame_id="cam")
             turned = Rotation.from_matrix(T_BASE_CAM[:3, :3]).as_quat()
             bag.static_transform(worlds[0].start_ns, "base_link", "cam", T_BASE_CAM[:3, 3], turned)
         for world in worlds:

@@ -12,7 +12,12 @@ try:
 except ModuleNotFoundError as error:
     raise SystemExit("error: MuJoCo is not installed; in the repository: pip install -e '.[sim]'") from error
 
+from datasets.sim.following.failing import read_failures
+from datasets.sim.following.loop import Drive, follow
+from datasets.sim.following.path import load_path
+from datasets.sim.following.poses import POSES, PoseName
 from datasets.sim.record import record as record_run
+from datasets.sim.scenario import Scenario
 from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.errors import FglocError
 from fgloc.files.atomic import check_out
@@ -53,10 +58,65 @@ def record(
         count = record_suite(todo, out, camera, jobs_)
         typer.echo(f"{count} recorded, {len(todo) - count} were there: {out}")
         return
-    scenario = suite.entries[0].scenario if from_file else suite.find(what)
+    scenario = find_scenario(what)
+    scenario = scenario.model_copy(update={"installation": None}) if perfect else scenario
     if longest is not None:
         scenario = scenario.model_copy(update={"duration_s": min(longest, scenario.duration_s)})
     typer.echo(record_run(scenario, seed, out, camera, progress=True))
+
+
+def find_scenario(what: str) -> Scenario:
+    """A scenario of the bundled suite by name, or of a YAML file."""
+    if Path(what).suffix in (".yaml", ".yml"):
+        return load_suite(Path(what)).entries[0].scenario
+    return load_suite(BUNDLED).find(what)
+
+
+@app.command(name="follow")
+def follow_path(
+    scenario: Annotated[str, typer.Argument(help="a scenario of the bundled suite by name, or a YAML file")],
+    out: Annotated[Path, typer.Option(help="folder of bag/, map.yaml, following.csv, following.png and so on")],
+    path: Annotated[str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour), or a file")],
+    pose: Annotated[str, typer.Option(help=f"what guides the robot: {', '.join(POSES)}")] = "fgloc",
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    failure: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="of a sensor, as in a suite of ablations: '{kind: dropout, sensor: camera}'; may be repeated"
+        ),
+    ] = None,
+    corners: Annotated[
+        bool, typer.Option("--corners", help="the camera sends corners of markers, not images: no OpenGL, faster")
+    ] = False,
+) -> None:
+    """Let the robot drive itself along waypoints, guided by a pose that is estimated while it drives."""
+    from datasets.sim.following.figures import draw_drives, table
+
+    check_out(out)
+    if pose not in POSES:
+        raise FglocError(f"pose '{pose}' is not known; expected one of {', '.join(POSES)}")
+    name: PoseName = pose  # type: ignore[assignment]
+    drive = Drive(
+        find_scenario(scenario), load_path(path), name, seed, read_failures(failure or []),
+        "corners" if corners else "images",
+    )  # fmt: skip
+    done = {drive.path.name: (drive, follow(drive, out))}
+    draw_drives(done, out / "following.png", close=False)
+    typer.echo(table(done))
+
+
+@app.command()
+def follow_demo(
+    out: Annotated[Path, typer.Option(help="folder of following.png and following.txt")],
+    jobs_: Annotated[int, typer.Option("--jobs", min=1, help="processes")] = 2,
+    corners: Annotated[bool, typer.Option("--corners", help="no images: no OpenGL, faster")] = False,
+) -> None:
+    """Six drives: flat, on ice, with sensors that fail; a picture and a table."""
+    from datasets.sim.following.demo import PICTURE, demonstrate
+
+    check_out(out)
+    typer.echo(demonstrate(out, jobs_, "corners" if corners else "images"))
+    typer.echo(f"\n{out / PICTURE}")
 
 
 @app.command()

@@ -1,7 +1,7 @@
 """The corners that a marker detector finds, without rendering: true corners through the true camera, and noise.
 
 Good enough where a test or a drive is not about images: what a detector misses in a real image, for blur or at a
-slant, is here a matter of size, angle and light alone.
+slant, is here a matter of size, angle and light alone, and no marker is hidden by the ground.
 """
 
 from __future__ import annotations

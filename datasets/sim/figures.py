@@ -28,7 +28,7 @@ from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, LandmarkMap
 
-_STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.spines.top": False, "axes.spines.right": False}
+STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.spines.top": False, "axes.spines.right": False}
 _SHEET = (4, 3)  # columns and rows
 _EPOCH_S = EPOCH_NS // 1_000_000_000
 
@@ -63,7 +63,7 @@ def draw(run: Path, out: Path) -> list[Path]:
     channels = _read(run / "bag")
     landmarks = load_map(run / "map.yaml")
     out.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         made = {
             "trajectory.png": _trajectory(scenario, seed, landmarks, channels),
             "control.png": _control(channels),

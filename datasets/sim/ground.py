@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.sim.scenario import Humps, Patch, Ramp, RandomPatches, World
+from datasets.sim.floor import Humps, Patch, Ramp, RandomPatches, Rough
+from datasets.sim.scenario import World
 from datasets.sim.section import channel_rng
 
 FloatArray = NDArray[np.float64]
@@ -28,6 +29,16 @@ class Ground:
     mu: FloatArray  # (rows, columns)
     height: FloatArray | None  # (rows, columns) m
     patches: tuple[Patch, ...]
+
+    @property
+    def low_m(self) -> float:
+        """Height of the lowest ground, at most 0."""
+        return 0.0 if self.height is None else min(float(self.height.min()), 0.0)
+
+    @property
+    def high_m(self) -> float:
+        """Height of the highest ground, at least 0."""
+        return 0.0 if self.height is None else max(float(self.height.max()), 0.0)
 
     def mu_at(self, x: float, y: float) -> float:
         """Friction coefficient at a place [m]; outside the room that of the nearest cell."""
@@ -56,7 +67,8 @@ def make_ground(world: World, seed: int) -> Ground:
         patches += _draw_patches(floor.random_patches, world, seed)
     height = None
     if floor.uneven:
-        height = _heights(world, seed, floor.ramp, floor.humps)
+        ramps = () if floor.ramp is None else (floor.ramp,)
+        height = _heights(world, seed, (*ramps, *floor.ramps), floor.humps)
     return Ground(world.size_m, _friction(world, patches), height, patches)
 
 
@@ -110,12 +122,12 @@ def _draw_patches(spec: RandomPatches, world: World, seed: int) -> tuple[Patch, 
     return tuple(patches)
 
 
-def _heights(world: World, seed: int, ramp: Ramp | None, humps: Humps | None) -> FloatArray:
+def _heights(world: World, seed: int, ramps: tuple[Ramp, ...], humps: Humps | None) -> FloatArray:
     columns, rows = (round(s / HEIGHT_CELL_M) + 1 for s in world.size_m)
     x = np.linspace(-0.5, 0.5, columns) * world.size_m[0]
     y = (np.linspace(-0.5, 0.5, rows) * world.size_m[1])[:, None]
     height = np.zeros((rows, columns))
-    if ramp is not None:
+    for ramp in ramps:
         slope = np.tan(np.radians(ramp.angle_deg))
         corners = ramp.start_x + np.cumsum([0.0, ramp.rise_m, ramp.top_m, ramp.rise_m])
         profile = np.interp(x, corners, np.array([0.0, 1.0, 1.0, 0.0]) * ramp.rise_m * slope)
@@ -128,4 +140,16 @@ def _heights(world: World, seed: int, ramp: Ramp | None, humps: Humps | None) ->
             cx, cy = rng.uniform(-reach, reach)
             sigma, top = rng.uniform(*humps.sigma_m), rng.uniform(*humps.height_m)
             height = np.maximum(height, top * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2)))
+    if world.floor.rough is not None:
+        height = height + _roughness(world.floor.rough, (rows, columns), seed)
+    if world.floor.tilt is not None:
+        height = height + world.floor.tilt.height(x, y)
     return height
+
+
+def _roughness(rough: Rough, shape: tuple[int, int], seed: int) -> FloatArray:
+    """Smoothed white noise, scaled to the wanted height."""
+    noise = channel_rng(seed, "rough").standard_normal(shape)
+    smooth = cv2.GaussianBlur(noise, (0, 0), rough.length_m / HEIGHT_CELL_M, borderType=cv2.BORDER_REFLECT)
+    smooth -= 0.5 * (smooth.max() + smooth.min())
+    return np.asarray(smooth * (rough.height_m / np.abs(smooth).max()))

@@ -94,7 +94,7 @@ def build_model(scenario: Scenario, ground: Ground, landmarks: LandmarkMap) -> m
     _robot(root, world, scenario)
     model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"), assets)
     if ground.height is not None:
-        model.hfield_data[:] = (ground.height / ground.height.max()).ravel()
+        model.hfield_data[:] = ((ground.height - ground.low_m) / (ground.high_m - ground.low_m)).ravel()
     return model
 
 
@@ -120,14 +120,16 @@ def _room(asset: ET.Element, world: ET.Element, scenario: Scenario, ground: Grou
         _add(world, "geom", name="ground", type="plane", size=(sx, sy, 0.1), material="floor")
     else:
         rows, columns = ground.height.shape
-        _add(asset, "hfield", name="h", nrow=rows, ncol=columns, size=(sx, sy, float(ground.height.max()), 0.1))
-        _add(world, "geom", name="ground", type="hfield", hfield="h", material="floor")
-    h = 0.5 * scenario.world.wall_height_m
+        _add(asset, "hfield", name="h", nrow=rows, ncol=columns, size=(sx, sy, ground.high_m - ground.low_m, 0.1))
+        _add(world, "geom", name="ground", type="hfield", hfield="h", material="floor", pos=(0, 0, ground.low_m))
+    tilt = scenario.world.floor.tilt
+    low, high = (0.0, 0.0) if tilt is None else (ground.low_m, ground.high_m)  # walls stand on a leaning floor
+    h, z = 0.5 * (scenario.world.wall_height_m + high - low), 0.5 * (scenario.world.wall_height_m + high + low)
     for name, place, size in (
-        ("east", (sx + 0.05, 0, h), (0.05, sy + 0.1, h)),
-        ("west", (-sx - 0.05, 0, h), (0.05, sy + 0.1, h)),
-        ("north", (0, sy + 0.05, h), (sx, 0.05, h)),
-        ("south", (0, -sy - 0.05, h), (sx, 0.05, h)),
+        ("east", (sx + 0.05, 0, z), (0.05, sy + 0.1, h)),
+        ("west", (-sx - 0.05, 0, z), (0.05, sy + 0.1, h)),
+        ("north", (0, sy + 0.05, z), (sx, 0.05, h)),
+        ("south", (0, -sy - 0.05, z), (sx, 0.05, h)),
     ):
         _add(world, "geom", name=name, type="box", pos=place, size=size, material="wall", friction=(0.1, 0.001, 0.0001))
 
@@ -142,16 +144,8 @@ def _markers(asset: ET.Element, world: ET.Element, landmarks: LandmarkMap, asset
         _add(asset, "texture", name=name, type="2d", file=f"{name}.png")
         _add(asset, "material", name=name, texture=name, specular=0)
         shared = {"xyaxes": axes, "contype": 0, "conaffinity": 0}
-        _add(
-            world,
-            "geom",
-            name=name,
-            type="plane",
-            size=(half, half, 0.01),
-            pos=landmark.position,
-            material=name,
-            **shared,
-        )
+        place = {"pos": landmark.position, **shared}
+        _add(world, "geom", name=name, type="plane", size=(half, half, 0.01), material=name, **place)
         _add(
             world,
             "geom",

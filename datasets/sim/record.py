@@ -85,9 +85,16 @@ def describe(scenario: Scenario, seed: int, camera: bool) -> str:
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
 
 
-def _unused(scenario: Scenario) -> set[str]:
+def _unused(scenario: Scenario) -> dict[str, Any]:
     """Options that were added later, where they are not used: older recordings stay what they are."""
-    return {name for name in ("uwb", "gnss") if getattr(scenario, name) is None}
+    floor, markers = scenario.world.floor, scenario.world.markers
+    return {
+        **{name: True for name in ("uwb", "gnss") if getattr(scenario, name) is None},
+        "world": {
+            "floor": {name for name in ("ramps", "tilt", "rough") if not getattr(floor, name)},
+            "markers": {name for name in ("placed",) if not getattr(markers, name)},
+        },
+    }
 
 
 def robot_settings(scenario: Scenario) -> dict[str, Any]:

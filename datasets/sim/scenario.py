@@ -11,6 +11,7 @@ from typing import Literal
 import cv2
 from pydantic import Field, model_validator
 
+from datasets.sim.floor import Floor
 from datasets.sim.installation import NamedInstallation
 from datasets.sim.section import Positive, Section, Vector2, Vector3
 
@@ -161,13 +162,24 @@ class Latency(Section):
 # --- World ------------------------------------------------------------------------------------------------------------
 
 
+class PlacedMarker(Section):
+    """A marker anywhere in the room: on a post, on the ceiling, on the floor."""
+
+    id: int = Field(ge=0)
+    position: Vector3  # m, of its center
+    facing_deg: float  # yaw of its normal
+    elevation_deg: float = Field(0.0, ge=-90, le=90)  # of its normal above the horizon
+    roll_deg: float = 0.0  # about its normal, counter-clockwise as seen
+
+
 class Markers(Section):
-    """Square markers on the walls."""
+    """Square markers on the walls, above the ground there, and wherever they are placed."""
 
     count: int = Field(14, ge=0)
     size_m: Positive = 0.20  # of the black square
     dictionary: str = "DICT_4X4_50"
     heights_m: Vector2 = (0.22, 0.50)  # of the centers
+    placed: tuple[PlacedMarker, ...] = ()  # besides; those on the walls have the ids below `count`
 
     @model_validator(mode="after")
     def _has_enough_ids(self) -> Markers:
@@ -175,62 +187,13 @@ class Markers(Section):
         if known is None:
             raise ValueError(f"dictionary {self.dictionary!r} is not one of OpenCV's (DICT_4X4_50, ...)")
         ids = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
+        given = [marker.id for marker in self.placed]
+        wrong = [i for i in given if not self.count <= i < ids or given.count(i) > 1]
+        if wrong:
+            raise ValueError(f"placed marker {wrong[0]}: expected ids from {self.count} to {ids - 1}, each once")
         if self.count > ids:
             raise ValueError(f"{self.count} markers, but {self.dictionary} has {ids}; take fewer or a larger one")
         return self
-
-
-class Patch(Section):
-    """A piece of floor with its own friction. ``points`` only for a polygon, relative to the center."""
-
-    shape: Literal["ellipse", "rectangle", "polygon"] = "ellipse"
-    center: Vector2
-    size: Vector2 = (1.0, 1.0)  # full length and width
-    yaw_deg: float = 0.0
-    points: tuple[Vector2, ...] = ()
-    mu: Positive
-
-
-class RandomPatches(Section):
-    """Patches of all shapes, drawn by the seed."""
-
-    count: int = Field(ge=0)
-    mu: Vector2 = (0.04, 0.15)
-    size_m: Vector2 = (0.6, 1.6)
-
-
-class Ramp(Section):
-    """Up, level, down along x."""
-
-    start_x: float
-    angle_deg: Positive = 7.0
-    rise_m: Positive = 1.0  # horizontal length of each slope
-    top_m: Positive = 1.0
-    center_y: float = 0.0
-    width_m: Positive = 2.0
-
-
-class Humps(Section):
-    """Smooth humps drawn by the seed."""
-
-    count: int = Field(ge=0)
-    height_m: Vector2 = (0.01, 0.03)
-    sigma_m: Vector2 = (0.12, 0.25)
-
-
-class Floor(Section):
-    """Friction and height of the ground."""
-
-    mu: Positive = 0.8
-    patches: tuple[Patch, ...] = ()
-    random_patches: RandomPatches | None = None
-    ramp: Ramp | None = None
-    humps: Humps | None = None
-
-    @property
-    def uneven(self) -> bool:
-        """Whether there is any height at all."""
-        return self.ramp is not None or self.humps is not None
 
 
 class LightStep(Section):

@@ -14,6 +14,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from datasets.bag import BagWriter
 from datasets.convert import Message
@@ -93,7 +94,7 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
     def write_odometry(i: int, received: int) -> None:
         (poses, twists, *_), k = rows.at(i)
-        bag.odometry("/odom", stamps[i] + late, poses[k], twists[k], twist_cov=twist_cov, received_ns=received)
+        bag.odometry("/odom", stamps[i] + late, poses[k], twists[k], received, (None, twist_cov))
 
     def write_joints(i: int, received: int) -> None:
         (*_, angles, rates, effort), k = rows.at(i)
@@ -129,8 +130,7 @@ def _imu(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
             stamps[i] + late,
             gyro[k],
             accel[k],
-            angular_velocity_variance=imu.gyro_noise**2,
-            linear_acceleration_variance=imu.accel_noise**2,
+            variances=(imu.gyro_noise**2, imu.accel_noise**2),
             received_ns=received,
         )
 
@@ -204,7 +204,7 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
     camera = scene.installed.believed.camera
     assert camera is not None
     mounted = {
-        "camera_optical": (camera.position, quaternion_of(camera.rotation)),
+        "camera_optical": (camera.position, Rotation.from_matrix(camera.rotation).as_quat()),
         "imu_link": (scene.scenario.imu.position, np.array([0.0, 0.0, 0.0, 1.0])),
     }
     for frame, (position, quaternion) in mounted.items():
@@ -271,7 +271,7 @@ def _write_lens(scene: Scene, bag: BagWriter, stamp: int, received: int) -> None
     assert camera is not None
     assert believed is not None
     size = (camera.width, camera.height)
-    bag.camera_info("/camera/camera_info", stamp, *size, believed.matrix, believed.distortion, received_ns=received)
+    bag.camera_info("/camera/camera_info", stamp, size, believed.matrix, believed.distortion, received_ns=received)
 
 
 def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:
@@ -297,10 +297,3 @@ def _received(scene: Scene, channel: str, stamps: list[int]) -> list[int]:
     rng = channel_rng(scene.seed, f"latency of {channel}")
     late: IntArray = np.array(stamps) + np.round(1e9 * (least + rng.exponential(mean, len(stamps)))).astype(np.int64)
     return [int(s) for s in np.maximum.accumulate(late)]
-
-
-def quaternion_of(rotation: NDArray[np.float64]) -> FloatArray:
-    """Quaternion x, y, z, w of a rotation matrix ``(3, 3)``."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotation).as_quat())

@@ -10,6 +10,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -31,8 +32,11 @@ from fgloc.frames import quaternion_yaw
 from fgloc.recording.outputs import sha256_of, write_text
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensor_setup import resolved
+from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.maps import load_map, write_map
+from fgloc.sensors.markers.events import ImageEvent
+from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.markers.remembered import RememberedDetections
 from fgloc.types import Mode, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
@@ -161,6 +165,33 @@ def execute(job: Job, out: Path) -> str:
     return job.key
 
 
+def detections_path(out: Path, job: Job) -> Path:
+    """Where the markers that are found in a job's images are kept for the other jobs that see them."""
+    return out / "detections" / f"{job.images}.npz"
+
+
+def detect(job: Job, out: Path) -> None:
+    """Find the markers in all images of a job's recording, so that each job that sees them need not.
+
+    What cannot be read is left to the jobs, which report it.
+    """
+    cell, memory = job.cell, None
+    try:
+        with open_recording(cell.bag, cell.config.recording) as recording:
+            _, setup = recorded_setup(recording, cell.map, resolved(cell.config, cell.map))
+            if setup.detector is None:
+                return
+            memory = RememberedDetections(detections_path(out, job), setup.detector)
+            for event in recording.events():
+                if isinstance(event, ImageEvent):
+                    with suppress(ImageError):
+                        memory.detect(event)
+    except FglocError:
+        pass
+    if memory is not None:
+        memory.save()
+
+
 def _localise(job: Job, out: Path) -> dict[str, Any]:
     cell = job.cell
     config = resolved(cell.config, cell.map)
@@ -188,7 +219,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
             cell.mode,
             events=None if plain else lambda events: corrupt(cell.chain, "recorded", events, scenes),
             sightings=None if plain else lambda events: corrupt(cell.chain, "sightings", events, scenes),
-            detections=out / "detections" / f"{job.images}.npz" if job.folder is None else None,
+            detections=detections_path(out, job) if job.folder is None else None,
         )
     config = result.config or config
     metrics = compute_metrics(result, config)

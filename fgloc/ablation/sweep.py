@@ -7,11 +7,11 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fgloc.ablation.jobs import Job, execute, finished
+from fgloc.ablation.jobs import Job, detect, detections_path, execute, finished
 from fgloc.ablation.records import Cost, Record, read_record, record_path, write_record
 from fgloc.errors import ConfigError, OutputError
 
@@ -93,8 +93,15 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     """Keys of finished jobs, with an error if their workers died."""
     import distributed
 
-    futures = client.map(_attempt, todo, out=out, key=[job.key for job in todo], pure=False, retries=0)
-    key_of = {future: job.key for future, job in zip(futures, todo, strict=True)}
+    prepared = {
+        images: client.submit(_prepare, job, out, key=f"detect-{images}", pure=False, retries=0)
+        for images, job in _shared_images(todo, out).items()
+    }
+    key_of = {
+        client.submit(_attempt, job, out, prepared.get(job.images), key=job.key, pure=False, retries=0): job.key
+        for job in todo
+    }
+    futures = list(key_of)
     for future in distributed.as_completed(futures):
         error = future.exception() if future.status == "error" else _unwritable(future.result())
         if error is not None and not isinstance(error, distributed.KilledWorker):
@@ -104,8 +111,30 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
         future.release()
 
 
-def _attempt(job: Job, out: Path) -> str | OutputError:
-    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
+def _shared_images(todo: Sequence[Job], out: Path) -> dict[str, Job]:
+    """Images that several jobs see as they were recorded, and whose markers are still to be found: one of the jobs."""
+    count = Counter(job.images for job in todo)
+    return {
+        job.images: job
+        for job in todo
+        if count[job.images] > 1
+        and job.folder is None
+        and not any(failure.pixels for failure in job.cell.chain)
+        and not detections_path(out, job).exists()
+    }
+
+
+def _prepare(job: Job, out: Path) -> None:
+    """`detect`; what goes wrong is left to the jobs."""
+    with suppress(Exception):
+        detect(job, out)
+
+
+def _attempt(job: Job, out: Path, _prepared: None) -> str | OutputError:
+    """`execute`, once its images were searched.
+
+    What cannot be written comes back as a value, for the worker would log an exception at length.
+    """
     try:
         return execute(job, out)
     except OutputError as error:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.frames import rotation_of
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.sensors import registry
 from fgloc.types import Camera, FloatArray, LandmarkMap
 
@@ -22,7 +22,7 @@ _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 def found_values(
     installation: Installation,
-    belief: InstallationBelief,
+    belief: InstallationEstimate,
     config: Config,
     camera: Camera | None,
     landmark_map: LandmarkMap | None,
@@ -51,7 +51,7 @@ def found_values(
 
 
 def _values(
-    rows: Iterable[_Row], installation: Installation, belief: InstallationBelief
+    rows: Iterable[_Row], installation: Installation, belief: InstallationEstimate
 ) -> dict[str, tuple[float, float]]:
     """Value and sigma of those rows whose parameter is estimated."""
     sigma = np.sqrt(np.diag(belief.cov))

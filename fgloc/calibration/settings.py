@@ -15,7 +15,7 @@ from fgloc.assembly import Assembly
 from fgloc.calibration.found import mounting
 from fgloc.config import Config
 from fgloc.frames import rotation_of
-from fgloc.graph.installation import MARKER, Installation, InstallationBelief
+from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
 from fgloc.sensors import registry
 from fgloc.sensors.cameras import pinhole
 from fgloc.types import Camera, FloatArray, InstallationFound, LandmarkMap, Setting
@@ -34,7 +34,7 @@ _SIGMAS = {  # the field that takes the sigma of settings back; of several the l
 }
 
 
-def installation_found(parts: Assembly, roles: Container[str], belief: InstallationBelief) -> InstallationFound:
+def installation_found(parts: Assembly, roles: Container[str], belief: InstallationEstimate) -> InstallationFound:
     """What a run of these parts has found, from a recording with these roles."""
     installation, landmark_map, source = parts.localizer.factors.installation, parts.landmark_map, parts.wheels.source
     found = InstallationFound(
@@ -165,7 +165,7 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
     return config.model_copy(update=sections)
 
 
-def map_found(landmark_map: LandmarkMap, installation: Installation, belief: InstallationBelief) -> LandmarkMap:
+def map_found(landmark_map: LandmarkMap, installation: Installation, belief: InstallationEstimate) -> LandmarkMap:
     """The map with its landmarks where they were found, each with its covariance."""
     moved = dict(landmark_map.landmarks)
     for i, (first, count) in installation.landmarks.items():

@@ -14,7 +14,7 @@ from fgloc.calibration.mirrored import mirrored, moved_by
 from fgloc.config import Config
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import Installation, InstallationBelief, installation_of
+from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.types import FloatArray, Landmark, LandmarkMap, PixelMeasurement
 
@@ -111,7 +111,7 @@ class SurveyGraph:
             for i, (first, count) in self.installation.landmarks.items():
                 if i not in self._anchors:
                     start[first : first + count] = 0.0
-            factors.believed = InstallationBelief(start, self.installation.prior().cov)
+            factors.estimated = InstallationEstimate(start, self.installation.prior().cov)
             solver = BatchSmoother(
                 self._log(factors), factors, self._config.batch, self._config.estimator.gate_probability
             )
@@ -157,7 +157,7 @@ class SurveyGraph:
         """Markers that fit better the other way round; of those that fit both ways about alike, note the ids."""
         seen: dict[int, list[tuple[PixelMeasurement, FloatArray]]] = {}
         for frame, pose in zip(solver.frames, self._poses, strict=True):
-            for s in (*frame.sightings, *frame.refused):
+            for s in (*frame.sightings, *frame.rejected):
                 if isinstance(s.measurement, PixelMeasurement):
                     seen.setdefault(s.measurement.landmark_id, []).append((s.measurement, pose))
         better = {}
@@ -211,10 +211,10 @@ class SurveyGraph:
                     origin = n == 0 and not leg.free
                     prior = PoseWithCovariance(frame.prior.pose, _ORIGIN) if origin else PoseWithCovariance(pose, _FREE)
                 accepted: list[LandmarkFactor] = []
-                refused: list[LandmarkFactor] = []
+                rejected: list[LandmarkFactor] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
-                    (accepted if agrees else refused).append(factors.sighting(k, m, m.cauchy_k))
+                    (accepted if agrees else rejected).append(factors.sighting(k, m, m.cauchy_k))
                 log.keyframes[k] = Keyframe(
                     k,
                     frame.stamp_ns,
@@ -223,6 +223,6 @@ class SurveyGraph:
                     prior,
                     frame.motions,
                     tuple(accepted),
-                    tuple(refused),
+                    tuple(rejected),
                 )
         return log

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fgloc.cli.terminal import say
 from fgloc.errors import ConfigError
-from fgloc.types import RunResult
+
+if TYPE_CHECKING:
+    from fgloc.types import RunResult
 
 _BASE = "base_link"
 

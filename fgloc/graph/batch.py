@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import groupby
 
 import gtsam
 import numpy as np
@@ -13,17 +12,17 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
+from fgloc.graph.batch_factors import BatchMotions, BatchSightings
 from fgloc.graph.batch_solve import estimated_landmarks, initial_values, solvable, with_deep_stack, without_orphans
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
-    installed_motion_factor,
     pose_key,
     prior_factor,
-    sighting_factors,
 )
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
+from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
 from fgloc.types import (
     FloatArray,
@@ -80,7 +79,12 @@ class BatchSmoother:
         self._config = config
         self._probability = gate_probability
         self.accepted = {frame.k: frame.sightings for frame in self.frames}
+        self._motions = BatchMotions(self.frames, factors.installation)
+        self._sightings = None
+        if factors.known:
+            self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
         self._values = initial_values(self.frames, self.accepted, self._factors)
+        self._solved: gtsam.Marginals | gtsam.ISAM2 | None = None  # covariances of the last solution
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
@@ -99,45 +103,51 @@ class BatchSmoother:
 
     def poses(self) -> FloatArray:
         """Smoothed poses ``(n, 3)``."""
+        if self._factors.known:  # then no other pose is among the values
+            return np.asarray(gtsam.utilities.extractPose2(self._values))
         return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
 
     def replace_motions(self, motions: Mapping[int, tuple[MotionMeasurement, ...]]) -> None:
         """Take other motion measurements for these keyframes, and solve again from the last solution."""
         for frame in self.frames:
             frame.motions = motions.get(frame.k, frame.motions)
+        self._motions = BatchMotions(self.frames, self._factors.installation)
         self._optimize()
 
-    def installed(self) -> InstallationBelief:
+    def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found."""
         n = len(self._factors.installation)
         if not n:
-            return InstallationBelief(np.zeros(0), np.zeros((0, 0)))
+            return InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
         marginals = self._marginals()
-        return InstallationBelief(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+        return InstallationEstimate(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
 
     def cost(self) -> float:
         """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
 
         Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
-        keyframe; a sighting that is left out counts as the least that would be refused.
+        keyframe; a sighting that is left out counts as the least that would be rejected.
         """
-        total = float(self._of_motion().error(self._values))
-        seen = [
-            (pose, s)
-            for frame, pose in zip(self.frames, self.poses(), strict=True)
-            for s in (*frame.sightings, *frame.refused)
-        ]
-        if not self._factors.known or not seen:
-            factors = [f for held in self.accepted.values() for s in held for f in s.factors]
+        total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
+        if self._sightings is None:
+            factors = [f for some in self.accepted.values() for s in some for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
-        observed = self._factors.observe([s.measurement for _, s in seen])
-        lines = observed.linearize(np.array([pose for pose, _ in seen]), self._theta())
-        for (_, s), one in zip(seen, lines, strict=True):
-            bound = chi2_bound(self._probability, len(one.residual))
-            total += 0.5 * (bound if one.behind else min(bound, float(one.residual @ one.residual)))
-            if not isinstance(s.measurement, PixelMeasurement):
-                total += 0.5 * float(np.linalg.slogdet(s.alone.cov)[1])  # type: ignore[union-attr]
+        rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
+        for squares, rows in (s.squares(self.poses(), self._theta()) for s in (self._sightings, rejected)):
+            bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
+            total += 0.5 * float(np.minimum(squares, bounds).sum())
+        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
+        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, PixelMeasurement)]  # type: ignore[union-attr]
+        for size in {len(cov) for cov in covs}:
+            total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total
+
+    def _cost_of_installation(self) -> float:
+        """Of its prior, where that is not among the priors of the poses."""
+        if self._sightings is None or not len(self._factors.installation):
+            return 0.0
+        prior = self._factors.installation.prior()
+        return 0.5 * float(np.sum((whitening_of(prior.cov) @ (self._theta() - prior.mean)) ** 2))
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.
@@ -150,6 +160,11 @@ class BatchSmoother:
 
     def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
         """Covariances of the solution; of long stretches that hardly anything determines, by QR."""
+        if self._solved is None:
+            self._solved = self._new_marginals()
+        return self._solved
+
+    def _new_marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
         try:
             return with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
         except RuntimeError:
@@ -177,10 +192,13 @@ class BatchSmoother:
 
     def _optimize(self) -> None:
         """Linearize the sightings anew and solve, until poses and installation stay where they are."""
+        self._solved = None
         for _ in range(_LINEARIZATIONS):
             poses, theta = self.poses(), self._theta()
+            self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
             graph = self._linearized()
-            values = self._solve(graph, without_orphans(self._values, graph))
+            start = self._values if self._factors.known else without_orphans(self._values, graph)
+            values = self._solve(graph, start)
             if not np.isfinite(graph.error(values)):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
             self._values, self._graph = values, graph
@@ -192,47 +210,34 @@ class BatchSmoother:
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
-        seen = [(f.k, pose, s) for f, pose in zip(self.frames, self.poses(), strict=True) for s in self.accepted[f.k]]
-        for factor in self._sighting_factors(seen):
+        if self._sightings is None:
+            for factor in (f for held in self.accepted.values() for s in held for f in s.factors):
+                graph.add(factor)
+            return graph
+        for factor in self._sightings.factors(self.poses(), self._theta()):
             graph.add(factor)
         return graph
 
+    def factors_of_motion(self) -> Iterator[gtsam.NonlinearFactor]:
+        """Priors of poses, and motions linear about the solution."""
+        yield from self._priors()
+        yield from self._motions.factors(self.poses())
+
     def _of_motion(self) -> gtsam.NonlinearFactorGraph:
-        """Priors and motions, linear about the solution."""
         graph = gtsam.NonlinearFactorGraph()
-        for factor in self._priors():
+        for factor in self.factors_of_motion():
             graph.add(factor)
-        poses = self.poses()
-        for i, frame in enumerate(self.frames):
-            for motion in frame.motions:
-                graph.add(installed_motion_factor(frame.k, motion, poses[i - 1], self._factors.installation))
         return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
+        """Of the poses, and of an installation that no sightings of a known map bring in."""
         installation = self._factors.installation
-        if len(installation):
+        if len(installation) and self._sightings is None:
             prior = installation.prior()
             yield gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))
         for frame in self.frames:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
-
-    def _sighting_factors(
-        self, seen: Sequence[tuple[int, FloatArray, LandmarkFactor]]
-    ) -> Iterator[gtsam.NonlinearFactor]:
-        """Of sightings with their keyframes and poses, keyframes in order."""
-        if not self._factors.known or not seen:
-            for _, _, s in seen:
-                yield from s.factors
-            return
-        theta = self._theta()
-        observed = self._factors.observe([s.measurement for _, _, s in seen])
-        lines = observed.linearize(np.array([pose for _, pose, _ in seen]), theta)
-        for k, group in groupby(zip(seen, lines, strict=True), key=lambda item: item[0][0]):
-            kept = [(pose, s, one) for (_, pose, s), one in group if not one.behind]
-            if kept:
-                sightings, ahead = [s for _, s, _ in kept], [one for _, _, one in kept]
-                yield from sighting_factors(k, sightings, ahead, kept[0][0], theta)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         params = gtsam.LevenbergMarquardtParams()

@@ -62,7 +62,7 @@ def initial_values(
     for frame in frames:
         values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
     if len(factors.installation):
-        values.insert(INSTALLATION, factors.believed.mean)
+        values.insert(INSTALLATION, factors.estimated.mean)
     if factors.known:
         return values
     seen: dict[int, list[FloatArray]] = {}

@@ -34,16 +34,19 @@ class CornerBatch:
         self._local = half[:, None, None] * square  # (m, 4, 3) in the marker's frame
         self._position = np.array([landmark.position for landmark in held])
         self._rotation = np.array([landmark.rotation for landmark in held])
-        T = np.array([m.camera.T_base_cam for m in seen])
+        cameras = {id(m.camera): m.camera for m in seen}
+        order = {camera: i for i, camera in enumerate(cameras)}
+        of = np.array([order[id(m.camera)] for m in seen])
+        T = np.array([camera.T_base_cam for camera in cameras.values()])[of]
         self._R, self._t = T[:, :3, :3], T[:, :3, 3]
-        self._K = np.array([m.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for m in seen])
-        self._D = np.array([np.concatenate([m.camera.D, np.zeros(4)])[:4] for m in seen])
+        self._K = np.array([camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras.values()])[of]
+        self._D = np.array([np.concatenate([camera.D, np.zeros(4)])[:4] for camera in cameras.values()])[of]
         self._pixels = np.array([m.corners_px for m in seen])
         self._sigma = np.array([m.sigma_px for m in seen])
         self._twist = np.array([m.twist for m in seen])
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
-        self._moved = [None if m.motion_cov is None else _root(m.motion_cov) for m in seen]
+        self._moved = _roots([m.motion_cov for m in seen])
         self._outward, self._small = _shrinking(self._pixels)
         self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
         self._noise_px = np.hypot(self._sigma, self._blur_px)
@@ -161,6 +164,16 @@ class CornerBatch:
         along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
         return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
 
+    def shared_all(self, stack: Stacked) -> FloatArray:
+        """`shared` of all sightings ``(m, 8, s)``; columns that one lacks are 0."""
+        shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
+        jitter = self._jitter[:, None] * stack.H[:, :, 11]
+        common = np.stack([shrunk, jitter], axis=2)
+        if all(moved is None for moved in self._moved):
+            return common
+        roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
+        return np.concatenate([common, stack.J @ roots], axis=2)
+
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
         shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
@@ -196,7 +209,12 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def _root(cov: FloatArray) -> FloatArray:
-    """A square root of a covariance that may be singular."""
-    values, vectors = np.linalg.eigh(cov)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+def _roots(covs: Sequence[FloatArray | None]) -> list[FloatArray | None]:
+    """Square roots of covariances ``(3, 3)`` that may be singular; of one that several share, once."""
+    kept = {id(cov): cov for cov in covs if cov is not None}
+    if not kept:
+        return [None] * len(covs)
+    values, vectors = np.linalg.eigh(np.array(list(kept.values())))
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    by_id: dict[int, FloatArray] = dict(zip(kept, roots, strict=True))
+    return [None if cov is None else by_id[id(cov)] for cov in covs]

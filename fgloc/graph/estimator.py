@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.types import MotionMeasurement
@@ -45,9 +45,9 @@ class Estimator(ABC):
         return self.factors.installation
 
     @property
-    def installed(self) -> InstallationBelief:
+    def installed(self) -> InstallationEstimate:
         """What is known of the installation now."""
-        return self.factors.believed
+        return self.factors.estimated
 
     @property
     def k(self) -> int:
@@ -84,7 +84,7 @@ class Estimator(ABC):
         dt: float,
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkFactor] = (),
-        refused: Sequence[LandmarkFactor] = (),
+        rejected: Sequence[LandmarkFactor] = (),
         predicted: PoseWithCovariance | None = None,
     ) -> PoseWithCovariance:
         """Add one keyframe with its measurements; return the filtered pose.
@@ -94,14 +94,14 @@ class Estimator(ABC):
             dt: time since the one before [s].
             motions: between-factors from the one before; at least one.
             sightings: landmark measurements carried to this keyframe.
-            refused: sightings that are only logged, for the cost of the batch.
+            rejected: sightings that are only logged, for the cost of the batch.
             predicted: result of `predict` for these motions, if the caller has it already.
         """
         predicted = predicted or self.predict(motions)
         self._k += 1
         self._elapsed_s += max(dt, 1e-6)
         frame = Keyframe(
-            self._k, stamp_ns, self._elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(refused)
+            self._k, stamp_ns, self._elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(rejected)
         )
         return self._take(frame)
 
@@ -122,7 +122,7 @@ class Estimator(ABC):
             of_it = tuple(s for s in frame.sightings if s.measurement.landmark_id == landmark_id)
             if of_it:
                 frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
-                frame.refused = (*frame.refused, *of_it)
+                frame.rejected = (*frame.rejected, *of_it)
         newest = self.newest
         newest.belief, self._corrected = belief, self._k
         self._begin_at(newest)
@@ -141,7 +141,7 @@ class Estimator(ABC):
     def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief
         if belief.installation is not None:
-            self.factors.believed = belief.installation
+            self.factors.estimated = belief.installation
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""

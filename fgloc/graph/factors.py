@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from operator import is_not
 from typing import Any
 
 import gtsam
@@ -16,7 +17,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.corner_batch import MIN_DEPTH_M
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
@@ -86,7 +87,7 @@ def installed_motion_factor(
 
 
 def installed_prior_factor(
-    k: int, prior: PoseWithCovariance, belief: InstallationBelief
+    k: int, prior: PoseWithCovariance, belief: InstallationEstimate
 ) -> list[gtsam.NonlinearFactor]:
     """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone."""
     known = prior.installation or belief
@@ -160,23 +161,24 @@ class LandmarkFactors:
         self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
         self._corners: dict[int, FloatArray] = {}
         self.installation = Installation({}) if installation is None else installation
-        self._believed = self.installation.prior()
+        self._estimated = self.installation.prior()
+        self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
 
     @property
-    def believed(self) -> InstallationBelief:
+    def estimated(self) -> InstallationEstimate:
         """What is known of the installation now."""
-        return self._believed
+        return self._estimated
 
-    @believed.setter
-    def believed(self, belief: InstallationBelief) -> None:
-        self._believed = belief
+    @estimated.setter
+    def estimated(self, belief: InstallationEstimate) -> None:
+        self._estimated = belief
         self._remembered = np.zeros(3), {}
 
     @property
     def time_offset_s(self) -> float:
         """How late stamps of sightings are, as far as is known."""
-        return self.installation.time_offset(self.believed)
+        return self.installation.time_offset(self.estimated)
 
     @property
     def known(self) -> bool:
@@ -208,10 +210,14 @@ class LandmarkFactors:
         return LandmarkFactor(m, alone or m, cauchy_k)
 
     def observe(self, measurements: Sequence[LandmarkMeasurement]) -> Observations:
-        """Sightings of the known map, prepared for being linearized."""
+        """Sightings of the known map, prepared for being linearized; of the same as the last time, once."""
         if self._known is None:
             raise EstimatorError("sightings are linearized against a known map only")
-        return Observations(measurements, self._known, self.installation)
+        held, observed = self._prepared
+        if observed is None or len(held) != len(measurements) or any(map(is_not, held, measurements)):
+            held, observed = tuple(measurements), Observations(measurements, self._known, self.installation)
+            self._prepared = held, observed
+        return observed
 
     def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> list[Linearized]:
         """Each sighting at a pose and the installation as it is known now.
@@ -221,13 +227,13 @@ class LandmarkFactors:
         at, held = self._remembered
         if at is pose and all(id(m) in held for m in measurements):
             return [held[id(m)][1] for m in measurements]
-        lines = self.observe(measurements).linearize(pose, self.believed.mean)
+        lines = self.observe(measurements).linearize(pose, self.estimated.mean)
         self._remembered = pose, {id(m): (m, one) for m, one in zip(measurements, lines, strict=True)}
         return lines
 
     def whitening(self, one: Linearized) -> FloatArray:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""
-        cov = one.noise() + one.H @ self.believed.cov[np.ix_(one.columns, one.columns)] @ one.H.T
+        cov = one.noise() + one.H @ self.estimated.cov[np.ix_(one.columns, one.columns)] @ one.H.T
         return sighting_whitening(cov)
 
     def depth(self, m: PixelMeasurement, pose: FloatArray) -> float:

@@ -25,7 +25,7 @@ TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its bloc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InstallationBelief:
+class InstallationEstimate:
     """Mean ``(n,)`` and covariance ``(n, n)`` of the installation state."""
 
     mean: FloatArray
@@ -82,9 +82,9 @@ class Installation:
     def __len__(self) -> int:
         return len(self.names)
 
-    def prior(self) -> InstallationBelief:
+    def prior(self) -> InstallationEstimate:
         """Before anything was measured."""
-        return InstallationBelief(self._prior_mean.copy(), self._prior_cov.copy())
+        return InstallationEstimate(self._prior_mean.copy(), self._prior_cov.copy())
 
     def measured(self, row: FloatArray, value: float, sigma: float) -> None:
         """Take a measurement of the parameters into the prior.
@@ -99,7 +99,7 @@ class Installation:
         cov = self._prior_cov - np.outer(gain, row @ self._prior_cov)
         self._prior_cov = 0.5 * (cov + cov.T)
 
-    def time_offset(self, belief: InstallationBelief) -> float:
+    def time_offset(self, belief: InstallationEstimate) -> float:
         """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
         for section, row in TIME_OFFSET.items():
             if section in self.blocks:

@@ -203,7 +203,7 @@ class IncrementalEstimator(Estimator):
         self._fresh = False
         if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
-            if known is self.factors.believed:
+            if known is self.factors.estimated:
                 lines = self.factors.linearize(measurements, initial.pose)
             else:
                 lines = self.factors.observe(measurements).linearize(initial.pose, known.mean)
@@ -238,7 +238,7 @@ class IncrementalEstimator(Estimator):
     def _rebuild(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
         """Build the window again from the log, without the sightings of the offending step."""
         self.rebuilt += 1
-        frame.refused = (*frame.refused, *frame.sightings)
+        frame.rejected = (*frame.rejected, *frame.sightings)
         frame.sightings = ()
         try:
             frame.belief = self._replayed([*self._window(frame), frame], initial)

@@ -12,7 +12,7 @@ from fgloc.graph.factors import (
     INSTALLATION,
     pose_key,
 )
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import (
     FloatArray,
@@ -111,7 +111,7 @@ class WholeRun:
 def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
     x = pose_key(k)
     found = isam2.jointMarginalCovariance([x, INSTALLATION])
-    known = InstallationBelief(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
+    known = InstallationEstimate(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
     return PoseWithCovariance(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
 
 

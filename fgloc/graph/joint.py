@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
@@ -67,7 +67,7 @@ def transition(motions: Sequence[MotionMeasurement], installation: Installation)
 
 def predict(
     belief: PoseWithCovariance,
-    known: InstallationBelief,
+    known: InstallationEstimate,
     installation: Installation,
     motions: Sequence[MotionMeasurement],
 ) -> PoseWithCovariance:
@@ -103,7 +103,7 @@ class Innovation:
     cov: FloatArray
 
 
-def joint_cov(belief: PoseWithCovariance, known: InstallationBelief) -> FloatArray:
+def joint_cov(belief: PoseWithCovariance, known: InstallationEstimate) -> FloatArray:
     """Covariance ``(3 + n, 3 + n)`` of pose and installation."""
     n = len(known.mean)
     P = np.zeros((3 + n, 3 + n))
@@ -132,7 +132,7 @@ def nis_of_each(found: Innovation, lines: Sequence[Linearized]) -> list[float]:
 
 def correct(
     belief: PoseWithCovariance,
-    known: InstallationBelief,
+    known: InstallationEstimate,
     measurements: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
 ) -> tuple[PoseWithCovariance, float] | None:
@@ -169,7 +169,7 @@ def correct(
     after_cov = P - gain @ cho_solve(factor, gain.T, check_finite=False)
     after_cov = 0.5 * (after_cov + after_cov.T)
     corrected = PoseWithCovariance(
-        pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationBelief(theta, after_cov[3:, 3:])
+        pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationEstimate(theta, after_cov[3:, 3:])
     )
     return corrected, cost
 

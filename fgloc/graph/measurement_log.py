@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, MotionReadings, Step
 
@@ -23,7 +23,7 @@ class PoseWithCovariance:
     pose: FloatArray
     cov: FloatArray
     cross: FloatArray | None = None
-    installation: InstallationBelief | None = None
+    installation: InstallationEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Keyframe:
     prior: PoseWithCovariance | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
     sightings: tuple[LandmarkFactor, ...] = ()
-    refused: tuple[LandmarkFactor, ...] = ()  # rejected online; for the cost of the batch
+    rejected: tuple[LandmarkFactor, ...] = ()  # rejected online; for the cost of the batch
     step: Step | None = None  # its events, to be measured again
     mode: Mode = Mode.OK
     readings: MotionReadings = field(default_factory=MotionReadings)  # what the motions were made of ...

@@ -13,6 +13,7 @@ from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
 from fgloc.types import (
     FloatArray,
+    IntArray,
     Landmark,
     LandmarkMeasurement,
     PixelMeasurement,
@@ -49,6 +50,20 @@ class Observations:
 
     def __len__(self) -> int:
         return self._count
+
+    def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Squared residual ``(m,)`` of each sighting by its own noise, infinite of one behind the camera, and its rows.
+
+        Args:
+            poses: ``(m, 3)`` of each.
+            theta: ``(n,)`` installation.
+        """
+        found, rows = np.zeros(self._count), np.zeros(self._count, dtype=np.int64)
+        for members, batch in self.batches:
+            stack = batch.evaluate(poses[members], theta, by_installation=False)
+            found[members] = np.where(stack.behind, np.inf, (stack.residual**2).sum(axis=1))
+            rows[members] = batch.rows
+        return found, rows
 
     def linearize(self, poses: FloatArray, theta: FloatArray) -> list[Linearized]:
         """Every sighting at a pose ``(3,)``, or each at its own ``(m, 3)``, and an installation ``(n,)``."""

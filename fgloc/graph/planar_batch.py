@@ -91,6 +91,10 @@ class PlanarBatch:
         W = self._whitening
         return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
 
+    def shared_all(self, stack: Stacked) -> FloatArray:
+        """`shared` of all sightings ``(m, 3, 0)``."""
+        return np.zeros((*stack.residual.shape, 0))
+
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it: the noise of these sightings has all in it."""
         return np.zeros((len(J), 0))

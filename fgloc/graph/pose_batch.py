@@ -29,6 +29,9 @@ class PoseBatch:
             residual[i, :d], J[i, :d] = W @ r, W @ by_pose
         return Stacked(residual, J, np.zeros((n, most, 0)), self._columns, np.zeros(n, dtype=np.bool_))
 
+    def shared_all(self, stack: Stacked) -> None:
+        """None: these are of different dimensions."""
+
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it: of the motion by which the measurement was moved to its keyframe."""
         m = self._seen[i]

@@ -1,4 +1,4 @@
-"""Which stamps to believe: jumps of the clock are told from single wrong stamps."""
+"""Which stamps are right: jumps of the clock are told from single wrong stamps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ClockGuard:
     """
 
     def __init__(self, config: GateConfig) -> None:
-        self._newest_ns = 0  # of the stamps believed
+        self._newest_ns = 0  # of the accepted stamps
         self._started = False
         self._back_ns = int(config.clock_back_s * 1e9)
         self._jump_ns = int(config.clock_jump_s * 1e9)
@@ -51,7 +51,7 @@ class ClockGuard:
             strays = [(ClockVerdict.OUTLIER, suspect) for suspect in self._suspects]
             self._suspects.clear()
             if not overtaken:
-                self._believe(event)
+                self._advance_to(event)
             self._newest_of[event.topic] = max(event.stamp_ns, self._newest_of.get(event.topic, 0))
             return [*strays, (ClockVerdict.FITS, event)]
         self._suspects.append(event)
@@ -68,7 +68,7 @@ class ClockGuard:
         return []
 
     def flush(self) -> list[tuple[ClockVerdict, Event]]:
-        """Verdicts on all that still waits: two that agree are believed, as nothing more will come."""
+        """Verdicts on all that still waits: two that agree are accepted, as nothing more will come."""
         verdicts: list[tuple[ClockVerdict, Event]] = []
         while self._suspects:
             last = self._suspects[-1]
@@ -93,14 +93,14 @@ class ClockGuard:
         if jumped:
             self._motion = False
             self._newest_of.clear()
-        self._believe(first)
+        self._advance_to(first)
         self._newest_of[first.topic] = first.stamp_ns
         verdicts = [(ClockVerdict.STARTS if jumped else ClockVerdict.FITS, first)]
         for event in waiting:
             verdicts += self.judge(event)
         return verdicts
 
-    def _believe(self, event: Event) -> None:
+    def _advance_to(self, event: Event) -> None:
         advance = event.stamp_ns - self._newest_ns if self._started else 0
         if advance < -self._back_ns:
             self._newest_ns = event.stamp_ns

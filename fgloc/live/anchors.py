@@ -11,7 +11,7 @@ from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import Config
 from fgloc.errors import FglocError
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.sensors.gyro.rate import Gyro
@@ -38,7 +38,7 @@ class Anchor:
     segment: int
     stamp_ns: int
     belief: PoseWithCovariance  # with the installation of `MotionParts`
-    known: InstallationBelief  # likewise
+    known: InstallationEstimate  # likewise
     added_cov: FloatArray  # (3, 3) in the body frame, of what is reported beside the estimator's
     mode: Mode
     since_fix_s: float
@@ -88,10 +88,10 @@ class Anchors:
         body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
         if frame is not None and frame.stamp_ns == estimate.stamp_ns:
             belief = frame.belief
-            known = belief.installation or installation.believed
-            budget = replace(frame.budget, overruled_cov=None)  # of that step alone
+            known = belief.installation or installation.estimated
+            budget = replace(frame.budget, overruled_cov=None)  # that is of one step alone
         else:
-            belief, known = PoseWithCovariance(estimate.pose, body), installation.believed
+            belief, known = PoseWithCovariance(estimate.pose, body), installation.estimated
             budget = NoiseBudget()
         return Anchor(
             segment=step.segment,
@@ -110,8 +110,8 @@ class Anchors:
         cross = None if belief.cross is None else belief.cross[:, self._rows]
         return PoseWithCovariance(belief.pose, belief.cov, cross)
 
-    def _belief_of_motion(self, known: InstallationBelief) -> InstallationBelief:
-        return InstallationBelief(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])
+    def _belief_of_motion(self, known: InstallationEstimate) -> InstallationEstimate:
+        return InstallationEstimate(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])
 
 
 def _rows_of_motion(installation: Installation) -> IntArray:

@@ -62,15 +62,16 @@ class Engine:
 
     # --- any thread ---
 
-    def put(self, event: Event) -> None:
-        """Queue an event; of too many, the oldest is dropped."""
-        is_image = isinstance(event, RawEvent)
-        queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
+    def put(self, events: Iterable[Event]) -> None:
+        """Queue events; of too many, the oldest is dropped."""
         with self.changed:
             self.check_alive()
-            if is_image:
-                self.worker.arrived(queued)
-            self._inbox.append(queued)
+            for event in events:
+                is_image = isinstance(event, RawEvent)
+                queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
+                if is_image:
+                    self.worker.arrived(queued)
+                self._inbox.append(queued)
             while len(self._inbox) > _MOST_EVENTS:
                 lost = self._inbox.popleft()
                 if isinstance(lost, Queued) and lost.event is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,14 +55,14 @@ class Estimation:
         if self._state is not None:
             self._saver.start()
 
-    def put(self, event: Event) -> None:
-        """Queue an event.
+    def put(self, events: Iterable[Event]) -> None:
+        """Queue events.
 
         Raises:
             EstimatorError: `close` was called.
             FglocError: the run has failed.
         """
-        self._engine.put(event)
+        self._engine.put(events)
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
         """Queue a pose to go on from; raises as `put`."""

@@ -6,28 +6,34 @@ import copy
 import threading
 from bisect import bisect_left, bisect_right, insort
 from collections import defaultdict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources
+from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, Step
+from fgloc.stats import chi2_bound
+from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
 HISTORY_S = 5.0  # poses further back than this are not told
 _BEFORE_NS = 500_000_000  # motion events this long before a keyframe tell how it was moving then
 _PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
 _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
 
+_CONTRADICTION = chi2_bound(0.99, 3)  # of wheels and learned motion; where they are rejected in error, little is lost
 _MOST_EVENTS = 8192  # of one kind
 
 
@@ -157,7 +163,7 @@ class Extrapolator:
 
     def _carried(self, held: _Held, step: Step) -> PoseWithCovariance:
         anchor, means = held.anchor, held.means
-        means.factors.believed = anchor.known
+        means.factors.estimated = anchor.known
         sensors = MotionSensors(
             held.wheels,
             None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),
@@ -170,10 +176,28 @@ class Extrapolator:
             end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
             piece = _piece(step, start_ns, end_ns)
             readings = sources.read(piece, anchor.since_fix_s + (start_ns - step.start_ns) * 1e-9)
-            motions = anchor.budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
+            budget = _without_slip(anchor.budget, readings, sources)
+            motions = budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
             belief = predict(belief, anchor.known, means.factors.installation, motions)
             start_ns = end_ns
         return belief
+
+
+def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: MotionSources) -> NoiseBudget:
+    """Without wheels that contradict the learned motion: a slip that began after the keyframe.
+
+    The test that flags slips (`MotionFaults`) sees whole steps only.
+    """
+    if readings.learned is None or not sources.learned_is_independent or "learned" in budget.rejected:
+        return budget
+    difference = source_difference(readings, sources)
+    if difference is None:
+        return budget
+    d, D = difference.value, difference.by_installation
+    cov = difference.cov * max(budget.scale, 1.0) + D @ difference.installation_cov @ D.T
+    if float(d @ np.linalg.solve(cov, d)) <= _CONTRADICTION:
+        return budget
+    return replace(budget, rejected={**budget.rejected, "wheels": "slip"})
 
 
 def _stamp(event: Event) -> int:

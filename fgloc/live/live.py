@@ -114,7 +114,7 @@ class Live(EventMaker):
                 motion = self._reception.motion(received)
                 if motion is not None:
                     self._results.poses.add(motion)
-                self._estimation.put(received)
+            self._estimation.put(used)
         return tuple(used)
 
     def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = (0.5, 0.5, 0.26)) -> None:

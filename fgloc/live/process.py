@@ -6,6 +6,7 @@ would hold up the threads that receive messages and publish poses.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import os
@@ -14,9 +15,11 @@ import subprocess
 import sys
 import threading
 from collections import Counter, deque
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,11 +31,13 @@ from fgloc.live.anchors import Anchor, MotionParts, Outlet
 from fgloc.live.estimation import Estimation, Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.types import Estimate, Event, RawEvent
+from fgloc.types import Estimate, Event, MotionEvent, RawEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
+# Motion events only matter to the estimation when a sighting or a question comes.
+_GATHER_S = 0.005  # for which they wait for one another: waking both processes costs more than sending
 _END_S = 10.0  # that it may take to use what it has and to save its state
 _ANSWERING = 4  # its threads that answer questions
 
@@ -56,6 +61,7 @@ class EstimationProcess:
         self._changed = threading.Condition()  # guards all that follows
         self._waiting: deque[Event | PoseWithCovariance | _Question] = deque()
         self._images = 0  # among them
+        self._urgent = False  # one of them is to be sent at once
         self._most_images = 0
         self._dropped: Counter[str] = Counter()
         self._numbers = itertools.count()
@@ -64,6 +70,11 @@ class EstimationProcess:
         self._failed: FglocError | None = None
         self._closing = False
         self._threads: list[threading.Thread] = []
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has been started up: a run that begins now loses no time."""
+        return bool(self._connection.poll())
 
     def begin(self, settings: Settings, outlet: Outlet) -> None:
         """Set up the run; otherwise as `Estimation`."""
@@ -74,16 +85,17 @@ class EstimationProcess:
             thread.start()
             self._threads.append(thread)
 
-    def put(self, event: Event) -> None:
+    def put(self, events: Iterable[Event]) -> None:
         """As `Estimation.put`."""
         with self._changed:
-            self._queue(event)
-            if isinstance(event, RawEvent):
-                self._images += 1
-                if self._images > self._most_images:
-                    self._drop(next(e for e in self._waiting if isinstance(e, RawEvent)))
-            if len(self._waiting) > _MOST_WAITING:
-                self._drop(next(e for e in self._waiting if isinstance(e, Event)))
+            for event in events:
+                self._queue(event)
+                if isinstance(event, RawEvent):
+                    self._images += 1
+                    if self._images > self._most_images:
+                        self._drop(next(e for e in self._waiting if isinstance(e, RawEvent)))
+                if len(self._waiting) > _MOST_WAITING:
+                    self._drop(next(e for e in self._waiting if isinstance(e, Event)))
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
         """As `Estimation.reset_pose`."""
@@ -139,7 +151,9 @@ class EstimationProcess:
         if self._closing:
             raise EstimatorError("the live run is closed; make a new Live")
         self._waiting.append(item)
-        self._changed.notify_all()
+        self._urgent = self._urgent or not isinstance(item, MotionEvent)
+        if self._urgent or len(self._waiting) == 1:
+            self._changed.notify_all()
 
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
@@ -160,9 +174,10 @@ class EstimationProcess:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closing or self._failed is not None)
+                self._changed.wait_for(lambda: self._urgent or self._closing, _GATHER_S)
                 batch = list(self._waiting)
                 self._waiting.clear()
-                self._images = 0
+                self._images, self._urgent = 0, False
             if not batch:
                 return
             try:
@@ -176,6 +191,8 @@ class EstimationProcess:
                 kind, *content = self._connection.recv()
             except (EOFError, OSError):
                 return self._ended()
+            if kind == "ready":
+                continue
             if kind == "built":
                 outlet.built(*content)
             elif kind == "estimated":
@@ -239,26 +256,30 @@ class _Worker:
 
     def run(self) -> None:
         """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
+        gc.freeze()  # what was imported stays: nothing is to be collected there
         try:
+            self._tell("ready")
             estimation = Estimation(self._connection.recv(), self)
             with ThreadPoolExecutor(_ANSWERING) as pool:
                 while True:
-                    for item in self._connection.recv():
-                        if isinstance(item, tuple):
-                            pool.submit(self._answer, estimation, *item)
-                        else:
-                            self._use(estimation, item)
+                    self._use(estimation, pool, self._connection.recv())
         except (EOFError, OSError):
             os._exit(1)
         except Exception as error:
             self._tell("failed", _told(error))  # the settings cannot be used
 
-    def _use(self, estimation: Estimation, item: Event | PoseWithCovariance) -> None:
-        with suppress(FglocError):  # it has failed, and has told so
-            if isinstance(item, PoseWithCovariance):
-                estimation.reset_pose(item)
-            else:
-                estimation.put(item)
+    def _use(self, estimation: Estimation, pool: ThreadPoolExecutor, batch: Iterable[Any]) -> None:
+        """In order."""
+        for is_event, items in groupby(batch, lambda item: isinstance(item, Event)):
+            with suppress(FglocError):  # it has failed, and has told so
+                if is_event:
+                    estimation.put(items)
+                    continue
+                for item in items:
+                    if isinstance(item, PoseWithCovariance):
+                        estimation.reset_pose(item)
+                    else:
+                        pool.submit(self._answer, estimation, *item)
 
     def _answer(self, estimation: Estimation, number: int, method: str, arguments: tuple[Any, ...]) -> None:
         try:

@@ -149,7 +149,7 @@ class OnlineRun:
         localizer, gyro = parts.localizer, parts.localizer.motion.sources.gyro
         known = installation_of_state(state, localizer.factors.installation)
         if known is not None:
-            localizer.factors.believed = known
+            localizer.factors.estimated = known
         if gyro is not None and state.gyro is not None:
             gyro.resume(state.gyro.bias, state.gyro.bias_variance)
         for landmark_id, displacement in state.excluded.items():

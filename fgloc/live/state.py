@@ -16,7 +16,7 @@ from fgloc.config import Section
 from fgloc.errors import FglocError, OutputError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
-from fgloc.graph.installation import Installation, InstallationBelief
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.types import FloatArray, LandmarkMap, Mode
 
 _SYMMETRIC, _NEGATIVE = 1e-6, -1e-9  # of the largest variance: what rounding leaves
@@ -120,12 +120,12 @@ def read_state(path: Path, map_fingerprint: str) -> Resumed:
     return Resumed(state, "")
 
 
-def installation_of_state(state: RunState, installation: Installation) -> InstallationBelief | None:
+def installation_of_state(state: RunState, installation: Installation) -> InstallationEstimate | None:
     """What was found, if the parameters are still the same."""
     saved = state.installation
     if saved.names != installation.names or not saved.names:
         return None
-    return InstallationBelief(np.array(saved.mean), np.array(saved.cov))
+    return InstallationEstimate(np.array(saved.mean), np.array(saved.cov))
 
 
 def matrix3(cov: FloatArray) -> tuple[Row3, Row3, Row3]:

@@ -97,7 +97,9 @@ def _read_through(
     recording.undecodable = {}
     for message in recording.messages():
         topic, _, received_ns, _ = message
-        times.setdefault(topic, Times()).received.append(received_ns)  # damage may hide a topic at first
+        if topic not in times:  # damage may hide it at first
+            times[topic] = Times()
+        times[topic].received.append(received_ns)
         if topic in role_of:
             for event in recording.decode(message, role_of[topic]):
                 times[topic].decoded.append(received_ns)

@@ -64,7 +64,7 @@ class PoseFit:
 
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
         self._observed = factors.observe(sightings)
-        self._theta, self._cov = factors.believed.mean, factors.believed.cov
+        self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
         self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 

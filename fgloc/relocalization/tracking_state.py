@@ -123,7 +123,7 @@ class Tracking:
         return self._given and self._contradicting >= max(self._confirming, 1)
 
     def gate_initial_pose(
-        self, accepted: list[LandmarkFactor], refused: list[LandmarkFactor], decisions: list[Decision]
+        self, accepted: list[LandmarkFactor], rejected: list[LandmarkFactor], decisions: list[Decision]
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Judge a given first pose by what `Association.judge` makes of sightings; while it holds, accept none of them.
 
@@ -132,13 +132,13 @@ class Tracking:
         if self.dead_reckoning and not self._contradicting:  # it is the motion that may be wrong by now
             self._given = False
         self._confirming += len(accepted)
-        self._contradicting += len(refused)
+        self._contradicting += len(rejected)
         if self._confirming > self._contradicting + _CONFIRMED:
             self._given = False
         if not self.keeps_initial_pose:
-            return accepted, refused, decisions
+            return accepted, rejected, decisions
         marked = [d if d.reason else replace(d, weight=0.0, reason=CONTRADICTS) for d in decisions]
-        return [], [*refused, *accepted], marked
+        return [], [*rejected, *accepted], marked
 
     def record_fix(self, by_sightings: bool = True) -> None:
         """The estimated pose is confirmed; ``by_sightings``: by accepted sightings."""

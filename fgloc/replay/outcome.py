@@ -21,7 +21,7 @@ class Outcome:
 
     Attributes:
         roles: topics by role.
-        rejections: everything refused anywhere, by reason.
+        rejections: everything rejected anywhere, by reason.
         mistakes: of the set-up, gross and sure; before the run and after it.
         hints: what surely does not fit together.
         untried: what seems to be wrong with the clocks, and was not tried.

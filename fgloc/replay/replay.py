@@ -88,7 +88,7 @@ class Replay:
             self.estimates = estimates
 
     def rejections(self) -> Counter[str]:
-        """Everything refused anywhere, by reason."""
+        """Everything rejected anywhere, by reason."""
         total = self._parts.rejections
         total.update(self._image_rejections)
         return total

@@ -10,7 +10,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.types import (
     Estimate,
     FloatArray,
@@ -29,7 +29,7 @@ class SmoothedRun:
     estimates: list[Estimate]
     landmarks: LandmarkMap | None  # given or estimated
     notes: tuple[str, ...]
-    installation: InstallationBelief
+    installation: InstallationEstimate
     cost: float
 
 

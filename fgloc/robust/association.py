@@ -1,4 +1,4 @@
-"""What a sighting is worth: its covariance, and whether it is believed at all."""
+"""Data association: the covariance of each sighting, and whether it is accepted."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Association:
     """Weighs the sightings of one step against the prediction.
 
     Attributes:
-        rejections: refused sightings by reason.
+        rejections: rejected sightings by reason.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
@@ -51,7 +51,7 @@ class Association:
         measurements: Sequence[LandmarkMeasurement],
         predicted: PoseWithCovariance,
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
-        """Sort sightings into believed and refused, with the decision on each.
+        """Sort sightings into accepted and rejected, with the decision on each.
 
         The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
         the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
@@ -92,21 +92,21 @@ class Association:
         self,
         k: int,
         stamp_ns: int,
-        refused: Sequence[LandmarkFactor],
+        rejected: Sequence[LandmarkFactor],
         decisions: list[Decision],
         predicted: PoseWithCovariance,
     ) -> list[tuple[LandmarkFactor, LandmarkFactor, Decision]]:
-        """Refused markers whose code was misread: what was refused, what it was, and the decision on that.
+        """Rejected markers whose code was misread: what was rejected, what it was, and the decision on that.
 
-        Beside others that are believed, a marker that cannot be where it was seen, in a place where exactly one other
+        Beside others that are accepted, a marker that cannot be where it was seen, in a place where exactly one other
         would be seen that was not, is that other.
         """
-        if not refused or not self._config.weights.adaptive or not self._factors.known:
+        if not rejected or not self._config.weights.adaptive or not self._factors.known:
             return []
         found = []
         seen = {d.landmark_id for d in decisions if not d.reason}
         rows = [i for i, d in enumerate(decisions) if d.reason]
-        for i, misread in zip(rows, refused, strict=True):
+        for i, misread in zip(rows, rejected, strict=True):
             m = misread.measurement
             if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, PixelMeasurement):
                 continue
@@ -139,14 +139,14 @@ class Association:
         return found
 
     def nearby_consensus(
-        self, refused: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
+        self, rejected: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
     ) -> Fit | None:
-        """The place nearby that refused sightings agree on, if they are of two landmarks or more and leave no doubt.
+        """The place nearby that rejected sightings agree on, if they are of two landmarks or more and leave no doubt.
 
         Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
         is taken back.
         """
-        gated = [s for s, d in zip(refused, decisions, strict=True) if d.reason == "gate"]
+        gated = [s for s, d in zip(rejected, decisions, strict=True) if d.reason == "gate"]
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
         fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
@@ -156,7 +156,7 @@ class Association:
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
             return None
         self.rejections.subtract(
-            f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(refused, decisions, strict=True)
+            f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
         )
         self.rejections += Counter()  # drops the zeros
         return fit
@@ -164,13 +164,13 @@ class Association:
     def _judge(
         self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
     ) -> list[tuple[float, int, str]]:
-        """Of each: NIS, its degrees of freedom, and why it is refused ("" if it is believed)."""
+        """Of each: NIS, its degrees of freedom, and why it is rejected ("" if it is accepted)."""
         if not self._factors.known:
             return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
         if not measurements:
             return []
         lines = self._factors.linearize(measurements, predicted.pose)
-        known = predicted.installation or self._factors.believed
+        known = predicted.installation or self._factors.estimated
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
         uncertain = not is_linear(predicted)
         judged = []
@@ -216,7 +216,7 @@ class Association:
         self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
     ) -> bool:
         """Whether these sightings and the prediction may all be right."""
-        known = predicted.installation or self._factors.believed
+        known = predicted.installation or self._factors.estimated
         seen = [measurements[i] for i in rows]
         together = correct(predicted, known, seen, self._factors)
         dof = sum(m.dof for m in seen)
@@ -230,7 +230,7 @@ class Association:
         predicted: PoseWithCovariance,
     ) -> tuple[float, list[int]]:
         """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
-        known = predicted.installation or self._factors.believed
+        known = predicted.installation or self._factors.estimated
         alone = correct(predicted, known, [measurements[first]], self._factors)
         if alone is None or alone[0].installation is None:
             return math.inf, []
@@ -264,7 +264,7 @@ class Association:
 
     @property
     def contradicting(self) -> int:
-        """How many landmarks were refused since a sighting was accepted."""
+        """How many landmarks were rejected since a sighting was accepted."""
         return len(self._contradicting)
 
     def forget_contradictions(self) -> None:

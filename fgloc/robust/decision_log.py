@@ -70,12 +70,12 @@ def place_decision(
     return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, weight, reason, shift_m=shift)
 
 
-def mode_decisions(k: int, stamp_ns: int, mode: Mode, blind_s: float, after_s: float) -> tuple[Decision, ...]:
+def mode_decisions(k: int, stamp_ns: int, mode: Mode, since_fix_s: float, after_s: float) -> tuple[Decision, ...]:
     """The row of a pose that is not ``OK``: its residual is the time without an accepted sighting [s]."""
     if mode is Mode.OK:
         return ()
     threshold = after_s if mode is Mode.DEAD_RECKONING else math.nan
-    return (Decision(k, stamp_ns, "mode", -1, blind_s, math.nan, 0, 0.0, mode.value.lower(), threshold),)
+    return (Decision(k, stamp_ns, "mode", -1, since_fix_s, math.nan, 0, 0.0, mode.value.lower(), threshold),)
 
 
 def segment_decision(k: int, stamp_ns: int) -> Decision:

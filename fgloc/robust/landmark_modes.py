@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import InstallationBelief
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import innovation, joint_cov, transition
 from fgloc.graph.linearized import Linearized
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
@@ -89,7 +89,7 @@ class LandmarkModes:
         predicted: PoseWithCovariance,
         belief: PoseWithCovariance,
         fused: Sequence[LandmarkFactor],
-        refused: Sequence[LandmarkFactor] = (),
+        rejected: Sequence[LandmarkFactor] = (),
     ) -> int | None:
         """Follow the estimator through one keyframe.
 
@@ -98,7 +98,7 @@ class LandmarkModes:
             predicted: before its sightings.
             belief: after them.
             fused: sightings that it took.
-            refused: sightings that it did not take.
+            rejected: sightings that it did not take.
 
         Returns:
             A landmark that is now known to be moved.
@@ -106,7 +106,7 @@ class LandmarkModes:
         if not len(self._ids):
             return None
         seen = [s for s in fused if not isinstance(s.alone, PoseMeasurement)]
-        against = [s for s in refused if not isinstance(s.alone, PoseMeasurement)]
+        against = [s for s in rejected if not isinstance(s.alone, PoseMeasurement)]
         for s in (*seen, *against):
             self._follow(s.alone.landmark_id)
         if motions:
@@ -139,7 +139,7 @@ class LandmarkModes:
         if not off.any():
             return belief, evidence
         pose = se2.compose(belief.pose, se2.exp(off[:3]))
-        installation = InstallationBelief(known.mean + off[3:], P[3:, 3:])
+        installation = InstallationEstimate(known.mean + off[3:], P[3:, 3:])
         return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation), evidence
 
     def _follow(self, landmark_id: int) -> None:
@@ -152,8 +152,8 @@ class LandmarkModes:
             self._evidence[:, row] = self._seen[:, row] = 0.0
         self._rows[landmark_id] = row
 
-    def _known(self, belief: PoseWithCovariance) -> InstallationBelief:
-        return belief.installation or self._factors.believed
+    def _known(self, belief: PoseWithCovariance) -> InstallationEstimate:
+        return belief.installation or self._factors.estimated
 
     def _reset(self, rows: NDArray[np.bool_]) -> None:
         self._M[rows], self._moved[rows], self._cov[rows] = 0.0, 0.0, _MOVED_M**2 * np.eye(2)
@@ -184,7 +184,7 @@ class LandmarkModes:
         self._M += (P @ found.H.T @ W.T) @ G
 
     def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
-        """A sighting that was refused; how its own landmark's displacement explains it may be far from linear."""
+        """A sighting that was rejected; how its own landmark's displacement explains it may be far from linear."""
         own, observed, scale = self._rows[m.landmark_id], self._factors.observe([m]), self._shared(m)
         one = observed.linearize(belief.pose, self._known(belief).mean)[0]
         if one.behind:
@@ -201,7 +201,7 @@ class LandmarkModes:
     def _explain_own(
         self, row: int, P: FloatArray, belief: PoseWithCovariance, observed: Observations, scale: float
     ) -> Explained:
-        """One refused sighting under the hypothesis that its landmark was moved: iterated Kalman update."""
+        """One rejected sighting under the hypothesis that its landmark was moved: iterated Kalman update."""
         theta, moved = self._known(belief).mean, self._moved[row]
         rows = self._factors.installation.landmarks.get(int(self._ids[row]), (0, 0))
         explained = np.array([np.inf]), self._moved[row, None], self._cov[row, None]
@@ -238,7 +238,7 @@ class LandmarkModes:
         self._explained[row] += explains[row]
 
     def _shared(self, m: LandmarkMeasurement) -> float:
-        """Scale on the sigma of a refused sighting, as errors of one landmark are correlated for some time."""
+        """Scale on the sigma of a rejected sighting, as errors of one landmark are correlated for some time."""
         last = self._last_ns.get(m.landmark_id)
         if last is None or isinstance(m, PixelMeasurement):
             return 1.0

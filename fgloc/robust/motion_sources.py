@@ -99,7 +99,7 @@ class MotionSources:
 
     def _installed(self, m: MotionMeasurement, *derivatives: Mapping[str, FloatArray]) -> MotionMeasurement:
         """The motion as reported with the installation as it is known now; its derivatives are those of the sensors."""
-        index, mean = self.factors.installation.index, self.factors.believed.mean
+        index, mean = self.factors.installation.index, self.factors.estimated.mean
         by = {name: d for each in derivatives for name, d in each.items()}
         kept = {name: (d, float(mean[index[name]])) for name, d in by.items() if name in index}
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)

@@ -52,7 +52,7 @@ class SensorMeasurements:
         return taken, verdicts
 
     def _is_biased(self, m: PoseMeasurement, predicted: PoseWithCovariance) -> bool:
-        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.believed.mean)
+        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
         return self._bias.is_biased((m.source, m.target), m.stamp_ns, one, predicted.cov)
 
 

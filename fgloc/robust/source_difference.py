@@ -62,7 +62,7 @@ def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFac
             if name in m.depends_on:
                 D[:, i] += sign * m.depends_on[name][0]
     rows = [index[name] for name in names]
-    return D, factors.believed.cov[np.ix_(rows, rows)]
+    return D, factors.estimated.cov[np.ix_(rows, rows)]
 
 
 def _is_clock(parameter: str) -> bool:

@@ -1,4 +1,4 @@
-"""Camera calibrations: CameraInfo, ROS and OpenCV calibration files, Kalibr; checked before they are believed."""
+"""Camera calibrations: CameraInfo, ROS and OpenCV calibration files, Kalibr; checked before they are used."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class LandmarksConfig(Section):
     )
     cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
     min_sightings: int = Field(
-        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is believed"
+        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is used"
     )
     repeat_s: float = Field(
         0.0,

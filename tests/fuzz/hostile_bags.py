@@ -162,7 +162,7 @@ def _with_images(folder: Path, image: bytes, side: int) -> Path:
     K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]
     with BagWriter(folder) as bag:
         bag.static_transform(START_NS, "base_link", "camera", (0.1, 0.0, 0.3), (-0.5, 0.5, -0.5, 0.5))
-        bag.camera_info("/camera/camera_info", START_NS, side, side, K, [0.0] * 5, frame_id="camera")
+        bag.camera_info("/camera/camera_info", START_NS, (side, side), K, [0.0] * 5, frame_id="camera")
         for k in range(40):
             stamp = START_NS + k * 50_000_000
             bag.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.4, 0.0))

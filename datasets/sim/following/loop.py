@@ -7,8 +7,8 @@ the time that detection and update take.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import count
 from operator import itemgetter
@@ -31,6 +31,7 @@ from datasets.sim.scenario import Scenario
 from datasets.sim.sensors import Sees, stamp_ns, streams
 from fgloc.ablation.failures import Failure
 from fgloc.config import Config, Role, config_of
+from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.decode import events_of
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent
@@ -83,10 +84,16 @@ def follow(drive: Drive, out: Path | None = None) -> Followed:
     """Drive once, into ``out`` if it is given: a run's folder as of `record`, ``following.csv`` and ``following.yaml``.
 
     Raises:
-        ConfigError: a failure that a driving robot cannot have.
+        ConfigError: a failure that a driving robot cannot have, or fgloc is to guide a robot that sees nothing.
         SimulationError: the physics diverged.
         RenderError: images are wanted and there is no OpenGL.
     """
+    blind = drive.scenario.camera is None or drive.sees == "nothing"
+    if drive.pose.startswith("fgloc") and blind:
+        raise ConfigError(
+            f"scenario '{drive.scenario.name}' shows the robot no markers: {drive.pose} would never know where it is; "
+            "give it a camera, or --pose truth, wheels or learned"
+        )
     with ExitStack() as stack:
         if out is None:
             from tempfile import TemporaryDirectory
@@ -113,7 +120,8 @@ def _drive(drive: Drive, scene: Scene, bag_folder: Path) -> Followed:
         bag = stack.enter_context(BagWriter(bag_folder, compress=True, tap=arrivals.take))
         channels = streams(scene, simulation.log, bag, camera=drive.sees)
         for channel in channels:
-            stack.callback(channel.close)
+            if isinstance(channel, Generator):  # the drive may end before its messages do
+                stack.enter_context(closing(channel))
         pursuit = Pursuit(curve, drive.path.speed_m_s, drive.settings)
         loop = ClosedLoop(Written(channels), arrivals, sensors, source, pursuit, scene.scenario.control.rest_s)
         log = simulation.run(loop)

@@ -61,13 +61,14 @@ class Curve:
         """Interpolate between the waypoints by the distance between them."""
         given = np.array(path.waypoints)
         knots = np.concatenate([[0.0], np.hypot(*np.diff(given, axis=0).T).cumsum()])
-        n = int(knots[-1] / _STEP_M) + 1
-        at = np.unique(np.concatenate([np.linspace(0.0, knots[-1], n + 1), knots]))
+        counts = [int(gap / _STEP_M) + 1 for gap in np.diff(knots)]
+        pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
+        at = np.concatenate([*pieces, knots[-1:]])
         if len(given) < _FEWEST_FOR_A_CURVE:
             self.points = np.column_stack([np.interp(at, knots, given[:, k]) for k in range(2)])
         else:
             self.points = np.asarray(Akima1DInterpolator(knots, given, method="makima")(at))
-        self.at_waypoints = np.searchsorted(at, knots)
+        self.at_waypoints = np.cumsum([0, *counts])
         self.along_m = np.concatenate([[0.0], np.hypot(*np.diff(self.points, axis=0).T).cumsum()])
 
     @property

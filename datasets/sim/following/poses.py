@@ -11,7 +11,7 @@ from fgloc.errors import EstimatorError
 from fgloc.live import Live
 from fgloc.types import Event, FloatArray, LandmarkMap, Mode
 
-PoseName = Literal["truth", "fgloc", "fgloc-no-model", "wheels", "learned"]
+PoseName = Literal["truth", "fgloc", "fgloc-no-model", "fgloc-no-model-no-gyro", "fgloc-constant", "wheels", "learned"]
 POSES: tuple[PoseName, ...] = get_args(PoseName)
 _START_SIGMA = 1e-3  # m and rad: dead reckoning begins at the true pose
 _PATIENCE_S = 120.0  # of wall time, for what has been pushed
@@ -19,6 +19,8 @@ _BLIND: dict[str, Any] = {"recording": {"topics": {"image": "none", "camera_info
 _CHANGES: dict[PoseName, dict[str, Any]] = {
     "fgloc": {},
     "fgloc-no-model": {"motion": {"use": False}},
+    "fgloc-no-model-no-gyro": {"motion": {"use": False}, "gyro": {"use": False}},
+    "fgloc-constant": {"weights": {"adaptive": False}},
     "wheels": {**_BLIND, "motion": {"use": False}, "gyro": {"use": False}},
     "learned": {
         "recording": {"topics": {**_BLIND["recording"]["topics"], "odometry": "none"}},
@@ -94,8 +96,8 @@ def pose_source(
     """A source by name.
 
     Args:
-        name: "truth"; "fgloc", and the same without its learned motion; "wheels" or "learned": wheel odometry or the
-            learned motion alone, carried on from the true start.
+        name: "truth"; "fgloc", and the same without its learned motion, without that and the gyro, or with constant
+            weights; "wheels" or "learned": wheel odometry or the learned motion alone, carried on from the true start.
         config: as in ``robot.yaml``.
         landmark_map: as surveyed.
         sees: role of the camera: "image" or "sightings".
@@ -105,7 +107,7 @@ def pose_source(
         return TruePose()
     changes = _CHANGES[name]
     roles = {"odometry", "joints", "command", "imu"}
-    if name in ("fgloc", "fgloc-no-model"):
+    if name.startswith("fgloc"):
         return LivePose(changed(config, changes), landmark_map, roles | {sees}, heeds_sigma=True)
     begin = {"estimator": {"initial_pose": start, "initial_sigmas": (_START_SIGMA,) * 3}}
     roles -= {"odometry"} if name == "learned" else set()

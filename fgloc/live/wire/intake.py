@@ -29,6 +29,7 @@ class Intake:
         roles: topic of each role; empty until those are there that a run needs.
         undecodable: messages that could not be decoded, by topic.
         received: messages by topic.
+        truth: whether a truth is read; only those who look on need it.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Intake:
         self.roles: dict[Role, str] = {}
         self.undecodable: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
+        self.truth = True
         self._counting = threading.Lock()
 
     def find(self) -> str:
@@ -78,6 +80,7 @@ class Intake:
                 self._role_of[topic] = None
                 self._participant.read(topic, types[topic], self._on_sample, latched=topic == "/tf_static")
         new = [(role, topic) for role, topic in self.roles.items() if topic not in self._role_of and topic in types]
+        new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:
             self._role_of[topic] = role
             self._participant.read(topic, types[topic], self._on_sample)

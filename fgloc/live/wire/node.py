@@ -25,6 +25,7 @@ from fgloc.live.wire.teller import Teller
 from fgloc.types import Estimate, Event, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
+_ASKED_EVERY = 2  # turns: the motion sources are asked at 25 Hz, which is most of the work; between, the twist is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
 _INITIAL_POSE = "/initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -70,7 +71,9 @@ class Node:
         self._messages = participant.messages
         self._failure: FglocError | None = None
         self._notes: list[str] = []  # to be told
+        self._given: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # pose and sigmas, before the run begins
         self._stopping = threading.Event()
+        self._turn = 0  # of publishing
         self._last_ns = 0  # stamp of the last odometry published
         self._last_odom_ns = 0
         if landmarks is not None:
@@ -99,17 +102,18 @@ class Node:
         """
         publishing: threading.Thread | None = None
         teller = Teller(tell)
+        self.intake.truth = self.watch is not None
         next_diagnostics_s = time.monotonic()
         try:
             while not stop.wait(_POLL_S):
                 if self._failure is not None:
                     raise self._failure
                 teller.waiting(self.intake.find())
-                if self.live is None and self.intake.roles:
+                if self.live is None and self.intake.roles and self._process.ready:
                     self._start()
                     publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
                     publishing.start()
-                for role, topic in self.intake.subscribe():
+                for role, topic in self.intake.subscribe() if self.live is not None else ():
                     teller.tell(f"Subscribed: {topic} ({role}).")
                 status = None if self.live is None else self.live.status()
                 if status is not None:
@@ -128,6 +132,7 @@ class Node:
         """The topics are known: whose first messages come soon belongs to the run from its beginning."""
         roles = tuple(self.intake.roles)
         self.live = Live(self._config, self._landmarks, state=self._state, roles=roles, process=self._process)
+        self._take_given(self.live)
         self._recent = RecentPoses(self.live.pose_at)
         for callback in self._subscribers:
             self.live.subscribe(callback)
@@ -154,16 +159,22 @@ class Node:
         if frame not in ("", MAP_FRAME):
             self._notes.append(f"{_INITIAL_POSE} is in frame {frame!r}, expected {MAP_FRAME!r}: not used.")
             return
-        if self.live is None:
-            self._notes.append(f"{_INITIAL_POSE} came before the robot's topics: not used.")
-            return
         pose, variances = message.pose.pose, np.asarray(message.pose.covariance)[[0, 7, 35]]
         if not (variances > 0.0).all():
             variances = np.square(self._config.estimator.initial_sigmas)
         q = pose.orientation
         yaw = quaternion_yaw((q.x, q.y, q.z, q.w))
+        self._given = (pose.position.x, pose.position.y, yaw), tuple(np.sqrt(variances).tolist())
+        if self.live is not None:
+            self._take_given(self.live)
+
+    def _take_given(self, live: Live) -> None:
+        """Go on from the pose that was given last, if one was."""
+        given, self._given = self._given, None
+        if given is None:
+            return
         try:
-            self.live.reset_pose((pose.position.x, pose.position.y, yaw), np.sqrt(variances).tolist())
+            live.reset_pose(*given)
         except FglocError as error:
             self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
 
@@ -186,13 +197,17 @@ class Node:
 
     def _publish_once(self) -> None:
         assert self.live is not None
-        now = self.live.pose_at(self._clock.now_ns()) or self.live.pose_at()
+        clock_ns = self._clock.now_ns()
+        self._turn += 1
+        ahead = self._recent.ahead(clock_ns) if self._turn % _ASKED_EVERY else None
+        now = ahead or self.live.pose_at(clock_ns) or self.live.pose_at()
         if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
             return
+        if ahead is None:
+            self._recent.add(now)
         self._last_ns = now.stamp_ns
-        self._recent.add(now)
         base, odom = self._odom.base, self._odom.latest()
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, self._recent.twist()), base)
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist()), base)
         self.published["odometry"] += 1
         if odom is None:
             self._outputs.transform(now.stamp_ns, now.pose, base)

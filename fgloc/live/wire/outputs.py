@@ -20,6 +20,7 @@ _LEVEL = {Mode.OK: 0, Mode.UNCONFIRMED: 1, Mode.DEAD_RECKONING: 1, Mode.LOST: 2}
 STALE = 3  # DiagnosticStatus
 _THICKNESS_M = 0.01  # of a marker's plate, as drawn
 _POINT_M = 0.1  # size of a landmark without one
+_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y, yaw of six
 _WHITE = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
 _CUBE, _SPHERE, _TEXT = 1, 2, 9  # visualization_msgs/Marker
 
@@ -32,6 +33,7 @@ class BaseState:
     pose: FloatArray  # (3,) T_map_base
     cov: FloatArray  # (3, 3) in the map frame
     twist: FloatArray  # (3,) of the base in its own axes: m/s, m/s, rad/s
+    twist_cov: FloatArray  # (3, 3) likewise
 
 
 class Outputs:
@@ -63,7 +65,10 @@ class Outputs:
                 "header": _header(state.stamp_ns, MAP_FRAME),
                 "child_frame_id": base_frame,
                 "pose": _pose_with_covariance(state.pose, state.cov),
-                "twist": {"twist": {"linear": _xyz(*state.twist[:2]), "angular": _xyz(z=state.twist[2])}},
+                "twist": {
+                    "twist": {"linear": _xyz(*state.twist[:2]), "angular": _xyz(z=state.twist[2])},
+                    "covariance": _spatial(state.twist_cov),
+                },
             },
         )
 
@@ -131,14 +136,14 @@ def _header(stamp_ns: int, frame_id: str) -> dict[str, Any]:
 
 
 def _pose_with_covariance(pose: FloatArray, cov: FloatArray) -> dict[str, Any]:
-    """Height, roll and pitch are zero, with no variance: the robot is taken to move in the plane."""
+    return {"pose": {"position": _xyz(*pose[:2]), "orientation": _rotation(pose[2])}, "covariance": _spatial(cov)}
+
+
+def _spatial(cov: FloatArray) -> FloatArray:
+    """``(36,)`` of ``(3, 3)``: height, roll and pitch are zero, with no variance: the robot moves in the plane."""
     covariance = np.zeros((6, 6))
-    planar = np.ix_((0, 1, 5), (0, 1, 5))
-    covariance[planar] = cov
-    return {
-        "pose": {"position": _xyz(*pose[:2]), "orientation": _rotation(pose[2])},
-        "covariance": covariance.ravel(),
-    }
+    covariance[_PLANAR] = cov
+    return covariance.ravel()
 
 
 def _rotation(yaw: float) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from fgloc.live import LivePose
 from fgloc.types import FloatArray
 
 SPAN_S = 0.1  # the twist is the mean over this long: five messages
+_AHEAD_NS = 50_000_000  # over which the twist is held; 1 m/s² moves the pose by 2.5 mm from that in this time
+_LEAST_S = 0.03  # between two poses whose covariances tell how fast the covariance grows
+_LEAST_VARIANCE = 1e-8  # (m/s)², (rad/s)²: no motion is known better
 
 
 class RecentPoses:
@@ -24,39 +28,71 @@ class RecentPoses:
     def __init__(self, pose_at: Callable[[int], LivePose | None]) -> None:
         """``pose_at``: of the live run."""
         self._pose_at = pose_at
-        self._keyframe_ns = 0
-        self._poses: deque[tuple[int, FloatArray]] = deque()
+        self._poses: deque[LivePose] = deque()
+        self._growth = np.zeros((3, 3))  # of the covariance, in the base's axes, by the motion: m²/s, rad²/s
 
     def add(self, now: LivePose) -> None:
         """Take in the newest pose."""
-        if self._poses and now.keyframe_ns != self._keyframe_ns:
+        if self._poses and now.keyframe_ns != self._poses[-1].keyframe_ns:
             self._correct()
-        self._keyframe_ns = now.keyframe_ns
-        if self._poses and now.stamp_ns <= self._poses[-1][0]:  # the clock was set back
+        if self._poses and now.stamp_ns <= self._poses[-1].stamp_ns:  # the clock was set back
             self._poses.clear()
-        self._poses.append((now.stamp_ns, now.pose))
-        while self._poses[0][0] < now.stamp_ns - round(SPAN_S * 1e9) and len(self._poses) > 2:
+        self._poses.append(now)
+        while self._poses[0].stamp_ns < now.stamp_ns - round(SPAN_S * 1e9) and len(self._poses) > 2:
             self._poses.popleft()
+        first = next(p for p in self._poses if p.keyframe_ns == now.keyframe_ns)
+        if (seconds := _seconds(first, now)) >= _LEAST_S:
+            ad = se2.adjoint(se2.inverse(se2.between(first.pose, now.pose)))
+            self._growth = (_body_cov(now) - ad @ _body_cov(first) @ ad.T) / seconds
 
-    def twist(self) -> FloatArray:
-        """``(3,)`` of the base in its own axes: m/s, m/s, rad/s."""
-        (first_ns, first), (last_ns, last) = self._poses[0], self._poses[-1]
-        return np.zeros(3) if last_ns == first_ns else se2.log(se2.between(first, last)) / ((last_ns - first_ns) * 1e-9)
+    def twist(self) -> tuple[FloatArray, FloatArray]:
+        """``(3,)`` of the base in its own axes [m/s, m/s, rad/s], and its covariance ``(3, 3)``.
+
+        The covariance is that of the motion over the span, by which the pose's has grown: errors of the motion sources
+        are taken to be independent from moment to moment, as the estimator takes them.
+        """
+        first, last = self._poses[0], self._poses[-1]
+        seconds = _seconds(first, last)
+        if seconds == 0.0:
+            return np.zeros(3), np.zeros((3, 3))
+        twist = se2.log(se2.between(first.pose, last.pose)) / seconds
+        variances, axes = np.linalg.eigh(self._growth / seconds)
+        return twist, axes @ np.diag(np.maximum(variances, _LEAST_VARIANCE)) @ axes.T
+
+    def ahead(self, stamp_ns: int) -> LivePose | None:
+        """The newest pose, carried on by the twist to a time soon after it; None if there is none soon before."""
+        if not self._poses or not 0 < stamp_ns - self._poses[-1].stamp_ns <= _AHEAD_NS:
+            return None
+        last = self._poses[-1]
+        seconds = (stamp_ns - last.stamp_ns) * 1e-9
+        motion = se2.exp(self.twist()[0] * seconds)
+        ad, pose = se2.adjoint(se2.inverse(motion)), se2.compose(last.pose, motion)
+        cov = ad @ _body_cov(last) @ ad.T + self._growth * seconds
+        return replace(last, stamp_ns=stamp_ns, pose=pose, cov=se2.rotate_cov(cov, float(pose[2])))
 
     def at(self, stamp_ns: int) -> FloatArray | None:
         """Pose ``(3,)`` at a time, if it is among these."""
-        if not self._poses[0][0] <= stamp_ns <= self._poses[-1][0]:
+        if not self._poses[0].stamp_ns <= stamp_ns <= self._poses[-1].stamp_ns:
             return None
-        stamps = np.array([stamp for stamp, _ in self._poses], dtype=np.int64)
-        poses = np.array([pose for _, pose in self._poses])
+        stamps = np.array([p.stamp_ns for p in self._poses], dtype=np.int64)
+        poses = np.array([p.pose for p in self._poses])
         return np.asarray(se2.interpolate(stamps, poses, np.array([stamp_ns], dtype=np.int64))[0])
 
     def _correct(self) -> None:
         """Move all poses with the last one, which is where the new keyframe has it."""
-        last_ns, last = self._poses[-1]
-        again = self._pose_at(last_ns)
+        last = self._poses.pop()
+        again = self._pose_at(last.stamp_ns)
         if again is None:
             self._poses.clear()
             return
-        correction = se2.compose(again.pose, se2.inverse(last))
-        self._poses = deque((stamp, se2.compose(correction, pose)) for stamp, pose in self._poses)
+        correction = se2.compose(again.pose, se2.inverse(last.pose))
+        self._poses = deque(replace(p, pose=se2.compose(correction, p.pose)) for p in self._poses)
+        self._poses.append(again)
+
+
+def _seconds(first: LivePose, last: LivePose) -> float:
+    return (last.stamp_ns - first.stamp_ns) * 1e-9
+
+
+def _body_cov(pose: LivePose) -> FloatArray:
+    return se2.rotate_cov(pose.cov, -float(pose.pose[2]))

@@ -133,7 +133,7 @@ class ModelCard(Section):
     dt_s: Positive = Field(description="longest sub-step: a step is cut into equal parts no longer than this")
     hidden: tuple[Annotated[int, Field(gt=0, le=4096)], ...]
     members: Annotated[int, Field(ge=1, le=64)] = Field(1, description="displacement: networks that are averaged")
-    hold_s: Positive = Field(description="a command is believed to hold for this long when the next one is missing")
+    hold_s: Positive = Field(description="a command is taken to hold for this long when the next one is missing")
     history_s: Positive = Field(description="seconds of commands before a step that the model wants")
     kinematics: Kinematics = Kinematics()
     lag: Lag | None = Field(None, description="lag, arx, velocity: the known part of the response")

@@ -6,7 +6,7 @@ import numpy as np
 
 from fgloc.types import ControlEvent, FloatArray
 
-_FOREVER_S = 1e4  # a last command holds on; who asks decides whether to believe it
+_FOREVER_S = 1e4  # a last command holds on; who asks decides for how long
 _MIN_CAPACITY = 4096
 
 

@@ -18,7 +18,7 @@ from fgloc.types import Camera, FloatArray, Landmark, LandmarkSighting, PixelMea
 if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
 
-_CLEAR_RATIO = 2.0  # a marker's pose is believed if the mirrored one explains its corners this much worse
+_CLEAR_RATIO = 2.0  # a marker's pose is unambiguous if the mirrored one explains its corners this much worse
 _MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
 
 

@@ -20,7 +20,7 @@ _MAX_TURN = 1.0  # rad: longer arcs are cut, so that the quadrature of the noise
 _SHORT_TURN = 0.1  # rad: below it two nodes do
 _TWO_NODES = ((0.5 - 0.5 / math.sqrt(3.0), 0.5), (0.5 + 0.5 / math.sqrt(3.0), 0.5))  # Gauss-Legendre on [0, 1]
 _THREE_NODES = tuple((0.5 + 0.5 * s * math.sqrt(0.6), w / 18.0) for s, w in ((-1.0, 5.0), (0.0, 8.0), (1.0, 5.0)))
-_SILENT_SPEED = 0.5  # m/s and rad/s that a silent robot is believed capable of at least ...
+_SILENT_SPEED = 0.5  # m/s and rad/s that a silent robot is taken to be capable of at least ...
 _SILENT_TAU_S = 2.0  # ... changing its mind after this time
 _STEADY_NS = 20_000_000  # a speed over less time may be a jitter of stamps
 _FLOOR = 1e-12  # keeps a covariance without any noise positive definite
@@ -78,7 +78,7 @@ class TwistTimeline:
                 del self._pieces[:old]
 
     def hold(self, twist: Twist, end_ns: int) -> None:
-        """What is believed beyond the last piece, until ``end_ns``."""
+        """What is taken to hold beyond the last piece, until ``end_ns``."""
         self._tail = twist
         self._tail_end = max(end_ns, self._end)
 

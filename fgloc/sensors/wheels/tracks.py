@@ -72,7 +72,7 @@ class Track:
         return vx, vy, config.scale_omega * w + config.yaw_per_m * vx
 
     def _extend(self, stamp_ns: int, twist: Twist | None, held: Twist | None) -> None:
-        """Continue the timeline with ``twist`` or, if that is None, with ``held`` for as long as it is believed."""
+        """Continue the timeline with ``twist`` or, if that is None, with ``held`` as long as it holds."""
         if self._last_ns is None:
             self.timeline.begin(stamp_ns)
         elif twist is not None:
@@ -83,7 +83,7 @@ class Track:
             self.timeline.extend(stamp_ns, None)
 
     def _reach(self, stamp_ns: int, held: Twist | None) -> None:
-        """This was the newest reading; ``held`` is believed beyond it."""
+        """This was the newest reading; ``held`` is taken to hold beyond it."""
         self._last_ns = stamp_ns
         if held is not None:
             self.timeline.hold(self._true(held), stamp_ns + self._hold_ns)

@@ -1,0 +1,228 @@
+"""Factors of a whole recording, made over and over about new poses: what does not change is prepared once, in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from fgloc import se2
+from fgloc.errors import CovarianceError
+from fgloc.graph.factors import INSTALLATION, LandmarkFactors, motion_factor, pose_key, sighting_factors
+from fgloc.graph.installation import Installation
+from fgloc.graph.linearized import Stacked
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
+from fgloc.graph.noise_models import whitening_of
+from fgloc.graph.observation import Observations
+from fgloc.types import FloatArray, IntArray, MotionMeasurement
+
+_AT_ONCE = 1000  # keyframes whose sightings are linearized at the same time: each may have 100 kB of Jacobians
+
+
+class BatchMotions:
+    """Between-factors of all keyframes, as `fgloc.graph.factors.installed_motion_factor` makes them."""
+
+    def __init__(self, frames: Sequence[Keyframe], installation: Installation) -> None:
+        """Prepare the motions that end at these keyframes."""
+        self._n = len(installation)
+        self._plain: list[gtsam.NonlinearFactor] = []
+        self._at: list[int] = []  # rows of the keyframes that the installed ones end at
+        self._keys: list[tuple[int, int]] = []
+        installed: list[MotionMeasurement] = []
+        for i, frame in enumerate(frames):
+            for motion in frame.motions:
+                if any(name in installation.index for name in motion.depends_on):
+                    self._at.append(i)
+                    self._keys.append((pose_key(frame.k - 1), pose_key(frame.k)))
+                    installed.append(motion)
+                else:
+                    self._plain.append(motion_factor(frame.k, motion))
+        self._motions = np.array([m.motion for m in installed]).reshape(-1, 3)
+        self._linear = list(self._prepared(installed, installation))
+
+    def _prepared(
+        self, motions: Sequence[MotionMeasurement], installation: Installation
+    ) -> Iterator[gtsam.JacobianFactor]:
+        if not motions:
+            return
+        W = whitenings([m.cov for m in motions])
+        by_first = -W @ np.array([se2.adjoint(se2.inverse(m.motion)) for m in motions])
+        noise = gtsam.noiseModel.Unit.Create(3)
+        for (first, second), m, w, A in zip(self._keys, motions, W, by_first, strict=True):
+            H, residual = np.zeros((3, self._n)), np.zeros(3)
+            for name, (derivative, assumed) in m.depends_on.items():
+                if name in installation.index:
+                    column = -w @ derivative
+                    H[:, installation.index[name]] = column
+                    residual -= column * assumed
+            yield gtsam.JacobianFactor(first, A, second, w, INSTALLATION, H, -residual, noise)
+
+    def factors(self, poses: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """All factors, linear about poses ``(n, 3)`` of the keyframes and what the motions lead to from there."""
+        yield from self._plain
+        before = poses[np.array(self._at, dtype=np.int64) - 1]
+        after = se2.compose_array(before, self._motions)
+        theta = np.zeros(self._n)
+        for (first, second), linear, start, end in zip(self._keys, self._linear, before, after, strict=True):
+            values = gtsam.Values()
+            values.insert(first, gtsam.Pose2(*start))
+            values.insert(second, gtsam.Pose2(*end))
+            values.insert(INSTALLATION, theta)
+            yield gtsam.LinearContainerFactor(linear, values)
+
+
+class BatchSightings:
+    """Sightings of a known map from all keyframes, and the prior of the installation.
+
+    Of each image only what concerns its pose becomes a factor: an orthogonal transform of its rows leaves three in
+    which the pose is, and the others, which hold the installation alone, are summed up over the whole recording. The
+    solution is that of `sighting_factors`, in a tenth of the memory.
+    """
+
+    def __init__(
+        self, frames: Sequence[Keyframe], accepted: Sequence[Sequence[LandmarkFactor]], factors: LandmarkFactors
+    ) -> None:
+        """Prepare what was accepted at each keyframe."""
+        self._installation = factors.installation
+        self._chunks: list[_Images] = []
+        for first in range(0, len(frames), _AT_ONCE):
+            chosen = range(first, min(first + _AT_ONCE, len(frames)))
+            held = [(i, frames[i].k, s) for i in chosen for s in accepted[i]]
+            if held:
+                self._chunks.append(_Images(held, factors))
+
+    def factors(self, poses: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """All factors, linear about poses ``(n, 3)`` of the keyframes and an installation ``(p,)``."""
+        rest = np.zeros((len(theta) + 1, len(theta) + 1))  # information of the installation, and its last column
+        for chunk in self._chunks:
+            yield from chunk.factors(poses, theta, rest)
+        if len(theta):
+            yield self._of_installation(theta, rest)
+
+    def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Squared residual ``(m,)`` of each sighting by its own noise, and its rows, see `Observations.squares`."""
+        found = [chunk.squares(poses, theta) for chunk in self._chunks]
+        return (
+            np.concatenate([np.zeros(0), *(squares for squares, _ in found)]),
+            np.concatenate([np.zeros(0, dtype=np.int64), *(rows for _, rows in found)]),
+        )
+
+    def _of_installation(self, theta: FloatArray, rest: FloatArray) -> gtsam.NonlinearFactor:
+        """Its prior, and all that the sightings tell of it alone."""
+        prior = self._installation.prior()
+        W = whitening_of(prior.cov)
+        both = np.column_stack([W, W @ (theta - prior.mean)])
+        total = both.T @ both + rest
+        n = len(theta)
+        root = np.linalg.cholesky(total[:n, :n]).T
+        residual = np.linalg.solve(root.T, total[:n, n])
+        A = np.vstack([root, np.zeros(n)])  # the last row is what no installation can explain
+        b = np.append(residual, np.sqrt(max(0.0, total[n, n] - float(residual @ residual))))
+        values = gtsam.Values()
+        values.insert(INSTALLATION, theta)
+        linear = gtsam.JacobianFactor(INSTALLATION, A, -b, gtsam.noiseModel.Unit.Create(n + 1))
+        return gtsam.LinearContainerFactor(linear, values)
+
+
+class _Images:
+    """The images of some keyframes."""
+
+    def __init__(self, held: Sequence[tuple[int, int, LandmarkFactor]], factors: LandmarkFactors) -> None:
+        """Take the sightings, each with the row and the number of its keyframe."""
+        self._row = np.array([i for i, _, _ in held], dtype=np.int64)
+        self._k = np.array([k for _, k, _ in held], dtype=np.int64)
+        self._sightings = [s for _, _, s in held]
+        self._observed = Observations([s.measurement for s in self._sightings], factors.landmarks, factors.installation)
+        stamps = np.array([s.measurement.stamp_ns for s in self._sightings], dtype=np.int64)
+        order = np.lexsort((stamps, self._row))
+        new = np.flatnonzero(np.diff(stamps[order]) | np.diff(self._row[order])) + 1
+        self._images = np.split(order, new)
+
+    def factors(self, poses: FloatArray, theta: FloatArray, rest: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """As `BatchSightings.factors`; what concerns the installation alone is added to ``rest``."""
+        own = poses[self._row]
+        (_, batch), *others = self._observed.batches
+        stack = None if others else batch.evaluate(own, theta)
+        shared = None if stack is None else batch.shared_all(stack)
+        if stack is None or shared is None:
+            yield from self._one_by_one(own, theta)
+            return
+        if not np.isfinite(shared).all():
+            raise CovarianceError("the covariance of a sighting is not finite")
+        ahead = [image[~stack.behind[image]] for image in self._images]
+        for size in sorted({len(image) for image in ahead} - {0}):
+            same = np.array([image for image in ahead if len(image) == size])
+            white = whitened(_rows(same, stack, len(theta)), shared[same].reshape(len(same), -1, shared.shape[2]))
+            yield from self._of_poses(same[:, 0], white, own, theta, rest)
+
+    def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
+        """As `BatchSightings.squares`."""
+        return self._observed.squares(poses[self._row], theta)
+
+    def _of_poses(
+        self, first: IntArray, white: FloatArray, own: FloatArray, theta: FloatArray, rest: FloatArray
+    ) -> Iterator[gtsam.NonlinearFactor]:
+        """Factors of images, of which these are the first sightings, from white rows ``(g, d, 3 + n + 1)``."""
+        Q, R = np.linalg.qr(white[:, :, :3])
+        others = white[:, :, 3:]
+        top = np.swapaxes(Q, 1, 2) @ others
+        flat, flat_top = others.reshape(-1, others.shape[2]), top.reshape(-1, others.shape[2])
+        rest += flat.T @ flat - flat_top.T @ flat_top
+        noise = gtsam.noiseModel.Unit.Create(R.shape[1])
+        keys = [pose_key(k) for k in self._k[first].tolist()]
+        for key, pose, by_pose, by_rest in zip(keys, own[first], R, top, strict=True):
+            values = gtsam.Values()
+            values.insert(key, gtsam.Pose2(*pose))
+            blocks: list[Any] = [key, by_pose]
+            if len(theta):
+                values.insert(INSTALLATION, theta)
+                blocks += [INSTALLATION, by_rest[:, :-1]]
+            linear = gtsam.JacobianFactor(*blocks, -by_rest[:, -1], noise)  # type: ignore[call-overload]
+            yield gtsam.LinearContainerFactor(linear, values)
+
+    def _one_by_one(self, own: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """Of recordings with sightings of several kinds."""
+        lines = self._observed.linearize(own, theta)
+        bounds = [0, *(np.flatnonzero(np.diff(self._row)) + 1).tolist(), len(self._row)]
+        for start, end in pairwise(bounds):
+            ahead = [i for i in range(start, end) if not lines[i].behind]
+            if ahead:
+                sightings, some = [self._sightings[i] for i in ahead], [lines[i] for i in ahead]
+                yield from sighting_factors(int(self._k[start]), sightings, some, own[start], theta)
+
+
+def _rows(chosen: IntArray, stack: Stacked, n: int) -> FloatArray:
+    """Rows ``(g, m d, 3 + n + 1)`` of images ``(g, m)`` with equally many sightings: Jacobians, residual."""
+    g, m = chosen.shape
+    d = stack.residual.shape[1]
+    A = np.zeros((g, m, d, 3 + n + 2))  # with a place for what is no state
+    A[..., :3] = stack.J[chosen]
+    columns = np.where(stack.columns[chosen] >= 0, 3 + stack.columns[chosen], 3 + n + 1)
+    np.put_along_axis(A, columns[:, :, None].repeat(d, axis=2), stack.H[chosen], axis=3)
+    A[..., 3 + n] = stack.residual[chosen]
+    return A[..., :-1].reshape(g, m * d, 3 + n + 1)
+
+
+def whitenings(covs: Sequence[FloatArray]) -> FloatArray:
+    """As `whitening_of` has it, of several covariances ``(d, d)``."""
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(np.array(covs))))
+    except np.linalg.LinAlgError:
+        return np.array([whitening_of(cov) for cov in covs])
+
+
+def whitened(A: FloatArray, shared: FloatArray) -> FloatArray:
+    """Rows ``(g, d, c)`` times the symmetric inverse root of ``I + S Sᵀ``, with S ``(g, d, s)`` of few columns.
+
+    With ``SᵀS = V λ Vᵀ`` the root is ``I + S V diag(((1 + λ)^-½ - 1) / λ) Vᵀ Sᵀ``.
+    """
+    if not shared.shape[2]:
+        return A
+    values, vectors = np.linalg.eigh(np.swapaxes(shared, 1, 2) @ shared)
+    values = np.maximum(values, 0.0)
+    root = np.sqrt(1.0 + values)
+    scaled = -vectors / (root * (1.0 + root))[:, None, :]  # (1/root - 1) / λ = -1 / (root (1 + root))
+    return np.asarray(A + shared @ (scaled @ np.swapaxes(vectors, 1, 2) @ (np.swapaxes(shared, 1, 2) @ A)))
