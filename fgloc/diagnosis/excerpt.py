@@ -13,8 +13,8 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
+from fgloc.sensors import registry
 from fgloc.sensors.detection import DetectionError, Detector
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Event,
     FloatArray,
@@ -73,7 +73,7 @@ class Excerpt:
         motion: odometry, joints and commands in order of receipt.
         imu, truth: likewise.
         delays: received minus stamped [s] by role.
-        wheel_source: as `WheelMotion` has it, once stretches were made.
+        wheel_source: as the odometer has it, once stretches were made.
     """
 
     pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
@@ -199,7 +199,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
-    wheels = WheelMotion(config.wheels)
+    wheels = registry.odometer(config)
     wheels.measure(step)
     if not wheels.source:
         return None

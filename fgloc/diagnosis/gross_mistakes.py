@@ -19,6 +19,7 @@ from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
+from fgloc.sensors import registry
 from fgloc.sensors.detection import RememberingDetector
 from fgloc.types import FloatArray, LandmarkMap
 
@@ -146,7 +147,7 @@ class _Search:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):
             return False
-        if self.config.markers.dictionary != parts.config.markers.dictionary:
+        if registry.landmark_dictionary(self.config) != registry.landmark_dictionary(parts.config):
             self.detections.clear()
             parts, excerpt = self._read(recording)
         self._fit(recording, excerpt, parts)
