@@ -28,7 +28,10 @@ from fgloc import run, se2
 from fgloc.config import Config, load_config
 from fgloc.errors import ConfigError
 from fgloc.recording.reader import open_recording
-from fgloc.types import CornersEvent, ImuEvent, LandmarkMap, OdometryEvent
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import LandmarkMap
 
 HOOK = WaypointPath(name="hook", speed_m_s=0.4, waypoints=((-0.6, 0), (-0.3, 0), (0, 0), (0.3, 0.1), (0.4, 0.4)))
 ROOM = Scenario(
@@ -211,7 +214,7 @@ def test_messages_that_are_written_while_the_robot_drives_say_the_same(tmp_path:
         if isinstance(first, OdometryEvent):
             np.testing.assert_array_equal(first.position, second.position)
         if isinstance(first, CornersEvent):
-            assert [s.marker_id for s in first.sightings] == [s.marker_id for s in second.sightings]
+            assert [s.landmark_id for s in first.sightings] == [s.landmark_id for s in second.sightings]
 
 
 def test_what_the_camera_sees_arrives_after_it_was_processed(folder: Path, followed: Followed) -> None:
