@@ -27,9 +27,10 @@ from benchmarks.common import Row, main, not_run
 from benchmarks.equal import SAMPLES
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.detection import use_one_thread
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector, use_one_thread
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import GrayImage, decode

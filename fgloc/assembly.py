@@ -14,13 +14,11 @@ from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
+from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.gyro.rate import Gyro
+from fgloc.sensors.detection import SensorDetector
+from fgloc.sensors.equipment import MotionPredictor, MotionSensors, Odometer, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, LandmarkMap
 
 
@@ -31,13 +29,13 @@ class Assembly:
     config: Config
     landmark_map: LandmarkMap | None
     gate: EventValidator
-    detector: MarkerDetector | None
+    detector: SensorDetector | None
     detections: EventValidator  # what the detector found has the stamps of its images, which the gate has seen
     stepper: KeyframeBuilder
-    wheels: WheelMotion
+    wheels: Odometer
     landmarks: LandmarkSensor
     camera: Camera | None
-    learned: LearnedMotion | None
+    learned: MotionPredictor | None
     sensors: tuple[Sensor, ...]
     localizer: Localizer
     diagnosis: Diagnosis
@@ -99,9 +97,9 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
 def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, camera = setup.learned, setup.camera
-    joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
-    wheels = WheelMotion(config.wheels)
-    gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
+    joint = None if learned is None else registry.error_correlation(config, learned)
+    wheels = registry.odometer(config)
+    gyro = None if setup.imu_up is None else registry.rate_sensor(config, setup.imu_up)
     motion = MotionSensors(wheels, learned, joint, gyro)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen_by: Role = "sightings" if setup.detector is None else "image"

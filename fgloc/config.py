@@ -265,7 +265,7 @@ def config_of(content: Any) -> Config:
     return config_type().model_validate(content)
 
 
-def _files(config: type[Config]) -> Iterator[tuple[str, str]]:
+def files_of(config: type[Config]) -> Iterator[tuple[str, str]]:
     """Section and key of each setting that is a file."""
     for name, section in config.model_fields.items():
         if isinstance(section.annotation, type) and issubclass(section.annotation, Section):
@@ -277,7 +277,7 @@ def _files(config: type[Config]) -> Iterator[tuple[str, str]]:
 def yaml_of(config: Config, folder: Path) -> str:
     """What `load_config` reads back from a file in this folder: the values that were given, without the defaults."""
     data = config.model_dump(mode="json", exclude_unset=True)
-    for section, key in _files(type(config)):
+    for section, key in files_of(type(config)):
         path = getattr(getattr(config, section), key)
         if path is not None:
             data[section][key] = registry.shipped_name(path) or os.path.relpath(path, folder)
@@ -291,7 +291,7 @@ def load_config(path: Path) -> Config:
         ConfigError: the file is missing, is not YAML, or has an unknown key or a value out of range; all are named.
     """
     settings = Settings(path, "give a YAML file with --config")
-    for section, key in _files(config_type()):
+    for section, key in files_of(config_type()):
         part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(SHIPPED):
             settings.content[section] = part | {key: path.parent / part[key]}

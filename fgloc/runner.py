@@ -24,8 +24,6 @@ from fgloc.replay.options import Progress, RunMode, RunOptions
 from fgloc.replay.outcome import Outcome, never_found, sentence
 from fgloc.replay.replay import Replay
 from fgloc.replay.smoothing import SmoothedRun, smooth_run
-from fgloc.sensors.markers.remembered import RememberedDetections
-from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
 from fgloc.types import (
     Estimate,
@@ -120,8 +118,8 @@ def _replayed(
     memory, file = None, options.get("detections")
     if parts.detector is not None:
         # What a file remembers must not depend on which images came before.
-        detector = TrackingDetector(parts.detector) if file is None else parts.detector
-        memory = RememberedDetections(file, detector, wrong.detections, note=file is not None)
+        detector = parts.detector.following() if file is None else parts.detector
+        memory = parts.detector.remembering(detector, file, wrong.detections, note=file is not None)
     replay = Replay(parts, recording, memory, progress, options)
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:

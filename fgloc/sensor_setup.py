@@ -16,9 +16,9 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
-from fgloc.sensors.learned import LearnedMotion, load_model
+from fgloc.sensors.detection import SensorDetector
+from fgloc.sensors.equipment import MotionPredictor
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -54,10 +54,10 @@ class SensorSetup:
 
     config: Config
     landmark_map: LandmarkMap | None
-    detector: MarkerDetector | None
+    detector: SensorDetector | None
     camera: Camera | None
     T_base_sensor: FloatArray | None
-    learned: LearnedMotion | None
+    learned: MotionPredictor | None
     imu_up: FloatArray | None
     sensors: tuple[Sensor, ...]
     notes: tuple[str, ...]
@@ -82,7 +82,7 @@ def recorded_setup(
     facts = RecordingFacts(recording)
     _need_motion(facts)
     if landmark_map is None and map_path is not None:
-        landmark_map = load_map(map_path, config.markers.default_size_m)
+        landmark_map = load_map(map_path, registry.landmark_size(config))
     return facts, sensor_setup(facts, landmark_map, config)
 
 
@@ -107,20 +107,12 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
-    detector = _detector(landmark_map, config) if "image" in facts.roles else None
-    learned = imu_up = None
-    if config.motion.use and config.motion.model is not None:
-        learned = LearnedMotion(load_model(config.motion.model), config.motion, mounted_up(facts, config, facts.first))
-    if "imu" in facts.roles and config.gyro.use:
+    detector = registry.detector(config, landmark_map) if "image" in facts.roles else None
+    imu_up = None
+    learned = registry.motion_predictor(config, lambda: mounted_up(facts, config, facts.first))
+    if "imu" in facts.roles and registry.rate_is_used(config):
         imu_up = mounted_up(facts, config, facts.first)
     return SensorSetup(config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, sensors, tuple(notes))
-
-
-def _detector(landmark_map: LandmarkMap | None, config: Config) -> MarkerDetector:
-    dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
-    if not dictionary:
-        raise ConfigError("no marker dictionary: set markers.dictionary (such as DICT_4X4_50) in --config or the map")
-    return MarkerDetector(dictionary, config.markers)
 
 
 def _need_motion(facts: StreamFacts) -> None:
@@ -238,13 +230,13 @@ def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
     base = base_frame(stream, config, first)
     event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
     if event is not None and event.frame_id in stream.frames and base in stream.frames:
-        return np.asarray(config.gyro.scale * stream.frames.lookup(base, event.frame_id)[2, :3])
-    return np.array([0.0, 0.0, config.gyro.scale])
+        return np.asarray(registry.rate_scale(config) * stream.frames.lookup(base, event.frame_id)[2, :3])
+    return np.array([0.0, 0.0, registry.rate_scale(config)])
 
 
 def base_up(recording: Recording, config: Config) -> FloatArray | None:
     """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
-    if "imu" not in recording.roles or not config.gyro.use:
+    if "imu" not in recording.roles or not registry.rate_is_used(config):
         return None
     return mounted_up(recording, config, first_events(recording))
 

@@ -25,7 +25,7 @@ from fgloc.sensors.learned.card import Kind
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import noise_density
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import ControlEvent, Step, by_class
 
 SECOND = 1_000_000_000

@@ -16,7 +16,7 @@ from fgloc import se2
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import ControlEvent, Trajectory
 from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from training.config import CalibrationConfig, DataConfig, OptimizationConfig

@@ -9,7 +9,8 @@ from event_makers import command, corners, in_order_of_receipt, joints, ns, odom
 
 from fgloc import se2
 from fgloc.errors import ConfigError
-from fgloc.sensors.wheels.config import NoiseDensity, WheelsConfig
+from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.sensors.wheels.timeline import TwistTimeline
 

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, Row
 from fgloc.sensors.learned.forms import calibrated
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import FloatArray
 from training.config import CalibrationConfig
 from training.data import Run

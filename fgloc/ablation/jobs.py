@@ -24,7 +24,7 @@ from fgloc import se2
 from fgloc.ablation.failures import Scene, corrupt, generators
 from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path, read_record, write_record
 from fgloc.ablation.suite import Cell
-from fgloc.config import Config
+from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
@@ -33,11 +33,10 @@ from fgloc.recording.outputs import sha256_of, write_text
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
+from fgloc.sensors import registry
+from fgloc.sensors.detection import DetectionError
 from fgloc.sensors.maps import load_map, write_map
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import ImageError
-from fgloc.sensors.markers.remembered import RememberedDetections
-from fgloc.types import Mode, RunResult, TruthEvent
+from fgloc.types import Mode, RawEvent, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
 _SOURCES_LEFT_OUT = (
@@ -87,8 +86,8 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
     jobs = []
     for cell in cells:
         config = cell.config.model_dump(mode="json")
-        config["camera"]["file"] = digest(cell.config.camera.file)
-        config["motion"]["model"] = digest(cell.config.motion.model)
+        for section, key in files_of(type(cell.config)):
+            config[section][key] = digest(getattr(getattr(cell.config, section), key))
         inputs = {
             "bag": digest(cell.bag),
             "map": digest(cell.map),
@@ -99,7 +98,9 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
             "seed": cell.seed if cell.chain else None,
             "code": code_hash(),
         }
-        seen = {name: inputs[name] for name in ("bag", "map", "code")} | {"dictionary": cell.config.markers.dictionary}
+        seen = {name: inputs[name] for name in ("bag", "map", "code")} | {
+            "dictionary": registry.landmark_dictionary(cell.config)
+        }
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}
         folder = None if folders is None else folders[cell.recording]
@@ -181,10 +182,10 @@ def detect(job: Job, out: Path) -> None:
             _, setup = recorded_setup(recording, cell.map, resolved(cell.config, cell.map))
             if setup.detector is None:
                 return
-            memory = RememberedDetections(detections_path(out, job), setup.detector)
+            memory = setup.detector.remembering(setup.detector, detections_path(out, job), None)
             for event in recording.events():
-                if isinstance(event, ImageEvent):
-                    with suppress(ImageError):
+                if isinstance(event, RawEvent):
+                    with suppress(DetectionError):
                         memory.detect(event)
     except FglocError:
         pass
@@ -197,7 +198,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
-    landmark_map = load_map(cell.map, config.markers.default_size_m) if cell.map is not None else None
+    landmark_map = load_map(cell.map, registry.landmark_size(config)) if cell.map is not None else None
     ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
     if cell.start == "truth":

@@ -15,6 +15,7 @@ from fgloc.ablation.jobs import Job, code_hash
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Suite
 from fgloc.ablation.tables import ATE, METRICS, Entry, Run, join, matrix, matrix_csv, rows, runs_csv, sentence, worst
+from fgloc.config import files_of
 from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.plots import png
@@ -58,7 +59,8 @@ def _inputs(jobs: Sequence[Job]) -> dict[str, dict[str, str]]:
     """SHA-256 of every file that the runs of a recording read."""
     files: dict[str, dict[Path, None]] = {}
     for cell in (job.cell for job in jobs):
-        read = (cell.bag, cell.map, cell.config_file, cell.config.camera.file, cell.config.motion.model)
+        given = [getattr(getattr(cell.config, section), key) for section, key in files_of(type(cell.config))]
+        read = (cell.bag, cell.map, cell.config_file, *given)
         files.setdefault(cell.recording, {}).update(dict.fromkeys(path for path in read if path is not None))
     digests = {path: sha256_of(path) for path in {path for paths in files.values() for path in paths}}
     return {name: {str(path): digests[path] for path in paths} for name, paths in files.items()}

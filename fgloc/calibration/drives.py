@@ -11,21 +11,17 @@ import numpy as np
 
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config
-from fgloc.diagnosis.image_checks import fitting_dictionary
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay.options import Progress
 from fgloc.replay.smoothing import smooth_run
+from fgloc.sensors import registry
+from fgloc.sensors.detection import detect_stream
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.marker_pose.events import MarkerPosesEvent
-from fgloc.sensors.markers.detector import detect_stream
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
-from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement, RawEvent, SightingsEvent
 
 _SHARP_PX = 30.0  # side from which a marker's corners are as good as they get
 
@@ -59,7 +55,7 @@ class Drive:
         """
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
-        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
+        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), registry.odometer(config)
         motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
         moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[PixelMeasurement]] = []
@@ -79,8 +75,8 @@ def sees_corners(bag: Path, config: Config) -> bool:
             return True
         if "sightings" not in recording.roles:
             return False
-        kinds = (CornersEvent, MarkerPosesEvent, RangeBearingEvent)
-        return isinstance(next((e for e in recording.events() if isinstance(e, kinds)), None), CornersEvent)
+        first = next((e for e in recording.events() if isinstance(e, SightingsEvent)), None)
+        return first is not None and first.in_pixels
 
 
 def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
@@ -102,7 +98,7 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
         unreadable: Counter[str] = Counter()
         seen: Counter[int] = Counter()
         for event in _checked(recording, parts, unreadable, progress):
-            if isinstance(event, CornersEvent):
+            if isinstance(event, SightingsEvent) and event.in_pixels:
                 seen.update(s.landmark_id for s in event.sightings)
             for step in parts.stepper.push(event):
                 parts.localizer.update(step)
@@ -137,21 +133,21 @@ def _checked(
         yield from gated()
         return
     for event in detect_stream(gated(), parts.detector, unreadable):
-        passed = parts.detections.check(event) if isinstance(event, CornersEvent) else event
-        if passed is not None and not isinstance(passed, ImageEvent):
+        passed = parts.detections.check(event) if isinstance(event, SightingsEvent) else event
+        if passed is not None and not isinstance(passed, RawEvent):
             yield passed
 
 
 def _check(bag: Path, recording: Recording, config: Config) -> None:
     if not {"image", "sightings"} & set(recording.roles):
         raise RecordingError(f"{bag}: no images and no corners of markers: nothing to survey; see `fgloc info {bag}`")
-    if "image" in recording.roles and not config.markers.dictionary:
-        fitting = fitting_dictionary(recording)
+    if "image" in recording.roles and not registry.landmark_dictionary(config):
+        fitting = registry.fitting_dictionary(recording)
         listed = (
             f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
         )
         raise ConfigError(f"{bag}: no marker dictionary; {listed}, or markers.dictionary in --config")
-    if config.markers.default_size_m is None:
+    if registry.landmark_size(config) is None:
         raise ConfigError(
             f"{bag}: the distance of markers follows from their size: give the side of the black square in "
             "metres, --size 0.16, or markers.default_size_m in --config"

@@ -21,6 +21,7 @@ from fgloc.calibration.survey_graph import Distance, Leg, SurveyGraph
 from fgloc.config import Config
 from fgloc.errors import MapError, RecordingError
 from fgloc.replay.options import Progress
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 _KNOWN_M, _KNOWN_RAD = 0.1, 0.2  # sigmas of a marker that is not known yet
@@ -69,7 +70,7 @@ def survey(
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
-    sizes = dict.fromkeys(seen, config.markers.default_size_m or 0.0) | {i: m.size_m for i, m in anchors.items()}
+    sizes = dict.fromkeys(seen, registry.landmark_size(config) or 0.0) | {i: m.size_m for i, m in anchors.items()}
     legs, start, left_out = _joined(drives, sizes, anchors, config.landmarks.min_sightings)
     _need_ends(distances, start, left_out)
     graph = SurveyGraph(legs, start, set(anchors), config, distances)
@@ -81,7 +82,7 @@ def survey(
         raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
-    dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
+    dictionary = registry.landmark_dictionary(config) or (given.dictionary if given is not None else "")
     landmarks = LandmarkMap(dict(sorted((kept | unseen).items())), dictionary, "surveyed")
     first = drives[0].parts
     found = found_values(graph.installation, graph.belief, first.config, first.camera, graph.landmark_map)

@@ -55,14 +55,13 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
 
     from fgloc.config import config_of, load_config
     from fgloc.recording.files import find_beside
-    from fgloc.sensors.learned.config import MotionConfig
+    from fgloc.sensors import registry
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = config_of({}) if file is None else load_config(file)
     if model is None:
         return config
     try:
-        motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
+        return registry.with_motion_model(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
-    return config.model_copy(update={"motion": motion})

@@ -11,8 +11,8 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.window import Spots, Window
+from fgloc.sensors import registry
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import FloatArray, FrameMeasurement, LandmarkMap, PixelMeasurement, SightingsEvent, Step
 
@@ -48,7 +48,7 @@ class SightingCollector:
 
     def spots(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
         """What was seen where."""
-        if isinstance(event, CornersEvent) and self._map is None and self._config.markers.default_size_m is None:
+        if event.in_pixels and self._map is None and registry.landmark_size(self._config) is None:
             return
         for m in self._sensor.measure(event):
             if isinstance(m, PixelMeasurement):

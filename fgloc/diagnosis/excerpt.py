@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,21 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import Recording
-from fgloc.sensors.markers.detector import Detector
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.sensors.markers.images import ImageError
-from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Event, FloatArray, InertialEvent, IntArray, LandmarkMap, MotionEvent, Step, TruthEvent, by_class
+from fgloc.sensors import registry
+from fgloc.sensors.detection import DetectionError, Detector
+from fgloc.types import (
+    Event,
+    FloatArray,
+    InertialEvent,
+    IntArray,
+    LandmarkMap,
+    MotionEvent,
+    RawEvent,
+    SightingsEvent,
+    Step,
+    TruthEvent,
+    by_class,
+)
 
 STRETCHES = 5
 STRETCH_S = 4.0  # within it wheels err by centimetres only
@@ -34,7 +45,7 @@ class Picture:
     """The markers of the map in one image."""
 
     stamp_ns: int
-    seen: tuple[MarkerCorners, ...]
+    seen: tuple[Any, ...]  # sightings in pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +76,7 @@ class Excerpt:
         motion: odometry, joints and commands in order of receipt.
         imu, truth: likewise.
         delays: received minus stamped [s] by role.
-        wheel_source: as `WheelMotion` has it, once stretches were made.
+        wheel_source: as the odometer has it, once stretches were made.
     """
 
     pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
@@ -127,13 +138,13 @@ class ExcerptCollector:
         role = self._role_of.get(event.topic)
         if role is not None:
             self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
-        if isinstance(event, ImageEvent | CornersEvent):
+        if isinstance(event, RawEvent) or (isinstance(event, SightingsEvent) and event.in_pixels):
             self._take_image(event)
         else:
             _take_motion(self.found, self._gate, event)
         return True
 
-    def _take_image(self, event: ImageEvent | CornersEvent) -> None:
+    def _take_image(self, event: RawEvent | SightingsEvent) -> None:
         if self._first_image is None:
             self._first_image = event.stamp_ns
             self._end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
@@ -144,7 +155,7 @@ class ExcerptCollector:
         self._last_image = event.stamp_ns
         corners = _corners(event, self._detector)
         passed = None if corners is None else self._gate.check(corners)
-        if isinstance(passed, CornersEvent):
+        if isinstance(passed, SightingsEvent):
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
         elif corners is not None:
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
@@ -160,14 +171,15 @@ def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
         found.truth.append(passed)
 
 
-def _corners(event: ImageEvent | CornersEvent, detector: Detector | None) -> CornersEvent | None:
-    if isinstance(event, CornersEvent):
+def _corners(event: RawEvent | SightingsEvent, detector: Detector | None) -> SightingsEvent | None:
+    if isinstance(event, SightingsEvent):
         return event
     if detector is None:
         return None
     try:
-        return detector.detect(event)
-    except ImageError:
+        found: SightingsEvent = detector.detect(event)
+        return found
+    except DetectionError:
         return None
 
 
@@ -190,7 +202,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
-    wheels = WheelMotion(config.wheels)
+    wheels = registry.odometer(config)
     wheels.measure(step)
     if not wheels.source:
         return None
@@ -212,8 +224,8 @@ def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -
     return np.asarray(np.interp(middle, at[order], rates[order]) * GRID_S)
 
 
-def usable(picture: Picture, landmark_map: LandmarkMap) -> list[MarkerCorners]:
-    """Markers of the map that have a size and are seen once in an image."""
+def usable(picture: Picture, landmark_map: LandmarkMap) -> list[Any]:
+    """Markers of the map that have a size and are seen once in an image: sightings in pixels."""
     times = Counter(m.landmark_id for m in picture.seen)
     known = landmark_map.landmarks
     return [

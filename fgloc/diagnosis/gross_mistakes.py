@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,15 +13,14 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.excerpt import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.image_checks import image_hints
 from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
 from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
-from fgloc.sensors.markers.remembered import Detections, RememberedDetections
-from fgloc.sensors.markers.tracking import TrackingDetector
+from fgloc.sensors import registry
+from fgloc.sensors.detection import RememberingDetector
 from fgloc.types import FloatArray, LandmarkMap
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
@@ -43,7 +43,7 @@ class Mistakes:
     sentences: tuple[str, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
-    detections: Mapping[bytes, Detections] = field(default_factory=dict)
+    detections: Mapping[bytes, Any] = field(default_factory=dict)
     undone: bool = False
 
     @property
@@ -102,19 +102,19 @@ class _Search:
         self.config = config
         self.landmark_map: LandmarkMap | None = None
         self.sentences: list[str] = []
-        self.detections: dict[bytes, Detections] = {}
+        self.detections: dict[bytes, Any] = {}
 
     def run(self) -> None:
         """Read the excerpt, and check it."""
         with open_recording(self._path, self.config.recording) as recording:
             self.go_on(recording, *self._read(recording))
 
-    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberedDetections | None]:
+    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberingDetector | None]:
         """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
         setup = recorded_setup(recording, self._map_path, self.config)[1]
         if setup.detector is None:
             return setup, None
-        memory = RememberedDetections(None, TrackingDetector(setup.detector), self.detections)
+        memory = setup.detector.remembering(setup.detector.following(), None, self.detections)
         self.detections = memory.found
         return setup, memory
 
@@ -147,7 +147,7 @@ class _Search:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):
             return False
-        if self.config.markers.dictionary != parts.config.markers.dictionary:
+        if registry.landmark_dictionary(self.config) != registry.landmark_dictionary(parts.config):
             self.detections.clear()
             parts, excerpt = self._read(recording)
         self._fit(recording, excerpt, parts)
@@ -162,7 +162,7 @@ class _Search:
     def _images(self, recording: Recording, parts: SensorSetup) -> bool:
         """Report why no marker is found; whether another dictionary finds them."""
         assert parts.detector is not None
-        hints, fitting = image_hints(recording, parts.detector)
+        hints, fitting = parts.detector.hints(recording)
         self.sentences += hints
         if fitting is not None:
             self._change("markers", dictionary=fitting)

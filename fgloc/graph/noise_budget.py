@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgloc.sensors import registry
-from fgloc.sensors.learned.joint import JointCalibration
+from fgloc.sensors.equipment import ErrorCorrelation
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
@@ -35,7 +35,7 @@ class FusionRules:
 
     wheels_are_commands: bool = False
     learned_has_gyro: bool = False
-    joint: JointCalibration | None = None
+    joint: ErrorCorrelation | None = None
     stopped_speed: float = 0.0
     stopped_turn: float = 0.0
 

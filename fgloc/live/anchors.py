@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,10 +14,7 @@ from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned.forms import MotionModel
-from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor, RateSensor
 from fgloc.types import Estimate, FloatArray, IntArray, Mode, Step
 
 
@@ -27,8 +24,8 @@ class MotionParts:
 
     config: Config
     installation: Installation  # the parameters that motions may depend on
-    joint: JointCalibration | None
-    model: MotionModel | None  # of the learned motion
+    joint: ErrorCorrelation | None
+    model: Any  # of the learned motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +40,8 @@ class Anchor:
     mode: Mode
     since_fix_s: float
     budget: NoiseBudget
-    gyro: Gyro | None
-    learned: LearnedMotion | None  # without its model
+    gyro: RateSensor | None
+    learned: MotionPredictor | None  # without its model
 
 
 class Outlet(Protocol):
@@ -123,8 +120,8 @@ def _rows_of_motion(installation: Installation) -> IntArray:
     return np.array([i for i in range(len(installation)) if i not in of_sightings], dtype=np.int64)
 
 
-def _without_model(learned: LearnedMotion) -> LearnedMotion:
+def _without_model(learned: MotionPredictor) -> MotionPredictor:
     """A copy to be forked with a model again: the model is large, and always the same."""
-    copied = learned.fork(learned.model)
+    copied: MotionPredictor = learned.fork(learned.model)
     del copied.model
     return copied

@@ -7,10 +7,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
 
-from fgloc.sensors.markers.detector import Detector, use_one_thread
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
-from fgloc.sensors.markers.images import ImageError
-from fgloc.types import Event
+from fgloc.sensors.detection import DetectionError, Detector, use_one_thread
+from fgloc.types import Event, RawEvent, SightingsEvent
 
 
 class State(Enum):
@@ -97,12 +95,12 @@ class DetectionWorker:
         with self._changed:
             self._changed.notify_all()
 
-    def _next(self) -> tuple[Queued, ImageEvent, Detector] | None:
+    def _next(self) -> tuple[Queued, RawEvent, Detector] | None:
         with self._changed:
             while not self._stopping:
                 while self._todo:
                     image = self._todo.popleft()
-                    if isinstance(image.event, ImageEvent) and self.detector is not None:
+                    if isinstance(image.event, RawEvent) and self.detector is not None:
                         image.state = State.DETECTING
                         return image, image.event, self.detector
                 self._changed.wait()
@@ -111,11 +109,11 @@ class DetectionWorker:
     def _run(self) -> None:
         while (task := self._next()) is not None:
             image, event, detector = task
-            found: CornersEvent | None = None
+            found: SightingsEvent | None = None
             reason = ""
             try:
                 found = detector.detect(event)
-            except ImageError as error:
+            except DetectionError as error:
                 reason = error.reason
             except Exception as error:  # told by whoever feeds this thread
                 self.error = error

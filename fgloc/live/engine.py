@@ -13,7 +13,6 @@ from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import role_of
 from fgloc.live.run import OnlineRun
-from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, RawEvent, Step
 
@@ -192,7 +191,7 @@ class Engine:
 
     def _build(self) -> None:
         detector = self._run.build().detector
-        self.worker.detector = None if detector is None else TrackingDetector(detector)
+        self.worker.detector = None if detector is None else detector.following()
         assert self._run.anchors is not None
         self._outlet.built(self._run.anchors.parts)
 

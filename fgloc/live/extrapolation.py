@@ -7,6 +7,7 @@ import threading
 from bisect import bisect_left, bisect_right, insort
 from collections import defaultdict, deque
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +22,8 @@ from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
-from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.learned.forms import MotionModel
-from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.sensors import registry
+from fgloc.sensors.equipment import ErrorCorrelation, MotionSensors, Odometer
 from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
@@ -41,8 +40,8 @@ _MOST_EVENTS = 8192  # of one kind
 class _Means:
     """What all anchors of one building of the parts are carried on by."""
 
-    joint: JointCalibration | None
-    model: MotionModel | None
+    joint: ErrorCorrelation | None
+    model: Any
     factors: LandmarkFactors  # hold what is known of the installation
 
 
@@ -52,7 +51,7 @@ class _Held:
 
     anchor: Anchor
     means: _Means
-    wheels: WheelMotion
+    wheels: Odometer
 
     @property
     def stamp_ns(self) -> int:
@@ -111,7 +110,7 @@ class Extrapolator:
             if anchor.segment != self._segment:
                 self._anchors.clear()
                 self._segment = anchor.segment
-            self._anchors.append(_Held(anchor, self._means, WheelMotion(self._config.wheels)))
+            self._anchors.append(_Held(anchor, self._means, registry.odometer(self._config)))
             while self._anchors[0].stamp_ns < anchor.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
             for events in self._events.values():
@@ -188,7 +187,11 @@ def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: Motion
 
     The test that flags slips (`MotionFaults`) sees whole steps only.
     """
-    if readings.learned is None or not sources.learned_is_independent or "learned" in budget.rejected:
+    if (
+        readings.learned is None
+        or not sources.learned_is_independent
+        or registry.motion_names().model in budget.rejected
+    ):
         return budget
     difference = source_difference(readings, sources)
     if difference is None:
@@ -197,7 +200,7 @@ def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: Motion
     cov = difference.cov * max(budget.scale, 1.0) + D @ difference.installation_cov @ D.T
     if float(d @ np.linalg.solve(cov, d)) <= _CONTRADICTION:
         return budget
-    return replace(budget, rejected={**budget.rejected, "wheels": "slip"})
+    return replace(budget, rejected={**budget.rejected, registry.motion_names().odometer: "slip"})
 
 
 def _stamp(event: Event) -> int:

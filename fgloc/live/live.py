@@ -21,7 +21,7 @@ from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.process import EstimationProcess
 from fgloc.live.reception import Reception
 from fgloc.live.status import LivePose, LiveStatus
-from fgloc.sensors.learned import load_model
+from fgloc.sensors import registry
 from fgloc.sensors.maps import load_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
 
@@ -75,9 +75,8 @@ class Live(EventMaker):
             MapError, ModelError: as their loaders have it.
         """
         if isinstance(landmark_map, Path):
-            landmark_map = load_map(landmark_map, config.markers.default_size_m)
-        if config.motion.use and config.motion.model is not None:
-            load_model(config.motion.model)  # a file that cannot be used is refused now, not when the robot drives
+            landmark_map = load_map(landmark_map, registry.landmark_size(config))
+        registry.motion_predictor(config)  # a file that cannot be used is refused now, not when the robot drives
         self._recording = config.recording
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
         self._reception = Reception(config)

@@ -26,8 +26,7 @@ from fgloc.live.anchors import Outlet
 from fgloc.live.estimation import Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.types import Event, MotionEvent
+from fgloc.types import Event, MotionEvent, RawEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
@@ -85,10 +84,10 @@ class EstimationProcess:
         with self._changed:
             for event in events:
                 self._queue(event)
-                if isinstance(event, ImageEvent):
+                if isinstance(event, RawEvent):
                     self._images += 1
                     if self._images > self._most_images:
-                        self._drop(next(e for e in self._waiting if isinstance(e, ImageEvent)))
+                        self._drop(next(e for e in self._waiting if isinstance(e, RawEvent)))
                 if len(self._waiting) > _MOST_WAITING:
                     self._drop(next(e for e in self._waiting if isinstance(e, Event)))
 
@@ -152,7 +151,7 @@ class EstimationProcess:
 
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
-        self._images -= isinstance(event, ImageEvent)
+        self._images -= isinstance(event, RawEvent)
         self._dropped[role_of(event)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from fgloc.assembly import Assembly
 from fgloc.config import Role
 from fgloc.diagnosis.gross_mistakes import Mistakes
-from fgloc.diagnosis.image_checks import image_hints
 from fgloc.diagnosis.unused_sightings import unused_sightings
 from fgloc.recording.reader import Recording
 from fgloc.replay.replay import Replay
+from fgloc.sensors import registry
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,8 @@ def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[
     """What does not fit together: surely, and what of the clocks is still to be tried."""
     hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.activity.missing()]
     untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
-    if parts.detector is not None and not parts.localizer.counts["corners"]:
-        hints = [*image_hints(recording, parts.detector)[0], *hints]
+    if parts.detector is not None and not any(parts.localizer.counts[kind] for kind in registry.detected_kinds()):
+        hints = [*parts.detector.hints(recording)[0], *hints]
     return hints, untried
 
 

@@ -12,9 +12,8 @@ from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.replay.options import EventFilter, Progress, RunOptions
-from fgloc.sensors.markers.detector import Detector, detect_stream
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
-from fgloc.types import Decision, Estimate, Event, SensorEvent, SightingsEvent, Step, TopicTimes, TruthEvent
+from fgloc.sensors.detection import Detector, detect_stream
+from fgloc.types import Decision, Estimate, Event, RawEvent, SensorEvent, SightingsEvent, Step, TopicTimes, TruthEvent
 
 
 class Replay:
@@ -108,7 +107,7 @@ class Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
-            self.blind = self.blind and not isinstance(event, ImageEvent | SightingsEvent | SensorEvent)
+            self.blind = self.blind and not isinstance(event, RawEvent | SightingsEvent | SensorEvent)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)
@@ -119,8 +118,8 @@ class Replay:
     def _regated(self, events: Iterator[Event]) -> Iterator[Event]:
         """Pass what the detector found through the gate."""
         for event in events:
-            if isinstance(event, ImageEvent):
+            if isinstance(event, RawEvent):
                 continue
-            passed = self._parts.detections.check(event) if isinstance(event, CornersEvent) else event
+            passed = self._parts.detections.check(event) if isinstance(event, SightingsEvent) else event
             if passed is not None:
                 yield passed

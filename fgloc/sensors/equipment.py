@@ -2,15 +2,144 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
-from fgloc.sensors.base import Sensor
-from fgloc.sensors.gyro.rate import Gyro
+from numpy.typing import ArrayLike
+
+from fgloc.sensors.base import Sensor, Turn
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.types import FloatArray, MotionMeasurement, Step
+
+
+class Odometer(Protocol):
+    """Measures every step; what others are compared to."""
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What could not be used so far, by reason."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """Where the motion comes from; empty before anything was received."""
+        ...
+
+    @property
+    def from_commands(self) -> bool:
+        """Whether control inputs stand in for it."""
+        ...
+
+    @property
+    def track_m(self) -> float | None:
+        """Distance of left and right [m], to tell them apart; None: not known."""
+        ...
+
+    def measure(self, step: Step) -> MotionMeasurement | None:
+        """Motion over the step; measured again, the same step gives the same."""
+        ...
+
+    def carry(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+        """``T_from_to (3,)`` between two times near the step, with its covariance ``(3, 3)``."""
+        ...
+
+    def twist(self, step: Step, at_ns: int) -> FloatArray:
+        """Of the base ``(3,)`` at a time near the step's end."""
+        ...
+
+    def derivatives(self, step: Step, m: MotionMeasurement, wanted: Container[str] = ()) -> dict[str, FloatArray]:
+        """Of a step's motion by what the sensor is off by."""
+        ...
+
+
+class RateSensor(Protocol):
+    """Measures the turn alone, with a bias."""
+
+    bias: float
+    bias_variance: float
+    rejections: Counter[str]
+
+    def measure(self, step: Step, wheels: ArrayLike | None, blind_s: float = 0.0) -> Turn | None:
+        """Turn over the step."""
+        ...
+
+    def rates_at(self, events: Any, stamps_ns: tuple[int, ...]) -> FloatArray:
+        """Yaw rates [rad/s] at these times."""
+        ...
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a motion with this turn by what the sensor is off by."""
+        ...
+
+    def turned(self, yaw: float, seconds: float) -> None:
+        """The robot went on by a step."""
+        ...
+
+    def fix(self, yaw: float, variance: float) -> None:
+        """Take in a yaw that sightings told."""
+        ...
+
+    def forget_fix(self) -> None:
+        """Nothing connects what comes with the last fix."""
+        ...
+
+    def resume(self, bias: float, bias_variance: float) -> None:
+        """Go on from what an earlier run learned."""
+        ...
+
+    def fork(self) -> Any:
+        """A copy that may go on without changing this one."""
+        ...
+
+
+class MotionPredictor(Protocol):
+    """Predicts the motion from control inputs, by a model.
+
+    Attributes:
+        model: with its card.
+        rejections: steps without a prediction, by reason.
+    """
+
+    model: Any
+    rejections: Counter[str]
+
+    @property
+    def reads_velocity(self) -> bool:
+        """Whether a better velocity changes the prediction."""
+        ...
+
+    def measure_scaled(
+        self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0
+    ) -> MotionMeasurement | None:
+        """Predict the step, for this robot."""
+        ...
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a predicted motion by what the model is off by."""
+        ...
+
+    def fork(self, model: Any) -> Any:
+        """A copy with another copy of the model, which may go on without changing this one."""
+        ...
+
+
+class ErrorCorrelation(Protocol):
+    """How the errors of odometer and predictor go together."""
+
+    def difference_cov(self, W: FloatArray, N: FloatArray) -> FloatArray:
+        """Covariance ``(3, 3)`` of the difference of the two motions."""
+        ...
+
+    def decorrelate(self, wheels: MotionMeasurement, learned: MotionMeasurement) -> MotionMeasurement:
+        """The predicted motion that may enter beside the odometer's as if independent."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,10 +153,10 @@ class MotionSensors:
         gyro: the gyro, if any.
     """
 
-    wheels: WheelMotion
-    learned: LearnedMotion | None = None
-    joint: JointCalibration | None = None
-    gyro: Gyro | None = None
+    wheels: Odometer
+    learned: MotionPredictor | None = None
+    joint: ErrorCorrelation | None = None
+    gyro: RateSensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

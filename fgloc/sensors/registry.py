@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fgloc.extensions import outside_sensors
@@ -24,12 +25,15 @@ from fgloc.sensors.learned.config import MotionConfig, shipped_name
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
 from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.types import Event, LandmarkSighting
+from fgloc.types import Event, FloatArray, LandmarkSighting, RawEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config
+    from fgloc.sensors.detection import SensorDetector
+    from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor, Odometer, RateSensor
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
+    from fgloc.types import LandmarkMap
 
 __all__ = ["SensorSections", "built_in", "shipped_name"]
 
@@ -160,6 +164,103 @@ def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Pa
     """Parameters of the motion sources in the order in which they stand in the state."""
     made = [p for installation in motion_installations() for p in installation.parameters(config, roles)]
     return tuple(sorted(made, key=lambda p: p.rank))
+
+
+def odometer(config: Config) -> Odometer:
+    """The odometer of one run.
+
+    Raises:
+        ConfigError: its settings do not fit together.
+    """
+    from fgloc.sensors.wheels.motion import WheelMotion
+
+    return WheelMotion(config.wheels)
+
+
+def rate_sensor(config: Config, up: FloatArray) -> RateSensor:
+    """The rate sensor of one run; ``up (3,)``: the base's z axis in its frame."""
+    from fgloc.sensors.gyro.rate import Gyro
+
+    return Gyro(config.gyro, up)
+
+
+def rate_is_used(config: Config) -> bool:
+    """Whether the rate sensor is to be used."""
+    return config.gyro.use
+
+
+def rate_scale(config: Config) -> float:
+    """True over reported rate."""
+    return config.gyro.scale
+
+
+def motion_predictor(config: Config, up: Callable[[], FloatArray] | None = None) -> MotionPredictor | None:
+    """The motion model of one run; None: none is used.
+
+    Args:
+        config: all settings.
+        up: gives the base's z axis ``(3,)`` in the frame of the rate sensor; None: it is mounted level.
+
+    Raises:
+        ModelError: the model cannot be used.
+    """
+    if not config.motion.use or config.motion.model is None:
+        return None
+    from fgloc.sensors.learned.load import load_model
+    from fgloc.sensors.learned.source import LearnedMotion
+
+    model = load_model(config.motion.model)
+    return LearnedMotion(model, config.motion, (0.0, 0.0, 1.0) if up is None else up())
+
+
+def error_correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrelation | None:
+    """How the errors of odometer and predictor go together; None: they are taken as independent."""
+    joint: ErrorCorrelation | None = predictor.model.joint
+    return joint if config.motion.correlation == "joint" else None
+
+
+def with_motion_model(config: Config, model: Path) -> Config:
+    """The configuration with another motion model, and nothing that is known of the one before.
+
+    Raises:
+        pydantic.ValidationError: there is no such model.
+    """
+    motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
+    return config.model_copy(update={"motion": motion})
+
+
+def landmark_size(config: Config) -> float | None:
+    """Size [m] of landmarks for which the map gives none."""
+    return config.markers.default_size_m
+
+
+def landmark_dictionary(config: Config) -> str | None:
+    """Dictionary of the landmarks that are detected; None: the map's."""
+    return config.markers.dictionary
+
+
+def detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetector:
+    """The detector of the sensor that has raw data.
+
+    Raises:
+        ConfigError: the settings and the map do not say what is to be detected.
+    """
+    from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
+
+    return configured_detector(config, landmark_map)
+
+
+def fitting_dictionary(recording: Any) -> str | None:
+    """The dictionary of landmarks that fits the raw data of a recording; None if none does."""
+    from fgloc.sensors.markers.hints import fitting_dictionary as fitting
+
+    return fitting(recording)
+
+
+def detected_kinds() -> tuple[str, ...]:
+    """Names of the landmark measurements that are made of raw data."""
+    raw = [s for s in built_in() if any(issubclass(stream.event, RawEvent) for stream in s.streams)]
+    return tuple(sensor.name for sensor in raw if sensor.measured)
 
 
 def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:

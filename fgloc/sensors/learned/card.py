@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, FiniteFloat, model_validator
 
 from fgloc.config import Section
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 
 FORMAT = "fgloc-motion"
 VERSION = 1

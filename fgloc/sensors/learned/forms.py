@@ -19,7 +19,7 @@ from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.signals import Signals
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray
 
 _SMALL = 1e-9

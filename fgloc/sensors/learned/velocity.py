@@ -20,7 +20,7 @@ from fgloc.sensors.learned.forms import (
 )
 from fgloc.sensors.learned.network import Answering
 from fgloc.sensors.learned.signals import Signals
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray
 
 

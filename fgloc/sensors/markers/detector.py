@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from cv2.typing import MatLike
 
+from fgloc.config import Config
+from fgloc.errors import ConfigError
+from fgloc.sensors.detection import Detector, RememberingDetector
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
 from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.sensors.markers.images import GrayImage, ImageError, decode
-from fgloc.types import Event, FloatArray
+from fgloc.sensors.markers.images import GrayImage, decode
+from fgloc.types import FloatArray, LandmarkMap
 
 _SMALLEST = 0.03  # perimeter of the smallest marker, in units of the image's longer side
 _SUBPIX_WINDOW_PX, _SUBPIX_SHARE = 10, 0.5  # half the window of a corner: at most, and as a share of a cell
 _SUBPIX_STOP = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.01)
 _ALL_WINDOWS, _ONE_WINDOW = (3, 23, 10), (7, 7, 10)  # of the adaptive threshold [px]: smallest, largest, step
 _LEAST_SIDE_PX = 16  # of an image
-_LOOKAHEAD = 4  # images that may be detected before the consumer asks for them
 _SECOND_LOOKS = 12  # small unreadable squares of an image that are enlarged and read again
 _SECOND_LOOK_SIDE_PX = (6.0, 32.0)  # smaller ones cannot be read, larger ones needed no enlarging
 _ENLARGE = 3
@@ -32,14 +33,6 @@ _HINT_RATIO = 2  # a changed image has to show more than this many times the mar
 
 Box = tuple[int, int, int, int]
 """Part of an image [px]: left, top, and the first column and row beyond it."""
-
-
-class Detector(Protocol):
-    """What finds markers in images."""
-
-    def detect(self, event: ImageEvent) -> CornersEvent:
-        """The markers of one image; see `MarkerDetector.detect`."""
-        ...
 
 
 class MarkerDetector:
@@ -74,6 +67,24 @@ class MarkerDetector:
         enlarged = _parameters(_ALL_WINDOWS, smallest=1.0)
         enlarged.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._second = cv2.aruco.ArucoDetector(self._dictionary, enlarged)
+
+    def following(self) -> Detector:
+        """A detector that follows the markers from image to image, which have to come in their order."""
+        from fgloc.sensors.markers.tracking import TrackingDetector
+
+        return TrackingDetector(self)
+
+    def remembering(self, detector: Detector, file: Path | None, known: Any, note: bool = True) -> RememberingDetector:
+        """A detector that asks another one only about images that are not known, from a file or an earlier run."""
+        from fgloc.sensors.markers.remembered import RememberedDetections
+
+        return RememberedDetections(file, detector, known, note)
+
+    def hints(self, recording: Any) -> tuple[tuple[str, ...], str | None]:
+        """What may be wrong where no marker is found; see `fgloc.sensors.markers.hints.image_hints`."""
+        from fgloc.sensors.markers.hints import image_hints
+
+        return image_hints(recording, self)
 
     def detect(self, event: ImageEvent) -> CornersEvent:
         """The markers of one image, ordered by id and place; an image without markers gives an event without sightings.
@@ -194,50 +205,16 @@ def suggest_dictionary(images: Iterable[GrayImage]) -> str | None:
     return suggest(look)
 
 
-def use_one_thread() -> None:
-    """Switch OpenCV's own threads off for the process: beside a detection thread they take the estimator's core."""
-    cv2.setNumThreads(1)
+def configured_detector(config: Config, landmark_map: LandmarkMap | None) -> MarkerDetector:
+    """The detector of the configured dictionary, or of the map's.
 
-
-def detect_stream(events: Iterable[Event], detector: Detector, rejections: Counter[str]) -> Iterator[Event]:
-    """All events in their order, with a CornersEvent in the place of each image.
-
-    Detection runs in one thread of its own, at most a few images ahead of the consumer; OpenCV releases Python's lock
-    meanwhile. OpenCV's own threads are switched off for the process, so that the rest keeps its core.
-
-    Args:
-        events: any events; an image that cannot be decoded is left out.
-        detector: not to be used elsewhere at the same time.
-        rejections: counts images left out, as "image." and the reason.
+    Raises:
+        ConfigError: neither names one.
     """
-    use_one_thread()
-    waiting: deque[Event | Future[CornersEvent]] = deque()
-    images = 0
-    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="marker-detection")
-    try:
-        for event in events:
-            if isinstance(event, ImageEvent):
-                waiting.append(worker.submit(detector.detect, event))
-                images += 1
-            else:
-                waiting.append(event)
-            while waiting and (images > _LOOKAHEAD or not isinstance(waiting[0], Future) or waiting[0].done()):
-                images -= isinstance(waiting[0], Future)
-                yield from _resolved(waiting.popleft(), rejections)
-        while waiting:
-            yield from _resolved(waiting.popleft(), rejections)
-    finally:
-        worker.shutdown(wait=True, cancel_futures=True)
-
-
-def _resolved(item: Event | Future[CornersEvent], rejections: Counter[str]) -> Iterator[Event]:
-    if not isinstance(item, Future):
-        yield item
-        return
-    try:
-        yield item.result()
-    except ImageError as error:
-        rejections[f"image.{error.reason}"] += 1
+    dictionary = config.markers.dictionary or (landmark_map.dictionary if landmark_map is not None else "")
+    if not dictionary:
+        raise ConfigError("no marker dictionary: set markers.dictionary (such as DICT_4X4_50) in --config or the map")
+    return MarkerDetector(dictionary, config.markers)
 
 
 def _parameters(windows: tuple[int, int, int], smallest: float = _SMALLEST) -> cv2.aruco.DetectorParameters:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.errors import RecordingError
+from fgloc.sensors.detection import DetectionError
 from fgloc.sensors.markers.events import ImageEvent
 
 GrayImage = NDArray[np.uint8]
@@ -50,16 +50,12 @@ _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
-class ImageError(RecordingError):
+class ImageError(DetectionError):
     """One image cannot be decoded.
 
     Attributes:
         reason: short name to count by: "empty", "truncated", "size", "encoding", "undecodable".
     """
-
-    def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
 
 
 def decode(event: ImageEvent) -> GrayImage:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from fgloc.files.atomic import atomic_file
-from fgloc.sensors.markers.detector import Detector
+from fgloc.sensors.detection import Detector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 
 Detections = tuple[MarkerCorners, ...]

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fgloc.se2 import wrap
-from fgloc.sensors.wheels.config import NoiseDensity
+from fgloc.sensors.noise_density import NoiseDensity
 from fgloc.types import FloatArray
 
 Twist = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s] in the body frame
