@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgloc.config import MarkersConfig, load_config
+from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
+from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import decode
 from fgloc.sensors.markers.tracking import TrackingDetector
-from fgloc.types import ImageEvent
 
 SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
 
