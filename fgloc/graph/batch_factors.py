@@ -155,7 +155,8 @@ class _Images:
         ahead = [image[~stack.behind[image]] for image in self._images]
         for size in sorted({len(image) for image in ahead} - {0}):
             same = np.array([image for image in ahead if len(image) == size])
-            white = whitened(_rows(same, stack, len(theta)), shared[same].reshape(len(same), -1, shared.shape[2]))
+            common = shared[same].reshape(len(same), same.shape[1] * shared.shape[1], shared.shape[2])
+            white = whitened(_rows(same, stack, len(theta)), common)
             yield from self._of_poses(same[:, 0], white, own, theta, rest)
 
     def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
