@@ -64,9 +64,11 @@ def wanted() -> Iterator[Wanted]:
         yield Wanted(f"{case}.reached", ((case, "fgloc"),), _mean("reached", ""))
 
 
-def measure(quick: bool, split: Split = "test", jobs: int | None = None, corners: bool = False) -> Iterator[Row]:
-    """All rows; a quick run has one seed and one case."""
-    drawn = SEEDS[split][: 1 if quick else None]
+def measure(
+    quick: bool, split: Split = "test", jobs: int | None = None, corners: bool = False, seeds: int | None = None
+) -> Iterator[Row]:
+    """All rows; a quick run has one seed and one case, others all or the first ``seeds``."""
+    drawn = SEEDS[split][: 1 if quick else seeds]
     rows = list(wanted())
     todo = [w for w in rows if not quick or all(case in _QUICK for case, _ in w.needs)]
     keys = {key for w in todo for key in w.needs}
@@ -113,6 +115,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--corners", action="store_true", help="corners of markers, not images: a third of the time")
+    parser.add_argument("--seeds", type=int, default=None, help="only the first so many")
     parser.add_argument("--jobs", type=int, default=None, help="processes")
     known, rest = parser.parse_known_args()
-    main(lambda quick: measure(quick, known.split, known.jobs, known.corners), __doc__ or "", rest)
+    main(lambda quick: measure(quick, known.split, known.jobs, known.corners, known.seeds), __doc__ or "", rest)

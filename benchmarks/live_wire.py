@@ -121,6 +121,8 @@ def live_run(sample: Path, domain: int, rate: float = 1.0) -> Heard:
         finally:
             live.kill()
             play.kill()
+    if len(recorder.sent_ns) < 2:
+        raise RuntimeError(f"{sample.name}: fgloc live published nothing (exit code {live.returncode}):\n{said}")
     poses = np.array(sorted(recorder.poses)).reshape(-1, 3)
     stamps = np.array([stamp for stamp, _, _ in sorted(recorder.poses)], dtype=np.int64)
     sent_s = np.array(recorder.sent_ns, dtype=np.int64) * 1e-9

@@ -155,7 +155,7 @@ def test_a_slip_that_has_just_begun_does_not_carry_the_pose_away():
     truth = [e for e in events if isinstance(e, TruthEvent)]
     stamps, x, y = (np.array(c) for c in zip(*((e.stamp_ns, *e.position[:2]) for e in truth), strict=True))
     apart = []
-    with Live(settings, sample / "map.yaml", roles=roles) as live:
+    with Live(settings, sample / "map.yaml", roles=roles, image_queue=100) as live:
         for event in events:
             live.push(event)
             if event.received_ns > start + 14.2e9 and isinstance(event, JointsEvent):

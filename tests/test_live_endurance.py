@@ -47,7 +47,7 @@ def kept(parts):
         "pending": len(stepper._pending),
         "seen": len(stepper._seen),
         "reached": len(stepper._reached),
-        "odometry": len(stepper._odometry.stamps),
+        "motion": sum(len(buffer.stamps) for buffer in stepper._motion.values()),
         "pieces": sum(len(track.timeline._pieces) for track in parts.wheels._all),
     }
 

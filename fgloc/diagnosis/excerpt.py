@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -20,6 +20,7 @@ from fgloc.types import (
     FloatArray,
     InertialEvent,
     IntArray,
+    LandmarkMap,
     MotionEvent,
     RawEvent,
     SightingsEvent,
@@ -35,6 +36,8 @@ MARGIN_S = 1.2  # wheels and gyro before and after the images, for clocks that d
 GRID_S = 0.02
 _SPACING_S = 0.19  # images nearer to the one before are passed over
 _PATIENCE_S = 120.0  # so long an image is waited for
+_FEWEST = 8  # sightings of a stretch
+_SPREAD_M = 0.4  # of the markers that they are of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,3 +222,19 @@ def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -
     order = np.argsort(at, kind="stable")
     middle = (np.arange(len(grid) - 1) + 0.5) * GRID_S
     return np.asarray(np.interp(middle, at[order], rates[order]) * GRID_S)
+
+
+def usable(picture: Picture, landmark_map: LandmarkMap) -> list[Any]:
+    """Markers of the map that have a size and are seen once in an image."""
+    times = Counter(m.landmark_id for m in picture.seen)
+    known = landmark_map.landmarks
+    return [
+        m for m in picture.seen if times[m.landmark_id] == 1 and m.landmark_id in known and known[m.landmark_id].size_m
+    ]
+
+
+def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
+    """Whether the markers seen in a stretch are enough, and far enough apart, to determine where the robot was."""
+    ids = [m.landmark_id for p in stretch.pictures for m in usable(p, landmark_map)]
+    places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
+    return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2

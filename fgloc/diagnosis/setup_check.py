@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgloc.config import Config, Role
-from fgloc.diagnosis.excerpt import Excerpt, Stretch
+from fgloc.diagnosis.excerpt import Excerpt, Stretch, tells_place
 from fgloc.diagnosis.setup_changes import Change, changes, gross, refined
-from fgloc.diagnosis.setup_fit import Fit, Problem, Setup, tells_place
+from fgloc.diagnosis.setup_fit import Fit, Problem, Setup
 from fgloc.diagnosis.setup_sentences import Correction, correction
 from fgloc.types import Camera, FloatArray, LandmarkMap
 

@@ -6,7 +6,6 @@ two set-ups can be compared by their costs. Poses of the images are free; wheels
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,12 +13,11 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.excerpt import Picture, Stretch
+from fgloc.diagnosis.excerpt import Stretch, usable
 from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.sensors.cameras import pinhole, undistort_points
-from fgloc.sensors.markers.events import MarkerCorners
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import Camera, FloatArray, IntArray, Landmark, LandmarkMap, PixelMeasurement
 
@@ -28,8 +26,6 @@ _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise
 _EXACT = 1e-6  # sigma of what is no unknown here
 _KERNEL = 9.0  # squared Cauchy constant, per degree of freedom
 _ITERATIONS = 12
-_FEWEST = 8  # sightings of a stretch
-_SPREAD_M = 0.4  # of the markers that they are of
 _LEAST_INFORMATION = 1e-9  # of a pose that nothing ties down
 _DONE = 1e-3  # share of the cost by which an iteration has to improve it
 
@@ -255,22 +251,6 @@ class Problem:
             markers,
             (state[1], state[2]),
         )
-
-
-def usable(picture: Picture, landmark_map: LandmarkMap) -> list[MarkerCorners]:
-    """Markers of the map that have a size and are seen once in an image."""
-    times = Counter(m.landmark_id for m in picture.seen)
-    known = landmark_map.landmarks
-    return [
-        m for m in picture.seen if times[m.landmark_id] == 1 and m.landmark_id in known and known[m.landmark_id].size_m
-    ]
-
-
-def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
-    """Whether the markers seen in a stretch are enough, and far enough apart, to determine where the robot was."""
-    ids = [m.landmark_id for p in stretch.pictures for m in usable(p, landmark_map)]
-    places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
-    return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2
 
 
 def _installation(config: Config, held: LandmarkMap, has_gyro: bool, free: Mapping[str, float]) -> Installation:

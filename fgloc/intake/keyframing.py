@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
+from fgloc.intake.clock_notes import ClockNotes
 from fgloc.intake.event_buffer import EventBuffer
 from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
 from fgloc.sensors import registry
@@ -16,7 +17,6 @@ from fgloc.types import ControlEvent, Event, MotionEvent, SensorEvent, Sightings
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
-_NAMED_JUMPS = 10  # in the notes; the rest is counted
 _ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
 _USED_LATE = (SightingsEvent, SensorEvent)
 
@@ -54,9 +54,7 @@ class KeyframeBuilder:
         self._lag_ns = int(lag_s * 1e9)
         self._clock = ClockGuard(gate)
         self._streams = {stream.event: stream for stream in streams}
-        self._jumps: list[str] = []  # the first few ...
-        self._jump_count = 0  # ... of so many
-        self._offsets: dict[str, list[int]] = {}  # by topic: events from the future, offset of the last
+        self._clock_notes = ClockNotes()
         self._index = 0
         self._segment = 0
         self._motion: dict[type[MotionEvent], EventBuffer[MotionEvent]] = {}  # by class of event
@@ -86,16 +84,7 @@ class KeyframeBuilder:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
-        notes = list(self._jumps)
-        if self._jump_count > _NAMED_JUMPS:
-            notes.append(f"the clock jumped {self._jump_count} times in all")
-        for topic, (count, ahead_ns) in self._offsets.items():
-            if count >= 10:
-                notes.append(
-                    f"{topic}: {count} messages were dropped, their stamps lie ahead of the other sensors' "
-                    f"(the last by {ahead_ns * 1e-9:.2f} s): correct them with recording.stamp_offset_s, "
-                    "or take the receive times of whichever clock is wrong with recording.received_stamps"
-                )
+        notes = [*self._clock_notes.sentences]
         for topic, source in self._sources.items():
             if source.patience_ns > self._reorder_ns:
                 notes.append(
@@ -184,8 +173,7 @@ class KeyframeBuilder:
         ahead = event.stamp_ns - self._newest_ns
         if ahead > 0:
             self.rejections[f"{self._name(event)}.future"] += 1
-            count, _ = self._offsets.get(event.topic, (0, 0))
-            self._offsets[event.topic] = [count + 1, ahead]
+            self._clock_notes.dropped(event.topic, ahead)
         elif isinstance(event, _USED_LATE):
             self._insert_late(event)
         else:
@@ -196,22 +184,19 @@ class KeyframeBuilder:
         steps: list[Step] = []
         if self._last_ns is None:
             lost = sum(len(buffer.stamps) for buffer in self._motion.values()) + len(self._pending) + len(self._carried)
-            self._tell_jump(f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped")
+            self._clock_notes.jumped(
+                f"{lost} message(s) before the first keyframe had stamps that nothing confirmed: dropped"
+            )
         else:
             jump_s = (event.stamp_ns - self._newest_ns) * 1e-9
             steps = self._finish()
             self._segment += 1
-            self._tell_jump(
+            self._clock_notes.jumped(
                 f"the clock jumped {'ahead' if jump_s > 0 else 'back'} by {abs(jump_s):.1f} s at "
                 f"{event.stamp_ns * 1e-9:.3f} s: segment {self._segment} begins"
             )
         self._reset()
         return steps
-
-    def _tell_jump(self, note: str) -> None:
-        self._jump_count += 1
-        if self._jump_count <= _NAMED_JUMPS:
-            self._jumps.append(note)
 
     # --- steps out ---
 

@@ -6,40 +6,34 @@ would hold up the threads that receive messages and publish poses.
 
 from __future__ import annotations
 
-import gc
 import itertools
 import json
-import os
-import signal
 import subprocess
 import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby
 from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.anchors import Anchor, MotionParts, Outlet
-from fgloc.live.estimation import Estimation, Settings
+from fgloc.live.anchors import Outlet
+from fgloc.live.estimation import Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.types import Estimate, Event, MotionEvent, RawEvent
+from fgloc.types import Event, MotionEvent, RawEvent
 
-_START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
+_START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
 # Motion events only matter to the estimation when a sighting or a question comes.
 _GATHER_S = 0.005  # for which they wait for one another: waking both processes costs more than sending
 _END_S = 10.0  # that it may take to use what it has and to save its state
-_ANSWERING = 4  # its threads that answer questions
 
 _Question: TypeAlias = tuple[int, str, tuple[Any, ...]]  # number, method of `Estimation`, arguments
 
@@ -227,73 +221,3 @@ class EstimationProcess:
             self._changed.notify_all()
         for answer in asked.values():
             answer.set_exception(error)
-
-
-# --- The other process ------------------------------------------------------------------------------------------------
-
-
-def main() -> None:
-    """Of the child process: do what comes through the pipe."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager ends the parent too, which ends this one in order
-    _Worker(Connection(int(sys.argv[1]))).run()
-
-
-class _Worker:
-    """Feeds an `Estimation` from a pipe, and answers through it."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._sending = threading.Lock()
-
-    def built(self, parts: MotionParts) -> None:
-        self._tell("built", parts)
-
-    def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
-        self._tell("estimated", anchor, estimate)
-
-    def failed(self, error: FglocError) -> None:
-        self._tell("failed", error)
-
-    def run(self) -> None:
-        """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
-        gc.freeze()  # what was imported stays: nothing is to be collected there
-        try:
-            self._tell("ready")
-            estimation = Estimation(self._connection.recv(), self)
-            with ThreadPoolExecutor(_ANSWERING) as pool:
-                while True:
-                    self._use(estimation, pool, self._connection.recv())
-        except (EOFError, OSError):
-            os._exit(1)
-        except Exception as error:
-            self._tell("failed", _told(error))  # the settings cannot be used
-
-    def _use(self, estimation: Estimation, pool: ThreadPoolExecutor, batch: Iterable[Any]) -> None:
-        """In order."""
-        for is_event, items in groupby(batch, lambda item: isinstance(item, Event)):
-            with suppress(FglocError):  # it has failed, and has told so
-                if is_event:
-                    estimation.put(items)
-                    continue
-                for item in items:
-                    if isinstance(item, PoseWithCovariance):
-                        estimation.reset_pose(item)
-                    else:
-                        pool.submit(self._answer, estimation, *item)
-
-    def _answer(self, estimation: Estimation, number: int, method: str, arguments: tuple[Any, ...]) -> None:
-        try:
-            result = getattr(estimation, method)(*arguments)
-            if method == "close":
-                result = estimation.status()
-        except Exception as error:
-            result = _told(error)
-        self._tell("answer", number, result)
-
-    def _tell(self, *message: Any) -> None:
-        with self._sending:
-            self._connection.send(message)
-
-
-def _told(error: Exception) -> FglocError:
-    return error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")

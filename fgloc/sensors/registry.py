@@ -226,7 +226,7 @@ def error_correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrel
 
 
 def with_motion_model(config: Config, model: Path) -> Config:
-    """With another motion model, and nothing that is known of the one before; pydantic.ValidationError: no such model."""
+    """With another motion model; `pydantic.ValidationError` where there is none of this name."""
     motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
     return config.model_copy(update={"motion": motion})
 
