@@ -78,8 +78,8 @@ def test_fault_36_images_without_camera_info_name_the_remedy(tmp_path):
 def test_fault_36_a_calibration_file_stands_in(tmp_path):
     (tmp_path / "camera.yaml").write_text(CAMERA_FILE)
     parts = build(tmp_path, {"camera": {"file": tmp_path / "camera.yaml"}}, info=None)
-    assert parts.landmarks._camera.K[0, 0] == 510.0
-    assert parts.landmarks._camera.T_base_cam[0, 3] == pytest.approx(0.1)
+    assert parts.landmarks._context.camera.K[0, 0] == 510.0
+    assert parts.landmarks._context.camera.T_base_cam[0, 3] == pytest.approx(0.1)
 
 
 def test_fault_39_another_image_size_is_refused(tmp_path):
@@ -89,7 +89,7 @@ def test_fault_39_another_image_size_is_refused(tmp_path):
 
 def test_fault_39_rescaled_on_request(tmp_path):
     parts = build(tmp_path, {"camera": {"rescale": True}}, image=(320, 240))
-    camera = parts.landmarks._camera
+    camera = parts.landmarks._context.camera
     assert (camera.width, camera.height) == (320, 240)
     assert camera.K[0, 0] == 250.0
     assert camera.K[0, 2] == pytest.approx(0.5 * (319.5 + 0.5) - 0.5)
@@ -103,7 +103,7 @@ def test_fault_66_a_camera_frame_without_transform_is_named(tmp_path):
 def test_fault_66_a_configured_pose_needs_no_transform(tmp_path):
     settings = {"recording": {"sightings_pose": (0.2, 0.0, 0.5, 0.0, 0.0, 0.0)}}
     parts = build(tmp_path, settings, camera_frame="front_cam")
-    T = parts.landmarks._camera.T_base_cam
+    T = parts.landmarks._context.camera.T_base_cam
     assert np.allclose(T[:3, 3], (0.2, 0.0, 0.5))
     assert np.allclose(T[:3, 2], (1.0, 0.0, 0.0))  # the camera looks ahead
     assert np.allclose(T[:3, 1], (0.0, 0.0, -1.0))
@@ -127,7 +127,7 @@ def test_without_a_map_the_whole_run_estimator_is_taken_and_said(tmp_path):
 
 def test_a_sensor_without_transform_is_taken_to_be_at_the_base_and_that_is_said(tmp_path):
     parts = build(tmp_path, image=None, info=None, sightings=True)
-    assert np.allclose(parts.landmarks._T_base_sensor, np.eye(4))
+    assert np.allclose(parts.landmarks._context.T_base_sensor, np.eye(4))
     assert any("beacon_sensor" in note and "recording.sightings_pose" in note for note in parts.notes)
 
 

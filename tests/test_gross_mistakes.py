@@ -17,7 +17,7 @@ from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.excerpt import Picture, read_excerpt
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
+from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks
 from fgloc.diagnosis.setup_changes import mirrored, swapped
 from fgloc.diagnosis.setup_check import check_fit
 from fgloc.evaluation.metrics import compute_metrics
@@ -28,6 +28,7 @@ from fgloc.sensor_setup import base_up
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.sensors.wheels.roll_over import roll_over
 from fgloc.types import LandmarkMap, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"

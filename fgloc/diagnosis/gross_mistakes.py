@@ -13,7 +13,7 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.excerpt import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks, roll_over
+from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks
 from fgloc.diagnosis.setup_check import Checked, check_fit
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
@@ -136,13 +136,9 @@ class _Search:
             self.sentences.append(clock_sentence(roles, excerpt.delays, given))
             self._change("recording", received_stamps=(*given, *roles))
             return True
-        rolled = roll_over(excerpt.motion, self.config)
-        if rolled is not None:
-            self.sentences.append(
-                f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
-                f"set wheels.angle_range: {rolled[0]:.4f}."
-            )
-            self._change("wheels", angle_range=rolled[0])
+        for mistake in registry.raw_mistakes(excerpt.motion, self.config):
+            self.sentences.append(mistake.sentence)
+            self._change(mistake.section, **mistake.values)
         if parts.landmark_map is None:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):

@@ -7,7 +7,7 @@ docs/adding-a-sensor.md goes through one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import partial
@@ -71,6 +71,20 @@ def _unchecked(event: Event) -> Event | str:
 
 def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
     return check(event, config)
+
+
+class RawMistake(NamedTuple):
+    """What messages alone show to be wrong with the settings.
+
+    Attributes:
+        sentence: for the user.
+        section: of ``robot.yaml``.
+        values: that undo it.
+    """
+
+    sentence: str
+    section: str
+    values: Mapping[str, object]
 
 
 class Joined(Protocol):
@@ -172,6 +186,7 @@ class BuiltIn:
         title: in sentences; "": its name.
         role: as a motion source; None: it is none.
         installation: what it is off by; of a motion source.
+        mistakes: what the first messages of a recording show to be wrong with its settings.
         failing_as: by what name failures call it; "": by its own.
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
@@ -187,6 +202,7 @@ class BuiltIn:
     title: str = ""
     role: MotionRole | None = None
     installation: MotionInstallation | None = None
+    mistakes: Callable[[Sequence[Event], Config], tuple[RawMistake, ...]] | None = None
     failing_as: str = ""
     failures: Callable[[], tuple[type[Any], ...]] = tuple
     carried: Callable[[Any], Callable[[Event], Event]] | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +17,7 @@ from fgloc.sensors.base import (
     MotionInstallation,
     MotionRole,
     Parameter,
+    RawMistake,
     Sensor,
     Stream,
 )
@@ -148,6 +149,11 @@ def motion_names() -> MotionNames:
     return MotionNames(*(names[role] for role in MotionRole))
 
 
+def raw_mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
+    """What the first messages of a recording show to be wrong with the settings of the sensors."""
+    return tuple(m for sensor in built_in() if sensor.mistakes is not None for m in sensor.mistakes(motion, config))
+
+
 def title_of(name: str) -> str:
     """Of a sensor, in sentences."""
     return next((sensor.title for sensor in built_in() if sensor.name == name and sensor.title), name)
@@ -220,11 +226,7 @@ def error_correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrel
 
 
 def with_motion_model(config: Config, model: Path) -> Config:
-    """The configuration with another motion model, and nothing that is known of the one before.
-
-    Raises:
-        pydantic.ValidationError: there is no such model.
-    """
+    """With another motion model; `pydantic.ValidationError` where there is none of this name."""
     motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
     return config.model_copy(update={"motion": motion})
 

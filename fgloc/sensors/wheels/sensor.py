@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from fgloc.sensors.base import BuiltIn, Joined, MotionRole, Stream
+from fgloc.sensors.base import BuiltIn, Joined, MotionRole, RawMistake, Stream
 from fgloc.sensors.wheels import messages, validation
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.findings import OdometryChecks
@@ -13,7 +13,7 @@ from fgloc.sensors.wheels.installation import INSTALLATION
 from fgloc.types import Event
 
 if TYPE_CHECKING:
-    from fgloc.config import Section
+    from fgloc.config import Config, Section
     from fgloc.sensors.failures import Carriage
 
 
@@ -38,6 +38,12 @@ def _carried(carriage: Carriage) -> Callable[[Event], Event]:
     from fgloc.sensors.wheels.carried import carried
 
     return carried(carriage)
+
+
+def _mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
+    from fgloc.sensors.wheels.roll_over import mistakes
+
+    return mistakes(motion, config)
 
 
 def _joined() -> Joined:
@@ -67,6 +73,7 @@ WHEELS = BuiltIn(
     ),
     role=MotionRole.ODOMETER,
     installation=INSTALLATION,
+    mistakes=_mistakes,
     failures=_failures,
     carried=_carried,
     joined=_joined,
