@@ -225,7 +225,7 @@ def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -
 
 
 def usable(picture: Picture, landmark_map: LandmarkMap) -> list[Any]:
-    """Markers of the map that have a size and are seen once in an image."""
+    """Markers of the map that have a size and are seen once in an image: sightings in pixels."""
     times = Counter(m.landmark_id for m in picture.seen)
     known = landmark_map.landmarks
     return [

@@ -155,8 +155,8 @@ class _Images:
         ahead = [image[~stack.behind[image]] for image in self._images]
         for size in sorted({len(image) for image in ahead} - {0}):
             same = np.array([image for image in ahead if len(image) == size])
-            common = shared[same].reshape(len(same), same.shape[1] * shared.shape[1], shared.shape[2])
-            white = whitened(_rows(same, stack, len(theta)), common)
+            rows = _rows(same, stack, len(theta))
+            white = whitened(rows, shared[same].reshape(*rows.shape[:2], shared.shape[2]))
             yield from self._of_poses(same[:, 0], white, own, theta, rest)
 
     def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
