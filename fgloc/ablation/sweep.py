@@ -93,14 +93,12 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     """Keys of finished jobs, with an error if their workers died."""
     import distributed
 
-    prepared = {
-        images: client.submit(_prepare, job, out, key=f"detect-{images}", pure=False, retries=0)
-        for images, job in _shared_images(todo, out).items()
-    }
-    key_of = {
-        client.submit(_attempt, job, out, prepared.get(job.images), key=job.key, pure=False, retries=0): job.key
-        for job in todo
-    }
+    # First and by themselves: jobs that depended on them would all be queued at one worker, and blamed if it dies.
+    shared = _shared_images(todo, out)
+    distributed.wait(
+        [client.submit(_prepare, job, out, key=f"detect-{images}", pure=False) for images, job in shared.items()]
+    )
+    key_of = {client.submit(_attempt, job, out, key=job.key, pure=False, retries=0): job.key for job in todo}
     futures = list(key_of)
     for future in distributed.as_completed(futures):
         error = future.exception() if future.status == "error" else _unwritable(future.result())
@@ -130,11 +128,8 @@ def _prepare(job: Job, out: Path) -> None:
         detect(job, out)
 
 
-def _attempt(job: Job, out: Path, _prepared: None) -> str | OutputError:
-    """`execute`, once its images were searched.
-
-    What cannot be written comes back as a value, for the worker would log an exception at length.
-    """
+def _attempt(job: Job, out: Path) -> str | OutputError:
+    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
     try:
         return execute(job, out)
     except OutputError as error:

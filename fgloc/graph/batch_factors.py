@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from fgloc import se2
-from fgloc.errors import CovarianceError
+from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, motion_factor, pose_key, sighting_factors
 from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Stacked
@@ -117,7 +117,7 @@ class BatchSightings:
         both = np.column_stack([W, W @ (theta - prior.mean)])
         total = both.T @ both + rest
         n = len(theta)
-        root = np.linalg.cholesky(total[:n, :n]).T
+        root = _root(total[:n, :n])
         residual = np.linalg.solve(root.T, total[:n, n])
         A = np.vstack([root, np.zeros(n)])  # the last row is what no installation can explain
         b = np.append(residual, np.sqrt(max(0.0, total[n, n] - float(residual @ residual))))
@@ -205,6 +205,22 @@ def _rows(chosen: IntArray, stack: Stacked, n: int) -> FloatArray:
     np.put_along_axis(A, columns[:, :, None].repeat(d, axis=2), stack.H[chosen], axis=3)
     A[..., 3 + n] = stack.residual[chosen]
     return A[..., :-1].reshape(g, m * d, 3 + n + 1)
+
+
+def _root(information: FloatArray) -> FloatArray:
+    """R with ``Rᵀ R`` an information matrix, which may be positive to rounding only: far from the optimum.
+
+    Raises:
+        EstimatorError: it is not finite.
+    """
+    if not np.isfinite(information).all():
+        raise EstimatorError("the batch diverged: it is not finite; look at steps.csv for what broke it")
+    try:
+        return np.asarray(np.linalg.cholesky(information).T)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(information)
+        least = np.finfo(np.float64).eps * max(float(values[-1]), 1.0)
+        return np.asarray(np.sqrt(np.maximum(values, least))[:, None] * vectors.T)
 
 
 def whitenings(covs: Sequence[FloatArray]) -> FloatArray:
