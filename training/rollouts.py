@@ -75,7 +75,7 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         nonlocal velocity
         heard = run.heard.step(start_ns, end_ns, model.card.history_s)
-        commands = heard.commands[: bisect_left(heard.commands, end_ns, key=lambda c: c.stamp_ns)]
+        commands = heard.controls[: bisect_left(heard.controls, end_ns, key=lambda c: c.stamp_ns)]
         signals = reader.read(heard, run.heard.gyro_bias(start_ns))
         if isinstance(signals, str):
             raise ModelError(f"{run.name}: the model reads {signals}, which was silent at {start_ns} ns")

@@ -28,7 +28,7 @@ from fgloc.sensors.maps import load_map
 
 FULL = Installation.as_installed()
 SCENARIO = Scenario(name="test", duration_s=1.0, installation=FULL)
-SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
+SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 
 
 def digest(folder: Path) -> str:

@@ -45,7 +45,7 @@ from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, LandmarkMap
 
-SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 START = 1_700_000_000_000_000_000
 SECONDS = 64.0
 GRID = np.arange(0.0, SECONDS + 4.0, 0.01)

@@ -31,7 +31,7 @@ from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.roll_over import roll_over
 from fgloc.types import LandmarkMap, TruthEvent
 
-SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
 START_NS = 1_700_000_000_000_000_000
 

@@ -191,7 +191,7 @@ def test_timeline_shows_the_true_error_within_its_bounds_and_the_true_slip():
 
 
 def test_the_simulators_slip_is_read_from_the_recording():
-    sample = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+    sample = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
     counts = {}
     for name in ("first_run", "patches_run"):
         with open_recording(sample / name / "bag", CONFIG.recording) as recording:

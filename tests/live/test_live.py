@@ -30,7 +30,7 @@ from fgloc.sensors.markers.tracking import TrackingDetector
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Mode, TransformEvent, TruthEvent
 
-SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
+SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes
 
 
@@ -413,7 +413,7 @@ def test_the_example_runs(tmp_path):
     """On a short drive: the bundled one takes longer."""
     write_world(tmp_path, World(room(), seconds=8.0, rate=5))
     (tmp_path / "robot.yaml").write_text(yaml_of(config(), tmp_path), encoding="utf-8")
-    example = Path(__file__).parent.parent / "examples" / "live_loop.py"
+    example = Path(__file__).parent.parent.parent / "examples" / "live_loop.py"
     assert len(example.read_text(encoding="utf-8").splitlines()) < 40
     done = subprocess.run([sys.executable, example, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

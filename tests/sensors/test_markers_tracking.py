@@ -13,7 +13,7 @@ from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import decode
 from fgloc.sensors.markers.tracking import TrackingDetector
 
-SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
+SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
 
 
 @pytest.fixture(scope="module")

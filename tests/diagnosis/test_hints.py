@@ -16,7 +16,7 @@ from fgloc.runner import run
 from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.images import decode
 
-SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "first_run"
+SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
 
 
 @pytest.fixture(scope="module")

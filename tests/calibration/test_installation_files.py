@@ -19,7 +19,7 @@ from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
 from fgloc.types import Camera, InstallationFound, RunResult, Setting
 
-SAMPLE = Path(__file__).resolve().parent.parent / "datasets" / "samples" / "installed_run"
+SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "installed_run"
 
 
 def found(names: dict[str, tuple[float, float, float]], **parts) -> InstallationFound:

@@ -220,7 +220,7 @@ def test_killed_at_any_time_it_leaves_a_state_that_can_be_used(tmp_path):
     path = tmp_path / "state.json"
     code = f"""
         import sys
-        sys.path[:0] = {[str(Path(__file__).parent)]!r}
+        sys.path[:0] = {[str(Path(__file__).parent.parent / "support")]!r}
         from pathlib import Path
         from live_feed import feed, live_in
         from robot_world import World, beacons

@@ -14,7 +14,7 @@ from datasets.sim.suite import BUNDLED, load_suite
 from fgloc.config import load_config
 from fgloc.sensors.maps import load_map
 
-SAMPLES = Path(__file__).parent.parent / "datasets" / "samples"
+SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 SEEDS = {"first_run": 1, "patches_run": 1, "light_drop_run": 1, "installed_run": 3}
 
 

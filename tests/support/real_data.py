@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-_DEFAULT = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+_DEFAULT = Path(__file__).resolve().parent.parent.parent.parent / "shared" / "data"
 
 
 def real_data(*parts: str) -> Path:

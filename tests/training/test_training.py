@@ -371,7 +371,7 @@ def test_configuration_is_strict(tmp_path: Path) -> None:
             load_train_config(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         load_train_config(tmp_path / "none.yaml")
-    shipped = list((Path(__file__).parent.parent / "training" / "configs").glob("*.yaml"))
+    shipped = list((Path(__file__).parent.parent.parent / "training" / "configs").glob("*.yaml"))
     assert shipped
     for file in shipped:
         load_train_config(file)
