@@ -15,7 +15,7 @@ _ROW = re.compile(r"^\| (\d+) \|(.*)\|([^|]*)\|$", re.MULTILINE)
 def faults_tested() -> dict[int, list[str]]:
     """Number of a fault -> the files that test it, with how many tests each has."""
     found: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
-    for path in sorted(TESTS.rglob("test_*.py")):
+    for path in sorted(TESTS.rglob("test_*.py"), key=lambda path: path.stem):
         for names in _TEST.findall(path.read_text(encoding="utf-8")):
             for number in re.findall(r"\d\d", names):
                 found[int(number)][path.stem.removeprefix("test_")] += 1
