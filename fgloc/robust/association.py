@@ -24,6 +24,9 @@ from fgloc.types import (
 )
 
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
+# Sightings of one step whose agreement is searched, the likeliest: more than an image shows come in a burst.
+# The others are held against what these agree on. The work grows with the square.
+_MOST_JOINT = 16
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
@@ -198,19 +201,33 @@ class Association:
         Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
         """
         rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
-        if len(rows) < 2 or self._compatible(rows, measurements, predicted):
+        likeliest = rows if len(rows) <= _MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:_MOST_JOINT]
+        if len(rows) < 2 or (likeliest is rows and self._compatible(rows, measurements, predicted)):
             return judged
-        found = [self._agreeing_with(i, rows, measurements, predicted) for i in rows]
-        most: list[int] = []
-        for _, agree in sorted(found, key=lambda item: (-len(item[1]), item[0])):
-            while len(agree) > max(len(most), 1) and not self._compatible(agree, measurements, predicted):
-                agree = agree[:-1]
-            if len(agree) > len(most):
-                most = agree
+        most = self._largest_agreeing(likeliest, measurements, predicted)
+        if likeliest is not rows and most:
+            others = [i for i in rows if i not in likeliest]
+            most = [*most, *self._agreeing_with(most, others, measurements, predicted)[1]]
         return [
             (nis, dof, reason or ("" if i in most or not most else "contradicts_others"))
             for i, (nis, dof, reason) in enumerate(judged)
         ]
+
+    def _largest_agreeing(
+        self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> list[int]:
+        """The most sightings that agree; all of them, if they do."""
+        if self._compatible(rows, measurements, predicted):
+            return list(rows)
+        found = [self._agreeing_with([i], [j for j in rows if j != i], measurements, predicted) for i in rows]
+        sets = [(nis, [i, *agree]) for i, (nis, agree) in zip(rows, found, strict=True) if math.isfinite(nis)]
+        most: list[int] = []
+        for _, agree in sorted(sets, key=lambda item: (-len(item[1]), item[0])):
+            while len(agree) > max(len(most), 1) and not self._compatible(agree, measurements, predicted):
+                agree = agree[:-1]
+            if len(agree) > len(most):
+                most = agree
+        return most
 
     def _compatible(
         self, rows: Sequence[int], measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
@@ -224,25 +241,24 @@ class Association:
 
     def _agreeing_with(
         self,
-        first: int,
-        rows: Sequence[int],
+        held: Sequence[int],
+        others: Sequence[int],
         measurements: Sequence[LandmarkMeasurement],
         predicted: PoseWithCovariance,
     ) -> tuple[float, list[int]]:
-        """How little the prediction agrees with a sighting, and those that agree with both, the best of them first."""
+        """How little the prediction agrees with what is held, and those others that agree with both, the best first."""
         known = predicted.installation or self._factors.estimated
-        alone = correct(predicted, known, [measurements[first]], self._factors)
-        if alone is None or alone[0].installation is None:
+        corrected = correct(predicted, known, [measurements[i] for i in held], self._factors)
+        if corrected is None or corrected[0].installation is None:
             return math.inf, []
-        belief, theirs = alone[0], alone[0].installation
-        others = [i for i in rows if i != first]
+        belief, theirs = corrected[0], corrected[0].installation
         lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
         found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
         ratios = {
             i: math.inf if one.behind else nis / chi2_bound(self._config.estimator.gate_probability, len(one.residual))
             for i, one, nis in zip(others, lines, found, strict=True)
         }
-        return alone[1], [first, *sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])]
+        return corrected[1], sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])
 
     def _gate(self, dof: int) -> float:
         """Bound of the NIS of a sighting; NaN where there is nothing to hold it against."""
