@@ -10,6 +10,7 @@ from exact import exact
 from robot_world import START_NS, Chain, polar, project, standing
 
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.robust import association
 from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.types import Decision, Landmark, LandmarkMap, Step
@@ -86,3 +87,23 @@ def test_sightings_of_one_beacon_within_its_correlation_time_share_their_informa
     events = [RangeBearingEvent(stamp, stamp, "/landmarks", "base_link", seen) for stamp in stamps]
     first, later = judged(beacon, *events, settings=exact(landmarks={"repeat_s": 1.0}))
     assert [d.weight for d in (*first, *later)] == pytest.approx([1.0, weight])
+
+
+def test_the_work_for_a_burst_of_sightings_is_bounded(monkeypatch):
+    """After a stall a step holds the images of seconds; an unsure pose excludes none of them, and one was misread."""
+    corrections, correct = [], association.correct
+
+    def counted(belief, known, measurements, *rest):
+        corrections.append(len(measurements))
+        return correct(belief, known, measurements, *rest)
+
+    monkeypatch.setattr(association, "correct", counted)
+    localizer = Chain(exact(), ROW).localizer
+    localizer.restart_at(PoseWithCovariance(np.zeros(3), np.diag(np.square(UNSURE))))
+    good, misread = image(ROW, *((i, i) for i in range(5))), image(ROW, (1, 2))
+    step = Step(0, 0, START_NS, START_NS, sightings=(*[good] * 40, misread))
+    decisions = [d for d in localizer.update(step).decisions if d.landmark_id >= 0]
+    assert len(decisions) == 201
+    assert len([d for d in decisions if not d.reason]) == 200
+    assert len(corrections) < 100
+    assert max(corrections) <= 16
