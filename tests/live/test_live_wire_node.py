@@ -235,9 +235,14 @@ def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
         node = Node(other, Config(), None)
         writers = [one.writer("/left/odometry", "nav_msgs/msg/Odometry")]
-        threading.Timer(2.5, lambda: writers.append(one.writer("/right/odometry", "nav_msgs/msg/Odometry"))).start()
+
+        def tell(said):
+            told.append(said)
+            if len(writers) == 1:
+                writers.append(one.writer("/right/odometry", "nav_msgs/msg/Odometry"))
+
         with pytest.raises(WireError, match="2 topics could be the odometry: /left/odometry, /right/odometry"):
-            node.run(threading.Event(), told.append)
+            node.run(threading.Event(), tell)
         node.close()
     assert told == ["Waiting for images or marker sightings; topics there: /left/odometry (nav_msgs/msg/Odometry)."]
 
