@@ -18,10 +18,11 @@ from fgloc.live.process import EstimationProcess
 from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.intake import Intake
 from fgloc.live.wire.odom_frame import OdomFrame
-from fgloc.live.wire.outputs import MAP_FRAME, BaseState, Outputs, odom_in_map
+from fgloc.live.wire.outputs import BaseState, Outputs, odom_in_map
 from fgloc.live.wire.participant import Participant, Sample
 from fgloc.live.wire.recent import RecentPoses
 from fgloc.live.wire.teller import Teller
+from fgloc.recording.standard_messages import MAP_FRAME
 from fgloc.types import Estimate, Event, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
