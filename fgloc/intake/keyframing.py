@@ -17,7 +17,7 @@ from fgloc.types import ControlEvent, Event, MotionEvent, SensorEvent, Sightings
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
-_ALIVE_NS = 2_000_000_000  # a source silent for longer is not waited for
+_ALIVE_NS = 2_000_000_000  # a source without messages for longer is not waited for
 _USED_LATE = (SightingsEvent, SensorEvent)
 
 
@@ -25,11 +25,11 @@ class KeyframeBuilder:
     """Turns gated events, in order of receipt, into contiguous steps.
 
     A keyframe is made at the stamp of each sightings event with a sighting, else every ``max_interval_s`` while a
-    motion source speaks (up to ``min_interval_s`` later, if a sighting is due then). Sightings closer than
+    motion source sends (up to ``min_interval_s`` later, if a sighting is due then). Sightings closer than
     ``min_interval_s`` to the last keyframe, and late ones inside the lag, go with the next step at their own stamps.
-    Where nothing was heard, the step reaches to the next event, in pieces of at most 1 s.
+    Where nothing was received, the step reaches to the next event, in pieces of at most 1 s.
 
-    A keyframe is closed when every living source has spoken at or beyond it, or ``reorder_s`` later by the newest
+    A keyframe is closed when every active source has sent at or beyond it, or ``reorder_s`` later by the newest
     stamp. Motion events older than the last keyframe are lost ("late"), sightings are not; their source is waited for
     longer in the next minute, up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
 
@@ -62,7 +62,7 @@ class KeyframeBuilder:
         self._reset()
 
     def _reset(self) -> None:
-        """Begin a segment with nothing heard."""
+        """Begin a segment with nothing received."""
         for buffer in self._motion.values():
             buffer.clear()
         self._last_ns: int | None = None  # the last keyframe
@@ -212,8 +212,8 @@ class KeyframeBuilder:
             return None
         at = bisect_left(self._pending, last + self._min_ns, key=lambda e: e.stamp_ns)
         sighting = self._pending[at].stamp_ns if at < len(self._pending) else None
-        heard = [stamp for buffer in self._motion.values() if (stamp := buffer.after(last)) is not None]
-        due = max(min(heard), last + self._max_ns) if heard else None
+        stamps = [stamp for buffer in self._motion.values() if (stamp := buffer.after(last)) is not None]
+        due = max(min(stamps), last + self._max_ns) if stamps else None
         if sighting is not None and (due is None or sighting < due + self._min_ns):
             due = sighting
         if due is None:

@@ -1,4 +1,4 @@
-"""Which topics speak, and when: in bounded memory, for recordings and live streams alike."""
+"""Which topics have messages, and when: in bounded memory, for recordings and live streams alike."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _MOST = 100_000  # times kept of a topic; of more, every second is dropped
 
 
 class TopicActivity:
-    """Notes who was heard. A topic that is expected and never speaks is the trace of a mismatch that nobody reports.
+    """Records when messages came. An expected topic without any hints at a mismatch that no error reports.
 
     Example:
-        >>> attendance = Attendance({"imu": "/imu", "odometry": "/odom"})
-        >>> attendance.hear("/odom", 1_000_000_000)
-        >>> [sentence.split(":")[0] for sentence in attendance.missing()]
+        >>> activity = TopicActivity({"imu": "/imu", "odometry": "/odom"})
+        >>> activity.record("/odom", 1_000_000_000)
+        >>> [sentence.split(":")[0] for sentence in activity.missing()]
         ['/imu (imu)']
     """
 
@@ -27,22 +27,22 @@ class TopicActivity:
         """``expected``: topic of each role that is to be used."""
         self._expected = dict(expected)
         self._topics: dict[str, _Times] = {}
-        self._silent = set(expected.values())
+        self._without = set(expected.values())
 
     def record(self, topic: str, stamp_ns: int) -> None:
-        """Note a message that could be used."""
+        """Record a message that could be used."""
         times = self._topics.get(topic)
         if times is None:
             times = self._topics[topic] = _Times()
-            self._silent.discard(topic)
+            self._without.discard(topic)
         times.add(stamp_ns)
 
     def present(self, topic: str) -> None:
-        """Note that a topic speaks without keeping when."""
-        self._silent.discard(topic)
+        """Record that a topic has messages, without their times."""
+        self._without.discard(topic)
 
     def missing(self) -> tuple[str, ...]:
-        """A sentence for each expected topic of which nothing usable was heard so far.
+        """A sentence for each expected topic without a usable message so far.
 
         A live adapter asks this once the streams should have begun (a few seconds after subscribing), and again at the
         end.
@@ -52,12 +52,12 @@ class TopicActivity:
             "and when recording) the quality of service does not match: subscribe with reliability best effort and "
             "durability volatile."
             for role, topic in self._expected.items()
-            if topic in self._silent
+            if topic in self._without
         )
 
     def spans(self, origin_ns: int) -> dict[str, TopicTimes]:
-        """When each topic was heard, in seconds from a time."""
-        return {topic: times.heard(origin_ns) for topic, times in sorted(self._topics.items())}
+        """When each topic had messages, in seconds from a time."""
+        return {topic: times.since(origin_ns) for topic, times in sorted(self._topics.items())}
 
 
 class _Times:
@@ -81,6 +81,6 @@ class _Times:
             self._kept = self._kept[::2]
             self._every *= 2
 
-    def heard(self, origin_ns: int) -> TopicTimes:
+    def since(self, origin_ns: int) -> TopicTimes:
         seconds = np.asarray((np.array(self._kept, dtype=np.int64) - origin_ns) * 1e-9, dtype=np.float64)
         return TopicTimes(seconds, self._count, self._every, self._longest * 1e-9)

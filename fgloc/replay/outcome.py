@@ -68,9 +68,9 @@ def sentence(note: str) -> str:
 
 def never_found(replay: Replay, rejections: Counter[str]) -> str:
     """Message of a run without any pose: what was received and what was rejected."""
-    heard = ", ".join(f"{topic} {span.count}" for topic, span in replay.spans().items()) or "nothing"
+    received = ", ".join(f"{topic} {span.count}" for topic, span in replay.spans().items()) or "nothing"
     why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
     return (
-        f"the first pose was never found in {len(replay.step_ms)} steps. Heard: {heard}. Rejected: {why}. "
+        f"the first pose was never found in {len(replay.step_ms)} steps. Received: {received}. Rejected: {why}. "
         "Check the map's ids and sizes, or give estimator.initial_pose."
     )

@@ -98,7 +98,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TopicTimes:
-    """When a topic was heard.
+    """When a topic had messages.
 
     ``times`` are in seconds from the first estimate; of very many only one in ``every`` is kept.
     """
@@ -146,7 +146,7 @@ class InstallationFound:
     prior_cov: FloatArray  # (n, n)
     camera: Camera | None  # of corners, as the run used it
     seen_by: str  # role whose stamps the sightings have
-    wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they never spoke
+    wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they had no messages
     settings: tuple[Setting, ...] = ()  # all but the map's
     landmarks: LandmarkMap | None = None  # of a known map, where they were found
 

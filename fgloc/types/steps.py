@@ -13,7 +13,7 @@ M = TypeVar("M", bound=MotionEvent)
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)  # sensors remember what they made of it
 class Step:
-    """All that was heard between two keyframes, gated and in order of stamp.
+    """All that was received between two keyframes, gated and in order of stamp.
 
     Each tuple of ``motion`` holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the
     last one at or before the start, and the first one at or after the end where known. Control inputs reach back

@@ -16,9 +16,9 @@ from fgloc.sensors.wheels.encoders import wheel_names
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import FloatArray, InertialEvent, Step
 
-MAX_GAP_S = 0.25  # a signal that was silent for longer has a hole
+MAX_GAP_S = 0.25  # a signal without a sample for longer has a gap
 _E = TypeVar("_E", InertialEvent, JointsEvent)
-_FOREVER_S = 1e4  # the first and the last values hold on; who asks decides whether to believe them
+_FOREVER_S = 1e4  # the first and the last values hold on; the caller decides whether to use them
 
 
 class Signal:
@@ -54,13 +54,13 @@ class Signal:
         return np.array([np.interp(times_s, self._times, channel) for channel in self._integrals])
 
     def covers(self, start_s: float, end_s: float) -> bool:
-        """Whether no moment between these times is farther than `MAX_GAP_S` from what was heard."""
+        """Whether no moment between these times is farther than `MAX_GAP_S` from a sample."""
         times = self._times[1:-1]
         first = max(0, int(np.searchsorted(times, start_s, "right")) - 1)
-        heard = times[first : int(np.searchsorted(times, end_s, "left")) + 1]
-        if not len(heard) or heard[0] > start_s + MAX_GAP_S or heard[-1] < end_s - MAX_GAP_S:
+        inside = times[first : int(np.searchsorted(times, end_s, "left")) + 1]
+        if not len(inside) or inside[0] > start_s + MAX_GAP_S or inside[-1] < end_s - MAX_GAP_S:
             return False
-        return bool((np.diff(heard) <= MAX_GAP_S).all())
+        return bool((np.diff(inside) <= MAX_GAP_S).all())
 
     def means(self, limits_s: FloatArray) -> FloatArray:
         """Means ``(..., m - 1, c)`` between neighboring limits ``(..., m)``, strictly monotonic along the last axis."""

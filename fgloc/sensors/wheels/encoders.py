@@ -26,7 +26,7 @@ class TicksTrack(Track):
     events = JointsEvent
 
     def __init__(self, config: WheelsConfig) -> None:
-        """Start with nothing heard.
+        """Start with nothing received.
 
         Raises:
             ConfigError: the wheels' geometry is incomplete.

@@ -33,11 +33,11 @@ class WheelMotion:
     Between two odometry messages the twist is the mean of theirs; a command holds until the next. A piece whose twist
     the gate refused is taken from pose differences, else the last twist is held, at most for ``hold_s``. The covariance
     is made of the configured noise densities alone: robots' own are rarely right. It does not depend on how time is cut
-    into steps. Where nothing was heard for longer than ``hold_s`` the robot is taken to stand still with the spread of
+    into steps. Where no message came for longer than ``hold_s`` the robot is taken to stand still with the spread of
     its largest speed so far, so that every step has a measurement; such steps are counted as "wheels.silence".
 
     Sources: with "auto" wheel angles if the geometry is given, else the odometry (see `OdometryTrack`), else commands:
-    the best that has been heard.
+    the best that has messages.
 
     ``rejections`` counts wheels.silence, wheels.pose_reset (an odometry that jumped) and wheels.encoder_reset.
     """
@@ -50,9 +50,9 @@ class WheelMotion:
         """
         self._config = config
         self._chosen = ""
-        self._silent_steps = 0
+        self._unknown_steps = 0
         self._delay_ns = int(config.delay_s * 1e9)
-        self._silent_s = 0.0
+        self._unknown_s = 0.0
         self._segment: int | None = None
         if config.source == "auto":
             geometry = (config.left_radius, config.right_radius, config.track)
@@ -66,18 +66,18 @@ class WheelMotion:
 
     @property
     def source(self) -> str:
-        """Where the motion comes from: "ticks", "odometry" or "command"; empty before anything was heard."""
+        """Where the motion comes from: "ticks", "odometry" or "command"; empty before any message came."""
         return self._chosen
 
     @property
     def from_commands(self) -> bool:
-        """Whether there are no wheels to hear, and commands stand in for them."""
+        """Whether there is no wheel odometry, and commands replace it."""
         return self._chosen == "command"
 
     @property
     def rejections(self) -> Counter[str]:
         """What could not be used so far, by reason."""
-        counts = Counter({"wheels.silence": self._silent_steps} if self._silent_steps else {})
+        counts = Counter({"wheels.silence": self._unknown_steps} if self._unknown_steps else {})
         for track in self._all:
             counts.update(track.rejections)
         return counts
@@ -85,12 +85,12 @@ class WheelMotion:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
-        said = [note for track in self._all for note in track.notes.values()]
+        of_tracks = [note for track in self._all for note in track.notes.values()]
         explained = any(track.kind == self._chosen and "source" in track.notes for track in self._all)
-        notes = [f"wheel motion comes from {_SAYS[self._chosen]}"] if self._chosen and not explained else []
-        notes += said
-        if self._silent_steps:
-            notes.append(f"no wheel motion was known for {self._silent_s:.1f} s in {self._silent_steps} steps")
+        notes = [f"wheel motion comes from {_NAMES[self._chosen]}"] if self._chosen and not explained else []
+        notes += of_tracks
+        if self._unknown_steps:
+            notes.append(f"no wheel motion was known for {self._unknown_s:.1f} s in {self._unknown_steps} steps")
         return tuple(notes)
 
     @property
@@ -114,8 +114,8 @@ class WheelMotion:
         if self._tracks and step.dt > 0.0:
             motion, cov, unknown_s = self._integrate(self._active(step), step.start_ns, step.stamp_ns)
             if unknown_s > 0.0:
-                self._silent_steps += 1
-                self._silent_s += unknown_s
+                self._unknown_steps += 1
+                self._unknown_s += unknown_s
             measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov)
         self._taken[step] = measured
         return measured
@@ -165,19 +165,19 @@ class WheelMotion:
             track.ingest(step)
 
     def _active(self, step: Step) -> TwistTimeline:
-        """The best source that has spoken before the step's end, else the best that has spoken at all."""
-        heard = [track for track in self._tracks if track.timeline.start_ns is not None]
-        for track in heard:
+        """The best source with messages before the step's end, else the best with any."""
+        active = [track for track in self._tracks if track.timeline.start_ns is not None]
+        for track in active:
             start = track.timeline.start_ns
             if start is not None and start < step.stamp_ns - self._delay_ns:
                 if track is not self._tracks[-1]:  # worse ones are not needed any more
                     self._tracks = self._tracks[: self._tracks.index(track) + 1]
                 self._chosen = track.kind
                 return track.timeline
-        return (heard or self._tracks)[0].timeline
+        return (active or self._tracks)[0].timeline
 
 
-_SAYS = {
+_NAMES = {
     "ticks": "wheel angles",
     "odometry": "the odometry",
     "command": "commands, which stand in for wheels",

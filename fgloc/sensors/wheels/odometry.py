@@ -32,7 +32,7 @@ class OdometryTrack(Track):
     events = OdometryEvent
 
     def __init__(self, config: WheelsConfig) -> None:
-        """Start with nothing heard."""
+        """Start with nothing received."""
         super().__init__(config)
         self._mode: str = config.source if config.source in ("twist", "pose") else "auto"
         self._compared = self._mode == "pose"

@@ -13,7 +13,7 @@ from fgloc.sensors.wheels.timeline import Twist, TwistTimeline
 from fgloc.types import ControlEvent, MotionEvent, Step
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
-MAX_GAP_S = 5.0  # over a longer silence no difference is trusted: the robot may have been restarted
+MAX_GAP_S = 5.0  # over a longer gap no difference is used: the robot may have been restarted
 
 
 class Track:
@@ -30,7 +30,7 @@ class Track:
     events: type[MotionEvent] = MotionEvent  # that it reads
 
     def __init__(self, config: WheelsConfig) -> None:
-        """Start with nothing heard."""
+        """Start with nothing received."""
         self.timeline = TwistTimeline()
         self.rejections: Counter[str] = Counter()
         self.notes: dict[str, str] = {}
