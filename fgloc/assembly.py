@@ -100,7 +100,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     joint = None if learned is None else registry.error_correlation(config, learned)
     wheels = registry.odometer(config)
     gyro = None if setup.imu_up is None else registry.rate_sensor(config, setup.imu_up)
-    motion = MotionSensors(wheels, learned, joint, gyro)
+    motion = MotionSensors(wheels, learned, joint, gyro, registry.attitude_sensor(config, setup.T_base_imu))
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen_by: Role = "sightings" if setup.detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)

@@ -48,6 +48,7 @@ class SensorSetup:
         T_base_sensor: ``(4, 4)`` place of a sensor that reports ranges or marker poses; None: the base, or not known.
         learned: motion model; None: none is used.
         imu_up: the base's z axis in the IMU's frame, see `mounted_up`; None: there is no gyro, or it is not used.
+        T_base_imu: ``(4, 4)`` its mounting; None likewise.
         sensors: those of other packages.
         notes: what the user should know.
     """
@@ -59,6 +60,7 @@ class SensorSetup:
     T_base_sensor: FloatArray | None
     learned: MotionPredictor | None
     imu_up: FloatArray | None
+    T_base_imu: FloatArray | None
     sensors: tuple[Sensor, ...]
     notes: tuple[str, ...]
 
@@ -108,11 +110,14 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
     detector = registry.detector(config, landmark_map) if "image" in facts.roles else None
-    imu_up = None
+    imu_up = T_base_imu = None
     learned = registry.motion_predictor(config, lambda: mounted_up(facts, config, facts.first))
     if "imu" in facts.roles and registry.rate_is_used(config):
         imu_up = mounted_up(facts, config, facts.first)
-    return SensorSetup(config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, sensors, tuple(notes))
+        T_base_imu = mounted_imu(facts, config, facts.first)
+    return SensorSetup(
+        config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, T_base_imu, sensors, tuple(notes)
+    )
 
 
 def _need_motion(facts: StreamFacts) -> None:
@@ -220,6 +225,15 @@ def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
             "calibrate at this size, or set camera.rescale: true"
         )
     return corrected(rescaled(camera, *size), config.camera)
+
+
+def mounted_imu(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
+    """``T_base_imu (4, 4)``; without a transform the IMU is taken to be level and at the base."""
+    base = base_frame(stream, config, first)
+    event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
+    if event is not None and event.frame_id in stream.frames and base in stream.frames:
+        return np.asarray(stream.frames.lookup(base, event.frame_id))
+    return np.eye(4)
 
 
 def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:

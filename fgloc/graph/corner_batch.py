@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from fgloc.graph.ground import rotations
 from fgloc.graph.installation import Installation
 from fgloc.graph.linearized import Stacked, landmark_block
 from fgloc.types import (
@@ -44,6 +45,7 @@ class CornerBatch:
         self._pixels = np.array([m.corners_px for m in seen])
         self._sigma = np.array([m.sigma_px for m in seen])
         self._twist = np.array([m.twist for m in seen])
+        self._tilting = np.array([m.tilting for m in seen]) if installation.ground else None
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = _roots([m.motion_cov for m in seen])
@@ -58,10 +60,19 @@ class CornerBatch:
         if self._camera is not None:
             self._columns[:, :12] = self._camera
         self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
+        self._constants = installation.constants
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
-        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time.
+
+        On uneven ground the poses are ``(m, 6)``, with height, roll and pitch at the end, and so are the Jacobians by
+        them; of poses ``(m, 3)`` those are at the end of the installation, and so are the Jacobians.
+        """
         n = len(poses)
+        if self._tilting is not None and poses.shape[1] == 3:
+            ground = np.broadcast_to(theta[self._constants :], (n, 3))
+            stack = self.evaluate(np.column_stack([poses, ground]), theta, by_installation)
+            return self._ground_in_installation(stack, by_installation)
         camera = np.zeros(12) if self._camera is None else theta[self._camera]
         marker = np.append(theta, 0.0)[self._columns[:, 12:]]
         # 1. Corners in the map, in the base frame, at the exposure, in the camera
@@ -72,10 +83,18 @@ class CornerBatch:
         Rz = np.zeros((n, 3, 3))  # R_map_base
         Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
         P[:, :, :2] -= poses[:, None, :2]
+        tilt = None
+        if self._tilting is not None:
+            P[:, :, 2] -= poses[:, None, 3]
+            tilt = rotations(poses[:, 4:6])
+            Rz = Rz @ tilt  # R_map_base of a base that is not level
         q = P @ Rz
         flow = np.zeros_like(q)  # of the point in the base frame by a later stamp
         flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
+        if self._tilting is not None:
+            p, r = self._tilting[:, None, 0], self._tilting[:, None, 1]
+            flow += np.stack([r * q[:, :, 2], -p * q[:, :, 2], p * q[:, :, 1] - r * q[:, :, 0]], axis=2)
         late = camera[11] - self._offset
         mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
         X = mounted - camera[:3] - _cross(camera[3:6], mounted)
@@ -93,7 +112,9 @@ class CornerBatch:
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
         )
         residual = ((predicted - self._pixels) * scale[:, None, None]).reshape(n, 8)
-        J = (J * scale[:, None, None, None]).reshape(n, 8, 3)
+        if tilt is not None:
+            J = _by_tilted_pose(B, q, tilt, poses[:, 4])
+        J = (J * scale[:, None, None, None]).reshape(n, 8, -1)
         if not by_installation:
             return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
         H: FloatArray = np.empty((n, 4, 2, 18))
@@ -108,6 +129,16 @@ class CornerBatch:
         H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
         return Stacked(residual, J, H, self._columns, behind)
+
+    def _ground_in_installation(self, stack: Stacked, by_installation: bool) -> Stacked:
+        """Derivatives by height, roll and pitch as the last ones by the installation."""
+        n, J = len(stack.J), stack.J[:, :, :3]
+        H, columns = stack.H, stack.columns
+        if by_installation:
+            H = np.concatenate([H, stack.J[:, :, 3:]], axis=2)
+            last = np.broadcast_to(self._constants + np.arange(3), (n, 3))
+            columns = np.concatenate([columns, last], axis=1)
+        return Stacked(stack.residual, J, H, columns, stack.behind)
 
     def _project(
         self, X: FloatArray, camera: FloatArray, with_lens: bool
@@ -172,7 +203,7 @@ class CornerBatch:
         if all(moved is None for moved in self._moved):
             return common
         roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
-        return np.concatenate([common, stack.J @ roots], axis=2)
+        return np.concatenate([common, stack.J[:, :, :3] @ roots], axis=2)
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
         """As `Linearized` has it, of one sighting."""
@@ -182,6 +213,25 @@ class CornerBatch:
         if moved is not None:
             common.append(J @ moved)
         return np.hstack(common)
+
+
+def _by_tilted_pose(B: FloatArray, q: FloatArray, tilt: FloatArray, roll: FloatArray) -> FloatArray:
+    """Derivatives ``(m, 4, 2, 6)`` by x, y, yaw (right perturbation), z, roll and pitch.
+
+    Args:
+        B: ``(m, 4, 2, 3)`` by the point in the base's axes.
+        q: ``(m, 4, 3)`` that point.
+        tilt: ``(m, 3, 3)`` ``Ry(pitch) Rx(roll)``.
+        roll: ``(m,)`` [rad].
+    """
+    zero = np.zeros_like(roll)
+    axes = np.stack(
+        [tilt[:, 2], np.stack([zero + 1.0, zero, zero], 1), np.stack([zero, np.cos(roll), -np.sin(roll)], 1)]
+    )
+    moved = [-tilt[:, i, None].repeat(4, axis=1) for i in range(2)]  # by x, y: minus those axes, as the base has them
+    turned = [-_cross(axis[:, None], q) for axis in axes]  # by yaw, roll, pitch
+    by = np.stack([*moved, turned[0], -tilt[:, 2, None].repeat(4, axis=1), *turned[1:]], axis=3)  # (m, 4, 3, 6)
+    return np.asarray(B @ by)
 
 
 def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

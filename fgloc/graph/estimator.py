@@ -9,9 +9,9 @@ from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate
-from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
-from fgloc.types import MotionMeasurement
+from fgloc.graph.uneven import levelled, predict, starting
+from fgloc.types import FloatArray, MotionMeasurement
 
 
 class Estimator(ABC):
@@ -76,7 +76,22 @@ class Estimator(ABC):
         """
         if self.belief is None or not motions:
             raise EstimatorError("predict needs a started estimator and at least one motion measurement")
-        return predict(self.belief, self.installed, self.factors.installation, motions)
+        if not self.installation.ground:
+            return predict(self.belief, self.installed, self.factors.installation, motions)
+        predicted = predict(self.belief, self.belief.installation or self.installed, self.installation, motions)
+        assert predicted.installation is not None
+        self.factors.estimated = predicted.installation  # sightings are held against the ground as predicted
+        return predicted
+
+    def level(self, motions: Sequence[MotionMeasurement]) -> None:
+        """While no pose is known, follow roll and pitch by what gravity tells of this step."""
+        if self.installation.ground:
+            self.factors.estimated = levelled(self.installed, motions, self.installation)
+
+    def forget_ground(self) -> None:
+        """A first pose comes: height, roll and pitch there may be others than those of the newest step."""
+        if self.installation.ground:
+            self.factors.estimated = starting(self.installed, self.installation)
 
     def update(
         self,
@@ -134,9 +149,16 @@ class Estimator(ABC):
 
     def _take(self, frame: Keyframe) -> PoseWithCovariance:
         self._solve(frame)
+        frame.ground = self.ground_of(frame.belief)
         self.log.append(frame)
         self._adopt(frame.belief)
         return frame.belief
+
+    def ground_of(self, belief: PoseWithCovariance) -> FloatArray | None:
+        """Height, roll and pitch ``(3,)``; None where the floor is flat."""
+        if not self.installation.ground:
+            return None
+        return (belief.installation or self.installed).mean[self.installation.constants :]
 
     def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief

@@ -17,6 +17,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.corner_batch import MIN_DEPTH_M
+from fgloc.graph.ground import ground_key, rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
@@ -77,8 +78,8 @@ def installed_motion_factor(
     values.insert(pose_key(k), gtsam.Pose2(*se2.compose(before, m.motion)))
     blocks = {pose_key(k - 1): -W @ se2.adjoint(se2.inverse(m.motion)), pose_key(k): W}
     residual = np.zeros(3)
-    values.insert(INSTALLATION, np.zeros(len(installation)))
-    H = np.zeros((3, len(installation)))
+    values.insert(INSTALLATION, np.zeros(installation.constants))
+    H = np.zeros((3, installation.constants))
     for i, (derivative, assumed) in columns.items():
         H[:, i] = -W @ derivative
         residual -= H[:, i] * assumed
@@ -87,20 +88,38 @@ def installed_motion_factor(
 
 
 def installed_prior_factor(
-    k: int, prior: PoseWithCovariance, belief: InstallationEstimate
+    k: int, prior: PoseWithCovariance, belief: InstallationEstimate, constants: int
 ) -> list[gtsam.NonlinearFactor]:
-    """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone."""
+    """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone.
+
+    Of the installation the first ``constants`` are the same for all keyframes, the others are those of this one.
+    """
     known = prior.installation or belief
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*prior.pose))
-    values.insert(INSTALLATION, known.mean)
+    insert_installation(k, known.mean, constants, values)
     n = len(known.mean)
     cov = np.zeros((3 + n, 3 + n))
     cov[:3, :3], cov[3:, 3:] = prior.cov, known.cov
     if prior.cross is not None:
         cov[:3, 3:], cov[3:, :3] = prior.cross, prior.cross.T
     W = whitening_of(cov)
-    return [linear_factor({pose_key(k): W[:, :3], INSTALLATION: W[:, 3:]}, np.zeros(3 + n), values)]
+    blocks = {pose_key(k): W[:, :3]} | installation_blocks(k, W[:, 3:], constants)
+    return [linear_factor(blocks, np.zeros(3 + n), values)]
+
+
+def insert_installation(k: int, theta: FloatArray, constants: int, values: gtsam.Values) -> None:
+    """Where a factor of keyframe k is linear: the installation ``(n,)``, the last rows of which may be its own."""
+    if constants:
+        values.insert(INSTALLATION, theta[:constants])
+    if len(theta) > constants:
+        values.insert(ground_key(k), theta[constants:])
+
+
+def installation_blocks(k: int, H: FloatArray, constants: int) -> dict[int, FloatArray]:
+    """Derivatives ``(d, n)`` by the installation, by key; the last of them may be keyframe k's own."""
+    blocks = {INSTALLATION: H[:, :constants]} if constants else {}
+    return blocks if H.shape[1] == constants else {**blocks, ground_key(k): H[:, constants:]}
 
 
 def sighting_factors(
@@ -109,6 +128,7 @@ def sighting_factors(
     lines: Sequence[Linearized],
     pose: FloatArray,
     theta: FloatArray,
+    constants: int | None = None,
 ) -> list[gtsam.NonlinearFactor]:
     """One factor for all sightings of one image, linear about a pose and an installation.
 
@@ -118,11 +138,12 @@ def sighting_factors(
         lines: the same, linearized there.
         pose: ``(3,)``.
         theta: ``(n,)``.
+        constants: how many of it are the same for all keyframes; None: all.
     """
+    shared = len(theta) if constants is None else constants
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*pose))
-    if len(theta):
-        values.insert(INSTALLATION, theta)
+    insert_installation(k, theta, shared, values)
     images: dict[int, list[int]] = {}
     for i, sighting in enumerate(sightings):
         images.setdefault(sighting.measurement.stamp_ns, []).append(i)
@@ -130,9 +151,7 @@ def sighting_factors(
     for members in images.values():
         r, J, H, cov = stacked([lines[i] for i in members], len(theta))
         W = sighting_whitening(cov)
-        blocks = {pose_key(k): W @ J}
-        if len(theta):
-            blocks[INSTALLATION] = W @ H
+        blocks = {pose_key(k): W @ J} | installation_blocks(k, W @ H, shared)
         made.append(linear_factor(blocks, W @ r, values))
     return made
 
@@ -244,7 +263,7 @@ class LandmarkFactors:
         c, s = math.cos(yaw), math.sin(yaw)
         corners = self._landmark_corners(self._known[m.landmark_id])
         dx, dy = corners[:, 0] - x, corners[:, 1] - y
-        base = np.column_stack([c * dx + s * dy, -s * dx + c * dy, corners[:, 2]])
+        base = self._tilted(np.column_stack([c * dx + s * dy, -s * dx + c * dy, corners[:, 2]]))
         T = m.camera.T_base_cam
         return float(((base - T[:3, 3]) @ T[:3, 2]).min())
 
@@ -264,15 +283,21 @@ class LandmarkFactors:
         found = []
         for other in others:
             dx, dy = other.position[0] - x, other.position[1] - y
-            right, down, depth = T[:3, :3].T @ (
-                np.array([c * dx + s * dy, -s * dx + c * dy, other.position[2]]) - T[:3, 3]
-            )
+            base = self._tilted(np.array([[c * dx + s * dy, -s * dx + c * dy, other.position[2]]]))[0]
+            right, down, depth = T[:3, :3].T @ (base - T[:3, 3])
             if depth < MIN_DEPTH_M:
                 continue
             across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
             if across < _LOOKALIKE:
                 found.append(other.landmark_id)
         return found if len(found) <= _MOST_LOOKALIKES else []
+
+    def _tilted(self, level: FloatArray) -> FloatArray:
+        """Points ``(m, 3)`` in the base's axes, from those of a level base on the floor."""
+        if not self.installation.ground:
+            return level
+        z, *angles = self._estimated.mean[self.installation.constants :].tolist()
+        return np.asarray((level - [0.0, 0.0, z]) @ rotations(np.array([angles]))[0])
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
         if isinstance(m, PointMeasurement):

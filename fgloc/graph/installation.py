@@ -21,6 +21,8 @@ CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "
 SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
 MARKER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 POINT = ("x_m", "y_m")
+GROUND = ("ground.z_m", "ground.roll_rad", "ground.pitch_rad")
+_GROUND_SIGMAS = (0.3, 0.15, 0.15)  # m, rad, rad: of a robot somewhere on an uneven floor; ramps of 15° are 0.26 rad
 TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its block
 
 
@@ -43,6 +45,9 @@ class Installation:
         sigmas: ``(n,)`` of the prior.
         blocks: rows ``(first, count)`` of "camera" and "sightings", where there are such.
         landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
+        ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
+            newest pose; in the graph each keyframe has its own.
+        constants: how many rows are the same for all poses: all, or all but those.
     """
 
     def __init__(self, parameters: Mapping[str, float], landmark_cov: Mapping[int, FloatArray] | None = None) -> None:
@@ -70,6 +75,8 @@ class Installation:
             elif section in TIME_OFFSET:
                 first, count = self.blocks.get(section, (i, 0))
                 self.blocks[section] = (first, count + 1)
+        self.ground = self.names[-len(GROUND) :] == GROUND
+        self.constants = len(kept) - len(GROUND) * self.ground
         self._prior_cov = np.diag(np.maximum(sigmas, _HELD) ** 2)
         for landmark_id, cov in (landmark_cov or {}).items():
             if landmark_id in self.landmarks:
@@ -142,8 +149,9 @@ def installation_of(
     there = {MotionRole.ODOMETER: True, MotionRole.RATE: has_gyro, MotionRole.MODEL: has_model}
     roles = [role for role, is_there in there.items() if is_there]
     sigmas = {parameter.name: parameter.sigma for parameter in registry.motion_parameters(config, roles)}
+    ground = dict(zip(GROUND, _GROUND_SIGMAS, strict=True)) if config.estimator.ground == "uneven" else {}
     if landmark_map is None:
-        return Installation(sigmas)
+        return Installation(sigmas | ground)
     if corners:
         m, r = camera.position_sigma_m, camera.rotation_sigma_rad
         focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
@@ -155,6 +163,7 @@ def installation_of(
     if len(landmark_map) <= most:
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)
+    sigmas |= ground
     return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None})
 
 

@@ -27,9 +27,12 @@ from fgloc.graph.factors import (
     prior_factor,
     sighting_factors,
 )
+from fgloc.graph.ground import ground_key
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
 from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.graph.uneven import ground_factors, ground_prior, is_level_known, step_of
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,
@@ -96,16 +99,18 @@ class IncrementalEstimator(Estimator):
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
         """Where to linearize: at the prediction or, far from linear, at what it and the sightings make likeliest."""
-        if not frame.sightings or not self.factors.known or is_linear(frame.belief):
+        if not frame.sightings or not self.factors.known:
             return frame.belief
         known = frame.belief.installation or self.installed
+        if is_linear(frame.belief) and is_level_known(known, self.installation):
+            return frame.belief
         measurements = [s.measurement for s in frame.sightings]
         corrected = correct(frame.belief, known, measurements, self.factors)
         return frame.belief if corrected is None else corrected[0]
 
     def _newest(self, k: int) -> PoseWithCovariance:
         assert self._backend is not None
-        belief = self._backend.belief(k, len(self.factors.installation))
+        belief = self._backend.belief(k, len(self.factors.installation), self.installation.ground)
         if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
             raise ValueError("estimate is not finite")
         return belief
@@ -176,14 +181,30 @@ class IncrementalEstimator(Estimator):
 
     def _motion_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
         """Of a keyframe, linear about the pose before it; a kernel on the wheels needs factors that are not."""
-        before = self.log.keyframes.get(frame.k - 1)
+        before, motions = self.log.keyframes.get(frame.k - 1), frame.motions
+        if self.installation.ground and motions:
+            motions = step_of(motions, self._theta_before(frame), self.installation).motions
         installed = self._config.motion_kernel == "none" and before is not None
         return [
             installed_motion_factor(frame.k, m, before.at, self.factors.installation)
             if installed and before is not None
             else motion_factor(frame.k, m, self._config.motion_kernel)
-            for m in frame.motions
+            for m in motions
         ]
+
+    def _theta_before(self, frame: Keyframe) -> FloatArray:
+        """Installation ``(n,)`` as it is known now, with height, roll and pitch at the keyframe before this one."""
+        before, theta = self.log.keyframes.get(frame.k - 1), self.installed.mean
+        ground = None if before is None else before.ground
+        return theta if ground is None else np.concatenate([theta[: self.installation.constants], ground])
+
+    def _ground_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
+        """Beside those of the motions; none where the floor is flat."""
+        if not self.installation.ground or not frame.motions:
+            return []
+        theta = self._theta_before(frame)
+        step = step_of(frame.motions, theta, self.installation)
+        return ground_factors(frame.k, frame.motions, step, theta, self.installation)
 
     def _graph_of(
         self, frame: Keyframe, initial: PoseWithCovariance, prior: PoseWithCovariance | None
@@ -192,14 +213,20 @@ class IncrementalEstimator(Estimator):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(pose_key(frame.k), gtsam.Pose2(*initial.pose))
         known = initial.installation or self.installed
-        if self._fresh and len(known.mean):
-            values.insert(INSTALLATION, known.mean)
+        constants = self.installation.constants
+        if self.installation.ground:
+            known = self._on_ground(frame, initial, known)
+            values.insert(ground_key(frame.k), known.mean[constants:])
+        if self._fresh and constants:
+            values.insert(INSTALLATION, known.mean[:constants])
         if prior is None:
-            made = self._motion_factors(frame)
+            made = [*self._motion_factors(frame), *self._ground_factors(frame)]
         elif len(known.mean) and self._fresh:
-            made = installed_prior_factor(frame.k, prior, self.installed)
+            made = installed_prior_factor(frame.k, prior, self.installed, constants)
         else:
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
+            if self.installation.ground:
+                made.append(ground_prior(frame.k, known.mean[constants:], known.cov[constants:, constants:]))
         self._fresh = False
         if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
@@ -210,13 +237,22 @@ class IncrementalEstimator(Estimator):
             kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
             if kept:
                 sightings, ahead = zip(*kept, strict=True)
-                made += sighting_factors(frame.k, sightings, ahead, initial.pose, known.mean)
+                made += sighting_factors(frame.k, sightings, ahead, initial.pose, known.mean, constants)
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial.pose, values)
             made += sighting.factors
         for factor in made:
             graph.add(factor)
         return graph, values
+
+    def _on_ground(
+        self, frame: Keyframe, initial: PoseWithCovariance, known: InstallationEstimate
+    ) -> InstallationEstimate:
+        """The installation with height, roll and pitch of this keyframe, which may not be the newest."""
+        if initial.installation is not None or frame.ground is None:
+            return known
+        mean = np.concatenate([known.mean[: self.installation.constants], frame.ground])
+        return InstallationEstimate(mean, known.cov)
 
     def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
         """Give a first value to a landmark that is a variable and not yet in the graph."""
@@ -262,7 +298,7 @@ class IncrementalEstimator(Estimator):
 
     def _new_backend(self) -> Backend:
         self._fresh = True
-        installed = len(self.factors.installation) if self.factors.known else 0
+        installed = self.installation.constants if self.factors.known else 0
         careful = math.isfinite(self._careful_until_s)
         if self._config.kind == "fixed_lag":
             return FixedLag(self._config, installed, careful)

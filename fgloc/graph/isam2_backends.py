@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import gtsam
@@ -12,7 +13,8 @@ from fgloc.graph.factors import (
     INSTALLATION,
     pose_key,
 )
-from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.ground import ground_key
+from fgloc.graph.installation import GROUND, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import (
     FloatArray,
@@ -37,8 +39,11 @@ class Backend(Protocol):
         """Estimated pose ``(3,)`` of a keyframe."""
         ...
 
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
-        """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance."""
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
+        """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance.
+
+        ``ground``: the installation ends with height, roll and pitch of the keyframe.
+        """
 
 
 class FixedLag:
@@ -70,9 +75,11 @@ class FixedLag:
         """Estimated pose of a keyframe."""
         return pose_vector(self._smoother.calculateEstimatePose2(pose_key(k)))
 
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
         """Pose and installation with their joint covariance."""
         pose = self.pose(k)
+        if ground:
+            return _joint_on_ground(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector, k, n)
         if not n:
             return PoseWithCovariance(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
         return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
@@ -100,9 +107,11 @@ class WholeRun:
         """Estimated pose of a keyframe."""
         return pose_vector(self._isam2.calculateEstimatePose2(pose_key(k)))
 
-    def belief(self, k: int, n: int) -> PoseWithCovariance:
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
         """Pose and installation with their joint covariance."""
         pose = self.pose(k)
+        if ground:
+            return _joint_on_ground(self._isam2, pose, self._isam2.calculateEstimateVector, k, n)
         if not n:
             return PoseWithCovariance(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
         return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
@@ -113,6 +122,17 @@ def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> P
     found = isam2.jointMarginalCovariance([x, INSTALLATION])
     known = InstallationEstimate(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
     return PoseWithCovariance(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
+
+
+def _joint_on_ground(
+    isam2: gtsam.ISAM2, pose: FloatArray, estimate: Callable[[int], FloatArray], k: int, n: int
+) -> PoseWithCovariance:
+    """As `_joint`, where the installation ends with the ground's height, roll and pitch at the keyframe."""
+    keys = [pose_key(k), *([INSTALLATION] if n > len(GROUND) else []), ground_key(k)]
+    found = isam2.jointMarginalCovariance(keys)
+    P = np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys])
+    known = InstallationEstimate(np.concatenate([np.asarray(estimate(key)) for key in keys[1:]]), P[3:, 3:])
+    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], known)
 
 
 def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = False) -> gtsam.ISAM2Params:
@@ -130,6 +150,7 @@ def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = Fa
         thresholds = gtsam.ISAM2ThresholdMap()
         thresholds.insert(("x", np.full(3, config.relinearize_threshold)))
         thresholds.insert(("i", np.full(installed, _NEVER)))
+        thresholds.insert(("g", np.full(len(GROUND), _NEVER)))
         params.setRelinearizeThreshold(thresholds)
     else:
         params.setRelinearizeThreshold(config.relinearize_threshold)

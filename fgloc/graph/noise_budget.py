@@ -94,6 +94,8 @@ class NoiseBudget:
         known = [m for m in (wheels, learned) if m is not None]
         if gyro is not None and known:
             known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
+        if readings.inertial is not None:
+            known = [replace(m, inertial=readings.inertial) for m in known]
         return [self.overruled(m) for m in known]
 
     def overruled(self, m: MotionMeasurement) -> MotionMeasurement:

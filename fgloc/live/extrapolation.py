@@ -14,9 +14,9 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.uneven import predict
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose

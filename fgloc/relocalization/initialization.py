@@ -80,6 +80,7 @@ class Initialization:
             self._tracking.start_known()
             return self._start(step, prior, sightings)
         motions = self._motion.combine(step, readings)
+        self._estimator.level(motions)
         found = self._tracking.collect(step, motions, sightings, readings)
         if found is None and self._tracking.lost:
             return self._advance(step, readings, ())
@@ -127,6 +128,7 @@ class Initialization:
         return estimates + [self._advance(later.step, later.readings, later.sightings) for later in rest]
 
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        self._estimator.forget_ground()
         seen = self._sightings.associate(step, sightings, prior)
         pose = self._estimator.start(step.stamp_ns, prior, seen.accepted)
         self._sightings.begin_graph(seen, pose)

@@ -36,7 +36,7 @@ class MotionSources:
         self._config = config
         self.factors = LandmarkFactors(None) if factors is None else factors
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
-        self.gyro = sensors.gyro
+        self.gyro, self._attitude = sensors.gyro, sensors.attitude
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
         self._untold_s = 0.0  # how long fixes have told the yaw along the way only, at most the lag
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
@@ -85,7 +85,9 @@ class MotionSources:
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
-        readings = MotionReadings(wheels, self._with_drift(self._measure_learned(step, velocity), step), gyro)
+        learned = self._with_drift(self._measure_learned(step, velocity), step)
+        inertial = None if self._attitude is None else self._attitude.measure(step, self._wheels.twist)
+        readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
@@ -130,7 +132,8 @@ class MotionSources:
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
             motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
-        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
+        inertial = None if readings is None else readings.inertial
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov, inertial=inertial)
 
     def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, tells_yaw: bool = True) -> None:
         """The robot went on by a step.

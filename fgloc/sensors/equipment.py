@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fgloc.sensors.base import Sensor, Turn
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.types import FloatArray, MotionMeasurement, Step
+from fgloc.types import FloatArray, InertialEvent, InertialReading, MotionMeasurement, Step
 
 
 class Odometer(Protocol):
@@ -99,6 +99,18 @@ class RateSensor(Protocol):
         ...
 
 
+class AttitudeSensor(Protocol):
+    """Measures roll and pitch."""
+
+    def measure(self, step: Step, twist: Callable[[Step, int], FloatArray]) -> InertialReading | None:
+        """Of a step; ``twist`` tells that of the base at a time near its end."""
+        ...
+
+    def rates_at(self, events: Sequence[InertialEvent], at_ns: int) -> FloatArray:
+        """Angular velocity ``(3,)`` [rad/s] of the base at a time."""
+        ...
+
+
 class MotionPredictor(Protocol):
     """Predicts the motion from control inputs, by a model.
 
@@ -151,12 +163,14 @@ class MotionSensors:
         learned: the learned motion, if any.
         joint: its correlation with the wheels; None: the two are taken as independent.
         gyro: the gyro, if any.
+        attitude: roll and pitch, on uneven ground; None: it is flat, or nothing measures them.
     """
 
     wheels: Odometer
     learned: MotionPredictor | None = None
     joint: ErrorCorrelation | None = None
     gyro: RateSensor | None = None
+    attitude: AttitudeSensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

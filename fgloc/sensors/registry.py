@@ -31,7 +31,7 @@ from fgloc.types import Event, FloatArray, LandmarkSighting, RawEvent
 if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.sensors.detection import SensorDetector
-    from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor, Odometer, RateSensor
+    from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, Odometer, RateSensor
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
     from fgloc.types import LandmarkMap
@@ -188,6 +188,15 @@ def rate_sensor(config: Config, up: FloatArray) -> RateSensor:
     from fgloc.sensors.gyro.rate import Gyro
 
     return Gyro(config.gyro, up)
+
+
+def attitude_sensor(config: Config, T_base_imu: FloatArray | None) -> AttitudeSensor | None:
+    """What measures roll and pitch; None: the ground is flat, or there is no inertial unit."""
+    if config.estimator.ground == "flat" or T_base_imu is None:
+        return None
+    from fgloc.sensors.gyro.attitude import Attitude
+
+    return Attitude(config.gyro, T_base_imu)
 
 
 def rate_is_used(config: Config) -> bool:

@@ -25,6 +25,7 @@ from fgloc.types.events import (
 from fgloc.types.maps import Camera, Landmark, LandmarkMap
 from fgloc.types.measurements import (
     FrameMeasurement,
+    InertialReading,
     LandmarkMeasurement,
     LandmarkSighting,
     MotionMeasurement,
@@ -49,6 +50,7 @@ __all__ = [
     "FloatArray",
     "FrameMeasurement",
     "InertialEvent",
+    "InertialReading",
     "InstallationFound",
     "IntArray",
     "Landmark",

@@ -13,6 +13,18 @@ from fgloc.types.arrays import FloatArray
 from fgloc.types.maps import Camera
 
 _AT_REST = np.zeros(3)
+_LEVEL = np.zeros(2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialReading:
+    """What an inertial unit measures of one step on uneven ground, in the axes of the base."""
+
+    turn: FloatArray  # (2,) rad: about x and y over the step, with the bias in it
+    turn_variance: float  # rad², of each
+    force: FloatArray | None  # (3,) m/s²: specific force at the step's end, without the robot's own acceleration
+    force_variance: float  # (m/s²)², of each
+    seconds: float  # length of the step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +38,7 @@ class MotionMeasurement:
     cov: FloatArray  # (3, 3) of what differs from step to step; what is always the same is in `depends_on`
     # by parameter of the installation: derivative (3,) of the motion (right perturbation), and the value it has in it
     depends_on: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    inertial: InertialReading | None = None  # of the same step; on uneven ground
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +48,7 @@ class MotionReadings:
     wheels: MotionMeasurement | None = None
     learned: MotionMeasurement | None = None
     gyro: MotionMeasurement | None = None  # only its yaw means anything
+    inertial: InertialReading | None = None  # on uneven ground
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +68,7 @@ class PixelMeasurement:
     jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
     cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
+    tilting: FloatArray = field(default_factory=lambda: _LEVEL)  # (2,) rad/s: roll and pitch rate of the base
 
     @property
     def dof(self) -> int:

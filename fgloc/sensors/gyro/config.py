@@ -15,4 +15,10 @@ class GyroConfig(Section):
     yaw_per_sqrt_s: float = Field(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
     bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
+    tilt_sigma_rad: float = Field(
+        0.011, ge=1e-6, le=0.5, description="rad: how far mounting and bias tilt the accelerometer; on uneven ground"
+    )
+    acceleration_sigma: float = Field(
+        0.15, ge=1e-3, le=100, description="m/s²: of the specific force of a step, beside gravity; on uneven ground"
+    )
     bias_walk: float = Field(0.0003, ge=0, le=10, description="rad/s/√s")

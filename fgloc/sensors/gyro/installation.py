@@ -15,9 +15,17 @@ if TYPE_CHECKING:
     from fgloc.config import Config
 
 
+BIASES = ("gyro.bias_x", "gyro.bias_y")  # rad/s, in the axes of the base
+TILTS = ("gyro.roll_rad", "gyro.pitch_rad")  # by how much the accelerometer sees the base tilted where it is level
+
+
 def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
-    """With their priors."""
-    return (Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0),)
+    """With their priors; on uneven ground also of what tells roll and pitch."""
+    scale = Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0)
+    if config.estimator.ground == "flat" or MotionRole.RATE not in roles:
+        return (scale,)
+    biases = (Parameter(name, config.gyro.bias_sigma) for name in BIASES)
+    return (scale, *biases, *(Parameter(name, config.gyro.tilt_sigma_rad) for name in TILTS))
 
 
 def found(config: Config) -> tuple[FoundRow, ...]:

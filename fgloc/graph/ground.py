@@ -1,0 +1,231 @@
+"""Uneven ground: height, roll and pitch of the base from step to step, beside its planar pose.
+
+The pose is ``T_map_base = (x, y, yaw)`` in the plane, and ``(z, roll, pitch)``: rotations are ``Rz(yaw) Ry(pitch)
+Rx(roll)``. Motion sources measure in the robot's own plane; here their motions are projected to the map's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from fgloc import se2
+from fgloc.graph.installation import Installation
+from fgloc.types import FloatArray, InertialReading, MotionMeasurement
+
+GRAVITY = 9.81  # m/s²
+_CONTACT_M = 0.06  # half a short wheelbase: the axle climbs a slope before the chassis has tilted by all of it
+_PATH_PER_SQRT_M = 0.003  # m/√m: height of a path beside what the tilt of the chassis says
+_SINK_PER_SQRT_S = 1e-4  # m/√s: of a standing robot, so that no covariance is singular
+_TILT_PER_SQRT_M = 0.1  # rad/√m: without an IMU, how fast the slope of the floor changes ...
+_TILT_PER_SQRT_RAD = 0.02  # rad/√rad: ... and what a turn in place does to it
+_SLOPE_RAD = 0.15  # rad: ... about level, by as much as `fgloc.graph.installation` allows for at the start
+_SUDDEN = 3.0  # Cauchy constant of the gravity's direction, in units of its sigma: slips and bumps are accelerations
+_EPS = 1e-6
+
+
+def ground_key(k: int) -> int:
+    """Key of height, roll and pitch of keyframe k: one vector."""
+    return int(gtsam.symbol("g", k))
+
+
+def rotations(angles: FloatArray) -> FloatArray:
+    """``Ry(pitch) Rx(roll)`` ``(m, 3, 3)`` of angles roll, pitch ``(m, 2)``."""
+    cr, sr, cp, sp = (f(angles[:, i]) for i in range(2) for f in (np.cos, np.sin))
+    zero = np.zeros_like(cr)
+    return np.stack([cp, sp * sr, sp * cr, zero, cr, -sr, -sp, cp * sr, cp * cr], axis=1).reshape(-1, 3, 3)
+
+
+def _turned(vectors: FloatArray) -> FloatArray:
+    """Rotations ``(m, 3, 3)`` about vectors ``(m, 3)`` by their length (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.asarray(np.eye(3) + a[:, None, None] * K + b[:, None, None] * (K @ K))
+
+
+def driven(angles: FloatArray, motions: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Motions in the robot's own plane, seen in the map.
+
+    Args:
+        angles: roll and pitch ``(m, 2)`` before them.
+        motions: ``(m, 3)`` x, y, yaw in the robot's plane.
+        turns: ``(m, 2)`` about the robot's x and y meanwhile [rad].
+
+    Returns:
+        Planar motions ``(m, 3)`` in the plane of the map, heights climbed ``(m,)``, roll and pitch ``(m, 2)`` after.
+    """
+    before = rotations(angles)
+    half = np.column_stack([0.5 * turns, np.zeros(len(turns))])
+    way = np.einsum("mij,mjk,mk->mi", before, _turned(half), motions * [1.0, 1.0, 0.0])
+    R = before @ _turned(np.column_stack([turns, motions[:, 2]]))
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    after = np.column_stack([np.arctan2(R[:, 2, 1], R[:, 2, 2]), np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))])
+    return np.column_stack([way[:, :2], yaw]), way[:, 2], after
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundStep:
+    """One step on uneven ground.
+
+    Attributes:
+        motions: projected to the plane of the map.
+        before: height, roll, pitch ``(3,)`` at its start.
+        after: ``(3,)`` at its end, as predicted.
+        A: ``(3, 3)`` derivative by those before.
+        D: ``(3, constants)`` derivative by the installation.
+        cov: ``(3, 3)`` of what is added on the way.
+    """
+
+    motions: tuple[MotionMeasurement, ...]
+    before: FloatArray
+    after: FloatArray
+    A: FloatArray
+    D: FloatArray
+    cov: FloatArray
+
+
+def ground_step(
+    motions: Sequence[MotionMeasurement],
+    fused: tuple[FloatArray, FloatArray, Mapping[str, tuple[FloatArray, float]]],
+    ground: FloatArray,
+    theta: FloatArray,
+    installation: Installation,
+) -> GroundStep:
+    """A step from its motions in the robot's plane.
+
+    Args:
+        motions: at least one.
+        fused: of these, as `fgloc.graph.joint.fuse_installed` makes it.
+        ground: height, roll and pitch ``(3,)`` at the start.
+        theta: ``(n,)`` installation.
+        installation: its parameters.
+    """
+    motion, motion_cov, depends = fused
+    by_theta = np.zeros((3, installation.constants))
+    for name, (derivative, assumed) in depends.items():
+        if name in installation.index:
+            i = installation.index[name]
+            by_theta[:, i] = derivative
+            motion = se2.compose(motion, se2.exp(derivative * (theta[i] - assumed)))
+    inertial = motions[0].inertial
+    turn, by_bias = _turn_of(inertial, theta, installation)
+    rows = 8 + len(motions)
+    angles, moves, turns = np.tile(ground[1:], (rows, 1)), np.tile(motion, (rows, 1)), np.tile(turn, (rows, 1))
+    angles[1:3] += _EPS * np.eye(2)
+    turns[3:5] += _EPS * np.eye(2)
+    for i, direction in enumerate(np.eye(3)):
+        moves[5 + i] = se2.compose(motion, se2.exp(_EPS * direction))
+    moves[8:] = [m.motion for m in motions]
+    planar, climbed, tilted = driven(angles, moves, turns)
+    ends = np.column_stack([ground[0] + climbed, tilted])
+    slopes = (ends[1:8] - ends[0]).T / _EPS  # (3, 7) by angles, turns, motion
+    P = np.column_stack([se2.log(se2.between(planar[0], planar[5 + i])) for i in range(3)]) / _EPS
+    by_turn, by_motion = slopes[:, 2:4], slopes[:, 4:]
+    A = np.column_stack([np.eye(3)[:, 0], slopes[:, :2]])
+    cov = by_motion @ motion_cov @ by_motion.T + _added(inertial, motion, A, ends[0, 1:] - ground[1:])
+    if inertial is None:
+        A = A.copy()
+        A[:, 1:] *= _kept(motion)
+        ends[0, 1:] *= _kept(motion)
+    else:
+        cov += by_turn @ by_turn.T * inertial.turn_variance
+    projected = tuple(
+        replace(
+            m,
+            motion=planar[8 + i],
+            cov=_symmetric(P @ m.cov @ P.T),
+            depends_on={name: (P @ derivative, at) for name, (derivative, at) in m.depends_on.items()},
+        )
+        for i, m in enumerate(motions)
+    )
+    return GroundStep(projected, ground, ends[0], A, by_motion @ by_theta + by_turn @ by_bias, cov)
+
+
+def _turn_of(
+    inertial: InertialReading | None, theta: FloatArray, installation: Installation
+) -> tuple[FloatArray, FloatArray]:
+    """Turn ``(2,)`` about x and y, rid of its bias, and its derivative ``(2, constants)``."""
+    by_bias = np.zeros((2, installation.constants))
+    if inertial is None:
+        return np.zeros(2), by_bias
+    turn = inertial.turn.copy()
+    for row, name in enumerate(("gyro.bias_x", "gyro.bias_y")):
+        if name in installation.index:
+            i = installation.index[name]
+            turn[row] -= theta[i] * inertial.seconds
+            by_bias[row, i] = -inertial.seconds
+    return turn, by_bias
+
+
+def _kept(motion: FloatArray) -> float:
+    """Share of a tilt that is left after a way, where nothing measures it: it returns to level."""
+    return math.exp(-0.5 * (_TILT_PER_SQRT_M / _SLOPE_RAD) ** 2 * math.hypot(motion[0], motion[1]))
+
+
+def _added(inertial: InertialReading | None, motion: FloatArray, A: FloatArray, tilted: FloatArray) -> FloatArray:
+    """Covariance ``(3, 3)`` of what the path does beside the tilt of the chassis."""
+    way, turned = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
+    climbed = (_CONTACT_M * float(np.hypot(*tilted)) if way > 0.0 else 0.0) ** 2
+    added = np.zeros((3, 3))
+    added[0, 0] = climbed + _PATH_PER_SQRT_M**2 * way + _SINK_PER_SQRT_S**2 * 0.1
+    if inertial is None:
+        added[1, 1] = added[2, 2] = _TILT_PER_SQRT_M**2 * way + _TILT_PER_SQRT_RAD**2 * turned + 1e-10
+        added[0, 0] += (0.5 * way) ** 2 * _TILT_PER_SQRT_M**2 * way
+    return added
+
+
+def _symmetric(cov: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (cov + cov.T))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gravity:
+    """Roll and pitch by the direction of gravity.
+
+    Attributes:
+        residual: ``(2,)`` predicted minus measured, at an attitude and an installation.
+        D: ``(2, constants)`` derivative by the installation; by roll and pitch it is the identity.
+        cov: ``(2, 2)``; larger the more the force is not gravity's.
+        noise: ``(2, 2)`` of that what is usual.
+    """
+
+    residual: FloatArray
+    D: FloatArray
+    cov: FloatArray
+    noise: FloatArray
+
+
+def gravity(
+    motions: Sequence[MotionMeasurement], ground: FloatArray, theta: FloatArray, installation: Installation
+) -> Gravity | None:
+    """What the newest step's specific force tells; None: nothing.
+
+    Args:
+        motions: of the step.
+        ground: height, roll, pitch ``(3,)`` at its end, as predicted.
+        theta: ``(n,)`` installation.
+        installation: its parameters.
+    """
+    inertial = motions[0].inertial if motions else None
+    if inertial is None or inertial.force is None:
+        return None
+    x, y, z = inertial.force
+    measured = np.array([math.atan2(y, z), math.atan2(-x, math.hypot(y, z))])
+    D = np.zeros((2, installation.constants))
+    residual = ground[1:] - measured
+    for row, name in enumerate(("gyro.roll_rad", "gyro.pitch_rad")):
+        if name in installation.index:
+            D[row, installation.index[name]] = 1.0
+            residual[row] += theta[installation.index[name]]
+    variance = inertial.force_variance / GRAVITY**2
+    off = (math.hypot(x, y, z) - GRAVITY) ** 2 / GRAVITY**2
+    usual = variance * np.eye(2)
+    variance += off + float(residual @ residual) / _SUDDEN**2
+    return Gravity(residual, D, variance * np.eye(2), usual)

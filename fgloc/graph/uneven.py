@@ -1,0 +1,137 @@
+"""Prediction and factors of a step on uneven ground; the state beside the pose ends with its height, roll and pitch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from fgloc.graph.factors import INSTALLATION, linear_factor
+from fgloc.graph.ground import Gravity, GroundStep, gravity, ground_key, ground_step
+from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
+from fgloc.graph.joint import fuse_installed, joint_cov
+from fgloc.graph.joint import predict as predict_on_plane
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_models import whitening_of
+from fgloc.types import FloatArray, MotionMeasurement
+
+_N = len(GROUND)
+_LINEAR_RAD = 0.02  # sigma of roll and pitch up to which a sighting is linear in them
+
+
+def predict(
+    belief: PoseWithCovariance,
+    known: InstallationEstimate,
+    installation: Installation,
+    motions: Sequence[MotionMeasurement],
+) -> PoseWithCovariance:
+    """Pose and installation after the motions of one step, on whichever ground."""
+    if not installation.ground:
+        return predict_on_plane(belief, known, installation, motions)
+    step = step_of(motions, known.mean, installation)
+    n, c = len(known.mean), installation.constants
+    F = np.eye(n)
+    F[c:, c:], F[c:, :c] = step.A, step.D
+    cov = F @ known.cov @ F.T
+    cov[c:, c:] += step.cov
+    planar = predict_on_plane(belief, known, installation, step.motions)
+    cross = planar.cross if planar.cross is not None else np.zeros((3, n))
+    mean = np.concatenate([known.mean[:c], step.after])
+    after = PoseWithCovariance(planar.pose, planar.cov, cross @ F.T, InstallationEstimate(mean, 0.5 * (cov + cov.T)))
+    return with_gravity(after, gravity(motions, step.after, mean, installation), installation)
+
+
+def with_gravity(belief: PoseWithCovariance, seen: Gravity | None, installation: Installation) -> PoseWithCovariance:
+    """Pose and installation corrected by the direction of gravity (Kalman update)."""
+    known = belief.installation
+    if seen is None or known is None:
+        return belief
+    P = joint_cov(belief, known)
+    H = np.zeros((2, len(P)))
+    H[:, 3 : 3 + installation.constants] = seen.D
+    H[:, -2:] = np.eye(2)
+    gain = np.linalg.solve(H @ P @ H.T + seen.cov, H @ P).T
+    moved = -gain @ seen.residual
+    P = P - gain @ H @ P
+    P = 0.5 * (P + P.T)
+    theta = InstallationEstimate(known.mean + moved[3:], P[3:, 3:])
+    return PoseWithCovariance(belief.pose, P[:3, :3], P[:3, 3:], theta)  # the pose itself hardly depends on it
+
+
+def step_of(motions: Sequence[MotionMeasurement], theta: FloatArray, installation: Installation) -> GroundStep:
+    """A step that begins at the height, roll and pitch with which ``theta (n,)`` ends."""
+    return ground_step(motions, fuse_installed(motions), theta[installation.constants :], theta, installation)
+
+
+def ground_factors(
+    k: int, motions: Sequence[MotionMeasurement], step: GroundStep, theta: FloatArray, installation: Installation
+) -> list[gtsam.NonlinearFactor]:
+    """How height, roll and pitch go on from keyframe k - 1 to k, and what gravity tells of them at k."""
+    c = installation.constants
+    values = gtsam.Values()
+    values.insert(ground_key(k - 1), step.before)
+    values.insert(ground_key(k), step.after)
+    W = whitening_of(step.cov)
+    blocks = {ground_key(k - 1): -W @ step.A, ground_key(k): W}
+    if c:
+        values.insert(INSTALLATION, theta[:c])
+        blocks[INSTALLATION] = -W @ step.D
+    made = [linear_factor(blocks, np.zeros(_N), values)]
+    seen = gravity(motions, step.after, theta, installation)
+    return made if seen is None else [*made, gravity_factor(k, seen, step.after, theta, installation)]
+
+
+def gravity_factor(
+    k: int, seen: Gravity, ground: FloatArray, theta: FloatArray, installation: Installation
+) -> gtsam.NonlinearFactor:
+    """The direction of gravity at keyframe k, linear about a height, roll and pitch and an installation."""
+    values = gtsam.Values()
+    values.insert(ground_key(k), ground)
+    W = whitening_of(seen.cov)
+    blocks = {ground_key(k): W @ np.eye(_N)[1:]}
+    if installation.constants:
+        values.insert(INSTALLATION, theta[: installation.constants])
+        blocks[INSTALLATION] = W @ seen.D
+    return linear_factor(blocks, W @ seen.residual, values)
+
+
+def ground_prior(k: int, ground: FloatArray, cov: FloatArray) -> gtsam.NonlinearFactor:
+    """Prior on height, roll and pitch of keyframe k."""
+    return gtsam.PriorFactorVector(ground_key(k), ground, gtsam.noiseModel.Gaussian.Covariance(cov))
+
+
+def starting(known: InstallationEstimate, installation: Installation) -> InstallationEstimate:
+    """At a first pose: the ground there may be anything, about what was known last of roll and pitch."""
+    if not installation.ground:
+        return known
+    prior, c = installation.prior(), installation.constants
+    mean, cov = known.mean.copy(), known.cov.copy()
+    mean[c] = prior.mean[c]
+    cov[c:, :], cov[:, c:] = 0.0, 0.0
+    cov[c:, c:] = prior.cov[c:, c:]
+    return InstallationEstimate(mean, cov)
+
+
+def levelled(
+    known: InstallationEstimate, motions: Sequence[MotionMeasurement], installation: Installation
+) -> InstallationEstimate:
+    """While no pose is known: roll and pitch by gravity alone, about any height."""
+    if not installation.ground:
+        return known
+    begun = starting(known, installation)
+    mean = np.concatenate([begun.mean[: installation.constants], np.zeros(_N)])
+    seen = gravity(motions, mean[-_N:], mean, installation)
+    if seen is None:
+        return begun
+    direct = replace(seen, cov=seen.noise)  # it is far from level, not wrong
+    nowhere = PoseWithCovariance(np.zeros(3), np.eye(3), None, InstallationEstimate(mean, begun.cov))
+    found = with_gravity(nowhere, direct, installation).installation
+    assert found is not None
+    return found
+
+
+def is_level_known(known: InstallationEstimate, installation: Installation) -> bool:
+    """Whether sightings are as good as linear over what roll and pitch may be."""
+    return not installation.ground or bool((np.diag(known.cov)[-2:] < _LINEAR_RAD**2).all())
