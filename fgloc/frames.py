@@ -53,6 +53,17 @@ def rotation_of(vector: Sequence[float] | FloatArray) -> FloatArray:
     return quaternion_matrix((k * x, k * y, k * z, math.cos(half)))
 
 
+def rpy_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Quaternion x, y, z, w of fixed-axis roll, pitch, yaw [rad]."""
+    cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
 def rpy_matrix(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Rotation matrix ``(3, 3)`` of fixed-axis roll, pitch, yaw [rad], as ROS and URDF use them."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,8 @@ from fgloc.replay.smoothing import SmoothedRun, smooth_run
 from fgloc.timing import one_blas_thread
 from fgloc.types import (
     Estimate,
+    FloatArray,
+    Ground,
     InstallationFound,
     RunResult,
     Trajectory,
@@ -189,4 +191,17 @@ def _trajectory(estimates: list[Estimate]) -> Trajectory:
         np.array([e.stamp_ns for e in estimates], dtype=np.int64),
         np.array([e.pose for e in estimates]),
         np.array([e.cov for e in estimates]),
+        *_grounds([e.ground for e in estimates]),
     )
+
+
+def _grounds(grounds: Sequence[Ground | None]) -> tuple[FloatArray | None, FloatArray | None]:
+    """Height, roll and pitch with the covariances of the whole poses; None: the floor is flat.
+
+    Of a pose before the first is confirmed they are not known: taken to be level, with the covariance of that.
+    """
+    if not any(grounds):
+        return None, None
+    first = next(g for g in grounds if g is not None)
+    known = [first if g is None else g for g in grounds]
+    return np.array([(g.z, g.roll, g.pitch) for g in known]), np.array([g.cov for g in known])

@@ -37,11 +37,12 @@ _SIGMAS = {  # the field that takes the sigma of settings back; of several the l
 def installation_found(parts: Assembly, roles: Container[str], belief: InstallationEstimate) -> InstallationFound:
     """What a run of these parts has found, from a recording with these roles."""
     installation, landmark_map, source = parts.localizer.factors.installation, parts.landmark_map, parts.wheels.source
+    n = installation.constants  # height, roll and pitch of a pose are no installation
     found = InstallationFound(
-        installation.names,
-        belief.mean,
-        belief.cov,
-        installation.prior().cov,
+        installation.names[:n],
+        belief.mean[:n],
+        belief.cov[:n, :n],
+        installation.prior().cov[:n, :n],
         parts.camera,
         "image" if "image" in roles else "sightings",
         "joints" if source == "ticks" else source,

@@ -24,6 +24,19 @@ class Matched:
     truth: FloatArray  # (n, 3)
     covs: FloatArray | None  # (n, 3, 3) of the estimate
     T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
+    ground: FloatArray | None = None  # (n, 3) estimated height, roll and pitch; None: the floor is flat
+    true_ground: FloatArray | None = None  # (n, 3); None: not known
+    ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw
+
+    @property
+    def spatial_errors(self) -> FloatArray | None:
+        """``(n, 6)`` estimate minus truth of x, y, z [m], roll, pitch and yaw; None where they were not estimated."""
+        if self.ground is None or self.true_ground is None:
+            return None
+        planar, off = self.errors, self.ground - self.true_ground
+        return np.column_stack(
+            [planar[:, :2], off[:, 0], se2.wrap_array(off[:, 1]), se2.wrap_array(off[:, 2]), planar[:, 2]]
+        )
 
     @property
     def errors(self) -> FloatArray:
@@ -64,7 +77,11 @@ def match(
         T_map_truth = align_se2(reference[:, :2], poses[:, :2])
         reference = transform(T_map_truth, reference)
     covs = None if estimate.covs is None else estimate.covs[indices]
-    return Matched(stamps, poses, reference, covs, T_map_truth)
+    if estimate.ground is None or estimate.ground_covs is None or truth.ground is None or align == "se2":
+        return Matched(stamps, poses, reference, covs, T_map_truth)
+    true = np.column_stack([np.interp(stamps, truth.stamps_ns, column) for column in truth.ground.T])
+    ground, spatial = estimate.ground[indices], estimate.ground_covs[indices]
+    return Matched(stamps, poses, reference, covs, T_map_truth, ground, true, spatial)
 
 
 def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:

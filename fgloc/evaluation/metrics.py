@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from fgloc.types import RunResult
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_Figure = TypeVar("_Figure")
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled
 
 
@@ -51,6 +52,18 @@ class FoundSetting(BaseModel):
     sigma: float
 
 
+class GroundMetrics(BaseModel):
+    """Of the pose in space, on uneven ground; root mean squares."""
+
+    model_config = ConfigDict(frozen=True)
+
+    ate_rmse_m: float  # distance in space
+    height_rmse_m: float
+    roll_rmse_deg: float
+    pitch_rmse_deg: float
+    nees_over_6: float  # of x, y, z, roll, pitch and yaw
+
+
 class Metrics(BaseModel):
     """What ``metrics.json`` holds. Keys that need a truth are None without one."""
 
@@ -66,6 +79,7 @@ class Metrics(BaseModel):
     drift_percent: float | None
     nees_over_3: float | None
     coverage: dict[str, float] | None  # by number of sigmas: "1", "2", "3"
+    ground: GroundMetrics | None  # None: estimated on a flat floor, or no truth
     real_time_factor: float | None  # seconds of recording per second of work
     step_ms: StepTimes | None
     factors: dict[str, int]
@@ -154,7 +168,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
     stamps = result.trajectory.stamps_ns
     duration = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
 
-    def against_truth(figure: Callable[[Matched], float | None]) -> float | None:
+    def against_truth(figure: Callable[[Matched], _Figure | None]) -> _Figure | None:
         return None if matched is None else figure(matched)
 
     honest: tuple[float | None, dict[str, float] | None] = (None, None)
@@ -172,6 +186,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         drift_percent=against_truth(drift_percent),
         nees_over_3=honest[0],
         coverage=honest[1],
+        ground=against_truth(ground_metrics),
         real_time_factor=duration / result.wall_s if result.wall_s > 0 else None,
         step_ms=_step_times(result.step_ms),
         factors=dict(sorted(result.counts.items())),
@@ -179,6 +194,20 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         installation=_installation(result),
         mistakes=result.mistakes,
         judgements=judgements(result),
+    )
+
+
+def ground_metrics(matched: Matched) -> GroundMetrics | None:
+    """Of the pose in space; None: it was not estimated."""
+    errors, covs = matched.spatial_errors, matched.ground_covs
+    if errors is None or covs is None:
+        return None
+    return GroundMetrics(
+        ate_rmse_m=_rms(np.linalg.norm(errors[:, :3], axis=1)),
+        height_rmse_m=_rms(errors[:, 2]),
+        roll_rmse_deg=math.degrees(_rms(errors[:, 3])),
+        pitch_rmse_deg=math.degrees(_rms(errors[:, 4])),
+        nees_over_6=float(np.mean(nees(errors, covs))) / 6.0,
     )
 
 

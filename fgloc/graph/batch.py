@@ -13,6 +13,7 @@ from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
+from fgloc.graph.batch_ground import GroundMotions, ground_covs, ground_of
 from fgloc.graph.batch_solve import estimated_landmarks, initial_values, solvable, with_deep_stack, without_orphans
 from fgloc.graph.factors import (
     INSTALLATION,
@@ -44,6 +45,8 @@ class Smoothed:
     stamps_ns: IntArray  # (n,)
     poses: FloatArray  # (n, 3)
     covs: FloatArray  # (n, 3, 3) right perturbation (body frame)
+    ground: FloatArray | None  # (n, 3) height, roll and pitch; None: the floor is flat
+    ground_covs: FloatArray | None  # (n, 6, 6) of x, y, yaw, height, roll and pitch
     landmarks: Mapping[int, Landmark]  # those that were variables
     factors: int  # held by the last graph
     error: float  # its GTSAM error
@@ -79,7 +82,8 @@ class BatchSmoother:
         self._config = config
         self._probability = gate_probability
         self.accepted = {frame.k: frame.sightings for frame in self.frames}
-        self._motions = BatchMotions(self.frames, factors.installation)
+        self._on_ground = GroundMotions(self.frames, factors.installation) if factors.installation.ground else None
+        self._motions = self._new_motions()
         self._sightings = None
         if factors.known:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
@@ -111,16 +115,33 @@ class BatchSmoother:
         """Take other motion measurements for these keyframes, and solve again from the last solution."""
         for frame in self.frames:
             frame.motions = motions.get(frame.k, frame.motions)
-        self._motions = BatchMotions(self.frames, self._factors.installation)
+        self._motions = self._new_motions()
         self._optimize()
 
+    def _new_motions(self) -> BatchMotions | None:
+        return None if self._on_ground is not None else BatchMotions(self.frames, self._factors.installation)
+
     def installed(self) -> InstallationEstimate:
-        """The installation that the last solution has found."""
-        n = len(self._factors.installation)
-        if not n:
-            return InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
-        marginals = self._marginals()
-        return InstallationEstimate(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+        """The installation that the last solution has found; on uneven ground with that under the last keyframe."""
+        n = self._factors.installation.constants
+        found = InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
+        if n:
+            marginals = self._marginals()
+            found = InstallationEstimate(self._theta(), np.asarray(marginals.marginalCovariance(INSTALLATION)))
+        if self._on_ground is None:
+            return found
+        cov = self._factors.installation.prior().cov
+        cov[:n], cov[:, :n] = 0.0, 0.0
+        cov[:n, :n] = found.cov
+        return InstallationEstimate(np.concatenate([found.mean, self._ground()[-1]]), cov)
+
+    def _ground(self) -> FloatArray:
+        """Height, roll and pitch ``(n, 3)`` of the keyframes; ``(n, 0)``: the floor is flat."""
+        return np.zeros((len(self.frames), 0)) if self._on_ground is None else ground_of(self._values, self.frames)
+
+    def _whole_poses(self) -> FloatArray:
+        """Poses ``(n, 3)``, on uneven ground with height, roll and pitch ``(n, 6)``."""
+        return self.poses() if self._on_ground is None else np.column_stack([self.poses(), self._ground()])
 
     def cost(self) -> float:
         """How badly the solution fits, half a sum of squares, for the comparison of ways to read one recording.
@@ -133,7 +154,7 @@ class BatchSmoother:
             factors = [f for some in self.accepted.values() for s in some for f in s.factors]
             return total + sum(f.error(self._values) for f in factors)
         rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
-        for squares, rows in (s.squares(self.poses(), self._theta()) for s in (self._sightings, rejected)):
+        for squares, rows in (s.squares(self._whole_poses(), self._theta()) for s in (self._sightings, rejected)):
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
         seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
@@ -144,10 +165,11 @@ class BatchSmoother:
 
     def _cost_of_installation(self) -> float:
         """Of its prior, where that is not among the priors of the poses."""
-        if self._sightings is None or not len(self._factors.installation):
+        n = self._factors.installation.constants
+        if self._sightings is None or not n:
             return 0.0
         prior = self._factors.installation.prior()
-        return 0.5 * float(np.sum((whitening_of(prior.cov) @ (self._theta() - prior.mean)) ** 2))
+        return 0.5 * float(np.sum((whitening_of(prior.cov[:n, :n]) @ (self._theta() - prior.mean[:n])) ** 2))
 
     def result(self) -> Smoothed:
         """The last solution with its covariances.
@@ -176,18 +198,23 @@ class BatchSmoother:
             return solver
 
     def _result(self, marginals: gtsam.Marginals | gtsam.ISAM2) -> Smoothed:
-        covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames]
+        ground, spatial = None, None
+        if self._on_ground is not None:
+            ground, spatial = self._ground(), ground_covs(marginals, self.frames)
+        covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames] if spatial is None else ()
         return Smoothed(
             stamps_ns=self.stamps_ns(),
             poses=self.poses(),
-            covs=np.array(covs),
+            covs=np.array(covs) if spatial is None else spatial[:, :3, :3],
+            ground=ground,
+            ground_covs=spatial,
             landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
             factors=self._graph.size(),
             error=self._graph.error(self._values),
         )
 
     def _theta(self) -> FloatArray:
-        n = len(self._factors.installation)
+        n = self._factors.installation.constants
         return np.asarray(self._values.atVector(INSTALLATION)) if n else np.zeros(0)
 
     def _optimize(self) -> None:
@@ -205,7 +232,8 @@ class BatchSmoother:
             moved = np.abs(self.poses() - poses)
             moved[:, 2] = np.abs(se2.wrap_array(moved[:, 2]))
             still = bool((moved < _STILL).all())
-            if still and (np.abs(self._theta() - theta) < _STILL_SIGMAS * self._factors.installation.sigmas).all():
+            sigmas = self._factors.installation.sigmas[: len(theta)]
+            if still and (np.abs(self._theta() - theta) < _STILL_SIGMAS * sigmas).all():
                 break
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
@@ -214,14 +242,17 @@ class BatchSmoother:
             for factor in (f for held in self.accepted.values() for s in held for f in s.factors):
                 graph.add(factor)
             return graph
-        for factor in self._sightings.factors(self.poses(), self._theta()):
+        for factor in self._sightings.factors(self._whole_poses(), self._theta()):
             graph.add(factor)
         return graph
 
     def factors_of_motion(self) -> Iterator[gtsam.NonlinearFactor]:
         """Priors of poses, and motions linear about the solution."""
         yield from self._priors()
-        yield from self._motions.factors(self.poses())
+        if self._motions is not None:
+            yield from self._motions.factors(self.poses())
+        if self._on_ground is not None:
+            yield from self._on_ground.factors(self.poses(), self._ground(), self._theta())
 
     def _of_motion(self) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
@@ -231,10 +262,11 @@ class BatchSmoother:
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
         """Of the poses, and of an installation that no sightings of a known map bring in."""
-        installation = self._factors.installation
-        if len(installation) and self._sightings is None:
-            prior = installation.prior()
-            yield gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))
+        n = self._factors.installation.constants
+        if n and self._sightings is None:
+            prior = self._factors.installation.prior()
+            noise = gtsam.noiseModel.Gaussian.Covariance(prior.cov[:n, :n])
+            yield gtsam.PriorFactorVector(INSTALLATION, prior.mean[:n], noise)
         for frame in self.frames:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)

@@ -12,8 +12,9 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, motion_factor, pose_key, sighting_factors
+from fgloc.graph.ground import of_ground
 from fgloc.graph.installation import Installation
-from fgloc.graph.linearized import Stacked
+from fgloc.graph.linearized import Linearized, Stacked
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.graph.noise_models import whitening_of
 from fgloc.graph.observation import Observations
@@ -27,7 +28,7 @@ class BatchMotions:
 
     def __init__(self, frames: Sequence[Keyframe], installation: Installation) -> None:
         """Prepare the motions that end at these keyframes."""
-        self._n = len(installation)
+        self._n = installation.constants
         self._plain: list[gtsam.NonlinearFactor] = []
         self._at: list[int] = []  # rows of the keyframes that the installed ones end at
         self._keys: list[tuple[int, int]] = []
@@ -95,7 +96,10 @@ class BatchSightings:
                 self._chunks.append(_Images(held, factors))
 
     def factors(self, poses: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
-        """All factors, linear about poses ``(n, 3)`` of the keyframes and an installation ``(p,)``."""
+        """All factors, linear about poses ``(n, 3)`` of the keyframes and an installation ``(p,)``.
+
+        On uneven ground poses are ``(n, 6)``, with height, roll and pitch.
+        """
         rest = np.zeros((len(theta) + 1, len(theta) + 1))  # information of the installation, and its last column
         for chunk in self._chunks:
             yield from chunk.factors(poses, theta, rest)
@@ -112,11 +116,10 @@ class BatchSightings:
 
     def _of_installation(self, theta: FloatArray, rest: FloatArray) -> gtsam.NonlinearFactor:
         """Its prior, and all that the sightings tell of it alone."""
-        prior = self._installation.prior()
-        W = whitening_of(prior.cov)
-        both = np.column_stack([W, W @ (theta - prior.mean)])
+        prior, n = self._installation.prior(), len(theta)
+        W = whitening_of(prior.cov[:n, :n])
+        both = np.column_stack([W, W @ (theta - prior.mean[:n])])
         total = both.T @ both + rest
-        n = len(theta)
         root = _root(total[:n, :n])
         residual = np.linalg.solve(root.T, total[:n, n])
         A = np.vstack([root, np.zeros(n)])  # the last row is what no installation can explain
@@ -135,6 +138,7 @@ class _Images:
         self._row = np.array([i for i, _, _ in held], dtype=np.int64)
         self._k = np.array([k for _, k, _ in held], dtype=np.int64)
         self._sightings = [s for _, _, s in held]
+        self._landmarks, self._installation = factors.landmarks, factors.installation
         self._observed = Observations([s.measurement for s in self._sightings], factors.landmarks, factors.installation)
         stamps = np.array([s.measurement.stamp_ns for s in self._sightings], dtype=np.int64)
         order = np.lexsort((stamps, self._row))
@@ -166,9 +170,10 @@ class _Images:
     def _of_poses(
         self, first: IntArray, white: FloatArray, own: FloatArray, theta: FloatArray, rest: FloatArray
     ) -> Iterator[gtsam.NonlinearFactor]:
-        """Factors of images, of which these are the first sightings, from white rows ``(g, d, 3 + n + 1)``."""
-        Q, R = np.linalg.qr(white[:, :, :3])
-        others = white[:, :, 3:]
+        """Factors of images, of which these are the first sightings, from white rows ``(g, d, p + n + 1)``."""
+        d = own.shape[1]
+        Q, R = np.linalg.qr(white[:, :, :d])
+        others = white[:, :, d:]
         top = np.swapaxes(Q, 1, 2) @ others
         flat, flat_top = others.reshape(-1, others.shape[2]), top.reshape(-1, others.shape[2])
         rest += flat.T @ flat - flat_top.T @ flat_top
@@ -176,8 +181,11 @@ class _Images:
         keys = [pose_key(k) for k in self._k[first].tolist()]
         for key, pose, by_pose, by_rest in zip(keys, own[first], R, top, strict=True):
             values = gtsam.Values()
-            values.insert(key, gtsam.Pose2(*pose))
-            blocks: list[Any] = [key, by_pose]
+            values.insert(key, gtsam.Pose2(*pose[:3]))
+            blocks: list[Any] = [key, by_pose[:, :3]]
+            if d > 3:
+                values.insert(of_ground(key), pose[3:])
+                blocks += [of_ground(key), by_pose[:, 3:]]
             if len(theta):
                 values.insert(INSTALLATION, theta)
                 blocks += [INSTALLATION, by_rest[:, :-1]]
@@ -186,25 +194,37 @@ class _Images:
 
     def _one_by_one(self, own: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
         """Of recordings with sightings of several kinds."""
-        lines = self._observed.linearize(own, theta)
+        ground, own, constants = own[:, 3:], own[:, :3], len(theta)
         bounds = [0, *(np.flatnonzero(np.diff(self._row)) + 1).tolist(), len(self._row)]
+        lines = [] if ground.shape[1] else self._observed.linearize(own, theta)
         for start, end in pairwise(bounds):
-            ahead = [i for i in range(start, end) if not lines[i].behind]
+            sightings, there, some = self._sightings[start:end], theta, lines[start:end]
+            if ground.shape[1]:
+                there = np.concatenate([theta, ground[start]])
+                some = self._of_keyframe(sightings, own[start], there)
+            ahead = [i for i, one in enumerate(some) if not one.behind]
             if ahead:
-                sightings, some = [self._sightings[i] for i in ahead], [lines[i] for i in ahead]
-                yield from sighting_factors(int(self._k[start]), sightings, some, own[start], theta)
+                kept = [sightings[i] for i in ahead], [some[i] for i in ahead]
+                yield from sighting_factors(int(self._k[start]), *kept, own[start], there, constants)
+
+    def _of_keyframe(
+        self, sightings: Sequence[LandmarkFactor], pose: FloatArray, theta: FloatArray
+    ) -> list[Linearized]:
+        measurements = [s.measurement for s in sightings]
+        return Observations(measurements, self._landmarks, self._installation).linearize(pose, theta)
 
 
 def _rows(chosen: IntArray, stack: Stacked, n: int) -> FloatArray:
-    """Rows ``(g, m d, 3 + n + 1)`` of images ``(g, m)`` with equally many sightings: Jacobians, residual."""
+    """Rows ``(g, m d, p + n + 1)``, p of the pose, of images ``(g, m)`` with as many sightings: Jacobians, residual."""
     g, m = chosen.shape
     d = stack.residual.shape[1]
-    A = np.zeros((g, m, d, 3 + n + 2))  # with a place for what is no state
-    A[..., :3] = stack.J[chosen]
-    columns = np.where(stack.columns[chosen] >= 0, 3 + stack.columns[chosen], 3 + n + 1)
+    p = stack.J.shape[2]
+    A = np.zeros((g, m, d, p + n + 2))  # with a place for what is no state
+    A[..., :p] = stack.J[chosen]
+    columns = np.where(stack.columns[chosen] >= 0, p + stack.columns[chosen], p + n + 1)
     np.put_along_axis(A, columns[:, :, None].repeat(d, axis=2), stack.H[chosen], axis=3)
-    A[..., 3 + n] = stack.residual[chosen]
-    return A[..., :-1].reshape(g, m * d, 3 + n + 1)
+    A[..., p + n] = stack.residual[chosen]
+    return A[..., :-1].reshape(g, m * d, p + n + 1)
 
 
 def _root(information: FloatArray) -> FloatArray:

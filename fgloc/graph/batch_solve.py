@@ -18,6 +18,7 @@ from fgloc.graph.factors import (
     landmark_key,
     pose_key,
 )
+from fgloc.graph.ground import ground_key
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.types import (
     FloatArray,
@@ -61,8 +62,10 @@ def initial_values(
     values = gtsam.Values()
     for frame in frames:
         values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
-    if len(factors.installation):
-        values.insert(INSTALLATION, factors.estimated.mean)
+        if frame.ground is not None:
+            values.insert(ground_key(frame.k), frame.ground)
+    if factors.installation.constants:
+        values.insert(INSTALLATION, factors.estimated.mean[: factors.installation.constants])
     if factors.known:
         return values
     seen: dict[int, list[FloatArray]] = {}

@@ -26,11 +26,18 @@ _TILT_PER_SQRT_RAD = 0.02  # rad/√rad: ... and what a turn in place does to it
 _SLOPE_RAD = 0.15  # rad: ... about level, by as much as `fgloc.graph.installation` allows for at the start
 _SUDDEN = 3.0  # Cauchy constant of the gravity's direction, in units of its sigma: slips and bumps are accelerations
 _EPS = 1e-6
+_TILTED = {"gyro.roll_rad": 0, "gyro.pitch_rad": 1}  # rows of roll and pitch as the accelerometer has them
+_LEVELLED = {"gyro.level_x_rad": 0, "gyro.level_y_rad": 1}
 
 
 def ground_key(k: int) -> int:
     """Key of height, roll and pitch of keyframe k: one vector."""
     return int(gtsam.symbol("g", k))
+
+
+def of_ground(pose: int) -> int:
+    """Key of height, roll and pitch of the keyframe whose pose has this key."""
+    return ground_key(gtsam.Symbol(pose).index())
 
 
 def rotations(angles: FloatArray) -> FloatArray:
@@ -115,7 +122,7 @@ def ground_step(
             by_theta[:, i] = derivative
             motion = se2.compose(motion, se2.exp(derivative * (theta[i] - assumed)))
     inertial = motions[0].inertial
-    turn, by_bias = _turn_of(inertial, theta, installation)
+    turn, by_bias = _turn_of(inertial, float(motion[2]), theta, installation)
     rows = 8 + len(motions)
     angles, moves, turns = np.tile(ground[1:], (rows, 1)), np.tile(motion, (rows, 1)), np.tile(turn, (rows, 1))
     angles[1:3] += _EPS * np.eye(2)
@@ -149,18 +156,20 @@ def ground_step(
 
 
 def _turn_of(
-    inertial: InertialReading | None, theta: FloatArray, installation: Installation
+    inertial: InertialReading | None, yaw: float, theta: FloatArray, installation: Installation
 ) -> tuple[FloatArray, FloatArray]:
-    """Turn ``(2,)`` about x and y, rid of its bias, and its derivative ``(2, constants)``."""
+    """Turn ``(2,)`` about x and y, rid of its bias and of the yaw in it, and its derivative ``(2, constants)``."""
     by_bias = np.zeros((2, installation.constants))
     if inertial is None:
         return np.zeros(2), by_bias
     turn = inertial.turn.copy()
-    for row, name in enumerate(("gyro.bias_x", "gyro.bias_y")):
+    dt = inertial.seconds
+    columns = {"gyro.bias_x": (0, -dt), "gyro.bias_y": (1, -dt), "gyro.roll_rad": (1, -yaw), "gyro.pitch_rad": (0, yaw)}
+    for name, (row, gain) in columns.items():
         if name in installation.index:
             i = installation.index[name]
-            turn[row] -= theta[i] * inertial.seconds
-            by_bias[row, i] = -inertial.seconds
+            turn[row] += gain * theta[i]
+            by_bias[row, i] = gain
     return turn, by_bias
 
 
@@ -220,7 +229,7 @@ def gravity(
     measured = np.array([math.atan2(y, z), math.atan2(-x, math.hypot(y, z))])
     D = np.zeros((2, installation.constants))
     residual = ground[1:] - measured
-    for row, name in enumerate(("gyro.roll_rad", "gyro.pitch_rad")):
+    for name, row in {**_TILTED, **_LEVELLED}.items():
         if name in installation.index:
             D[row, installation.index[name]] = 1.0
             residual[row] += theta[installation.index[name]]

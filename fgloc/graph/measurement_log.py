@@ -58,7 +58,6 @@ class Keyframe:
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
     ground: FloatArray | None = None  # (3,) height, roll and pitch, as of the belief; on uneven ground
-    ground_cov: FloatArray | None = None  # (6, 6) of x, y, yaw (right perturbation), height, roll and pitch; likewise
 
     @property
     def at(self) -> FloatArray:

@@ -55,12 +55,13 @@ class Observations:
         """Squared residual ``(m,)`` of each sighting by its own noise, infinite of one behind the camera, and its rows.
 
         Args:
-            poses: ``(m, 3)`` of each.
+            poses: ``(m, 3)`` of each; on uneven ground ``(m, 6)``, with height, roll and pitch.
             theta: ``(n,)`` installation.
         """
         found, rows = np.zeros(self._count), np.zeros(self._count, dtype=np.int64)
         for members, batch in self.batches:
-            stack = batch.evaluate(poses[members], theta, by_installation=False)
+            own = poses[members] if isinstance(batch, CornerBatch) else poses[members, :3]
+            stack = batch.evaluate(own, theta, by_installation=False)
             found[members] = np.where(stack.behind, np.inf, (stack.residual**2).sum(axis=1))
             rows[members] = batch.rows
         return found, rows

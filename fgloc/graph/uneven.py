@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from fgloc.graph.joint import fuse_installed, joint_cov
 from fgloc.graph.joint import predict as predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import whitening_of
-from fgloc.types import FloatArray, MotionMeasurement
+from fgloc.types import FloatArray, Ground, MotionMeasurement
 
 _N = len(GROUND)
 _LINEAR_RAD = 0.02  # sigma of roll and pitch up to which a sighting is linear in them
@@ -69,6 +70,13 @@ def ground_factors(
     k: int, motions: Sequence[MotionMeasurement], step: GroundStep, theta: FloatArray, installation: Installation
 ) -> list[gtsam.NonlinearFactor]:
     """How height, roll and pitch go on from keyframe k - 1 to k, and what gravity tells of them at k."""
+    made = [step_factor(k, step, theta, installation)]
+    seen = gravity(motions, step.after, theta, installation)
+    return made if seen is None else [*made, gravity_factor(k, seen, step.after, theta, installation)]
+
+
+def step_factor(k: int, step: GroundStep, theta: FloatArray, installation: Installation) -> gtsam.NonlinearFactor:
+    """How height, roll and pitch go on from keyframe k - 1 to k."""
     c = installation.constants
     values = gtsam.Values()
     values.insert(ground_key(k - 1), step.before)
@@ -78,9 +86,7 @@ def ground_factors(
     if c:
         values.insert(INSTALLATION, theta[:c])
         blocks[INSTALLATION] = -W @ step.D
-    made = [linear_factor(blocks, np.zeros(_N), values)]
-    seen = gravity(motions, step.after, theta, installation)
-    return made if seen is None else [*made, gravity_factor(k, seen, step.after, theta, installation)]
+    return linear_factor(blocks, np.zeros(_N), values)
 
 
 def gravity_factor(
@@ -130,6 +136,35 @@ def levelled(
     found = with_gravity(nowhere, direct, installation).installation
     assert found is not None
     return found
+
+
+def spatial(belief: PoseWithCovariance, installation: Installation, added: FloatArray) -> Ground | None:
+    """Height, roll and pitch of a belief; None: the floor is flat.
+
+    Args:
+        belief: with its installation, which ends with them.
+        installation: its parameters.
+        added: ``(3, 3)`` to the covariance of the pose, in the body frame.
+    """
+    known = belief.installation
+    if not installation.ground or known is None:
+        return None
+    cov = np.zeros((6, 6))
+    cov[:3, :3], cov[3:, 3:] = belief.cov + added, known.cov[-_N:, -_N:]
+    if belief.cross is not None:
+        cov[:3, 3:], cov[3:, :3] = belief.cross[:, -_N:], belief.cross[:, -_N:].T
+    return ground_at(known.mean[-_N:], cov, float(belief.pose[2]))
+
+
+def ground_at(ground: FloatArray, cov: FloatArray, yaw: float) -> Ground:
+    """Height, roll and pitch ``(3,)``, with the covariance ``(6, 6)`` of x, y, yaw (right perturbation) and those."""
+    T = np.zeros((6, 6))
+    c, s = math.cos(yaw), math.sin(yaw)
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[5, 2] = 1.0
+    T[2:5, 3:] = np.eye(_N)
+    z, roll, pitch = ground.tolist()
+    return Ground(z, roll, pitch, T @ cov @ T.T)
 
 
 def is_level_known(known: InstallationEstimate, installation: Installation) -> bool:

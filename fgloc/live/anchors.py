@@ -14,7 +14,7 @@ from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor, RateSensor
+from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, RateSensor
 from fgloc.types import Estimate, FloatArray, IntArray, Mode, Step
 
 
@@ -26,6 +26,7 @@ class MotionParts:
     installation: Installation  # the parameters that motions may depend on
     joint: ErrorCorrelation | None
     model: Any  # of the learned motion
+    attitude: AttitudeSensor | None = None  # on uneven ground
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +74,9 @@ class Anchors:
         self._run = parts
         self._rows = _rows_of_motion(installation)
         sigmas = {installation.names[i]: float(installation.sigmas[i]) for i in self._rows}
+        sources = parts.localizer.motion.sources
         model = None if parts.learned is None else parts.learned.model
-        self.parts = MotionParts(parts.config, Installation(sigmas), parts.localizer.motion.sources.rules.joint, model)
+        self.parts = MotionParts(parts.config, Installation(sigmas), sources.rules.joint, model, sources.attitude)
 
     def make(self, step: Step, estimate: Estimate) -> Anchor:
         """The anchor of the estimate that the run's last step led to."""
@@ -105,7 +107,8 @@ class Anchors:
 
     def _of_motion(self, belief: PoseWithCovariance) -> PoseWithCovariance:
         cross = None if belief.cross is None else belief.cross[:, self._rows]
-        return PoseWithCovariance(belief.pose, belief.cov, cross)
+        known = None if belief.installation is None else self._belief_of_motion(belief.installation)
+        return PoseWithCovariance(belief.pose, belief.cov, cross, known)
 
     def _belief_of_motion(self, known: InstallationEstimate) -> InstallationEstimate:
         return InstallationEstimate(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])

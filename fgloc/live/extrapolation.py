@@ -16,14 +16,14 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.graph.uneven import predict
+from fgloc.graph.uneven import predict, spatial
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors import registry
-from fgloc.sensors.equipment import ErrorCorrelation, MotionSensors, Odometer
+from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionSensors, Odometer
 from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
@@ -43,6 +43,7 @@ class _Means:
     joint: ErrorCorrelation | None
     model: Any
     factors: LandmarkFactors  # hold what is known of the installation
+    attitude: AttitudeSensor | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +83,7 @@ class Extrapolator:
         """The parts of the run have been built, or built again: the next anchor is the first of them."""
         model = copy.deepcopy(parts.model)  # it writes into buffers of its own
         with self._lock:
-            self._means = _Means(parts.joint, model, LandmarkFactors(None, parts.installation))
+            self._means = _Means(parts.joint, model, LandmarkFactors(None, parts.installation), parts.attitude)
             self._anchors.clear()
 
     def add(self, event: MotionEvent) -> None:
@@ -135,7 +136,8 @@ class Extrapolator:
         if mode is Mode.OK and since_fix_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
-        return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns)
+        ground = spatial(belief, held.means.factors.installation, anchor.added_cov)
+        return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns, ground)
 
     def _step(self, anchor: Anchor, end_ns: int) -> Step:
         """All motion events from a while before the anchor to the first one after the end."""
@@ -168,6 +170,7 @@ class Extrapolator:
             None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),
             means.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
+            means.attitude,
         )
         sources = MotionSources(self._config, sensors, means.factors)
         belief, start_ns = anchor.belief, step.start_ns
@@ -177,7 +180,8 @@ class Extrapolator:
             readings = sources.read(piece, anchor.since_fix_s + (start_ns - step.start_ns) * 1e-9)
             budget = _without_slip(anchor.budget, readings, sources)
             motions = budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
-            belief = predict(belief, anchor.known, means.factors.installation, motions)
+            known = anchor.known if belief.installation is None else belief.installation
+            belief = predict(belief, known, means.factors.installation, motions)
             start_ns = end_ns
         return belief
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fgloc.types import FloatArray, Mode
+from fgloc.types import FloatArray, Ground, Mode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,6 +17,7 @@ class LivePose:
     cov: FloatArray  # (3, 3) in the map frame
     mode: Mode
     keyframe_ns: int  # stamp of the keyframe that it was carried from
+    ground: Ground | None = None  # height, roll and pitch; None: the floor is flat
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,13 +16,16 @@ import numpy as np
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
-from fgloc.frames import quaternion_yaw
+from fgloc.frames import quaternion_yaw, rpy_matrix, rpy_quaternion
 from fgloc.types import Decision, Trajectory
 
 _NS = 1_000_000_000
 _TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
 _COV_COLUMNS = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
 _UPPER = np.triu_indices(3)
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_SPATIAL_COV_COLUMNS: tuple[str, ...] = tuple(f"{a} {b}" for i, a in enumerate(_AXES) for b in _AXES[i:])
+_SPATIAL_UPPER = np.triu_indices(6)
 _STEP_COLUMNS = (
     "step",
     "stamp",
@@ -39,7 +42,9 @@ _STEP_COLUMNS = (
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a planar trajectory as TUM: ``t x y z qx qy qz qw``, t in seconds with all nine decimals.
+    """Write a trajectory as TUM: ``t x y z qx qy qz qw``, t in seconds with all nine decimals.
+
+    On a flat floor z, roll and pitch are 0.
 
     Raises:
         TrajectoryError: a pose is not finite.
@@ -48,14 +53,19 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     _check_finite(path, trajectory)
     with atomic_file(path) as file:
         file.write(_TUM_HEADER)
-        for stamp, (x, y, yaw) in zip(trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True):
+        for i, (stamp, (x, y, yaw)) in enumerate(
+            zip(trajectory.stamps_ns.tolist(), trajectory.poses.tolist(), strict=True)
+        ):
             qz, qw = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
             numbers = (x, y, 0.0, 0.0, 0.0, qz, qw)
+            if trajectory.ground is not None:
+                z, roll, pitch = trajectory.ground[i].tolist()
+                numbers = (x, y, z, *rpy_quaternion(roll, pitch, yaw))
             file.write(f"{_seconds(stamp)} " + " ".join(f"{number:.9f}" for number in numbers) + "\n")
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write a planar trajectory as KITTI's odometry benchmark has it: the 12 numbers of ``[R | t]``, row by row.
+    """Write a trajectory as KITTI's odometry benchmark has it: the 12 numbers of ``[R | t]``, row by row.
 
     The axes are ours (x forward, z up); KITTI's own files have a camera's. There are no stamps: one line a pose.
 
@@ -65,9 +75,12 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """
     _check_finite(path, trajectory)
     with atomic_file(path) as file:
-        for x, y, yaw in trajectory.poses.tolist():
+        for i, (x, y, yaw) in enumerate(trajectory.poses.tolist()):
             c, s = math.cos(yaw), math.sin(yaw)
-            numbers = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, 0.0)
+            numbers: tuple[float, ...] = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, 0.0)
+            if trajectory.ground is not None:
+                z, roll, pitch = trajectory.ground[i].tolist()
+                numbers = tuple(np.column_stack([rpy_matrix(roll, pitch, yaw), (x, y, z)]).ravel().tolist())
             file.write(" ".join(f"{number:.9e}" for number in numbers) + "\n")
 
 
@@ -100,17 +113,23 @@ def read_tum(path: Path) -> Trajectory:
 def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
     """Write the upper triangle of each pose's covariance in the map frame: stamp, xx xy xθ yy yθ θθ [m, rad].
 
+    On uneven ground it is that of x, y, z, roll, pitch and yaw.
+
     Raises:
         TrajectoryError: the trajectory has no covariances.
         OutputError: the file cannot be written.
     """
     if trajectory.covs is None:
         raise TrajectoryError(f"{path}: the trajectory has no covariances to write")
+    covs, upper = trajectory.covs, _UPPER
+    columns: tuple[str, ...] = _COV_COLUMNS
+    if trajectory.ground_covs is not None:
+        covs, columns, upper = trajectory.ground_covs, _SPATIAL_COV_COLUMNS, _SPATIAL_UPPER
     with atomic_file(path) as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("stamp", *_COV_COLUMNS))
-        for stamp, cov in zip(trajectory.stamps_ns.tolist(), trajectory.covs, strict=True):
-            rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[_UPPER])))
+        rows.writerow(("stamp", *columns))
+        for stamp, cov in zip(trajectory.stamps_ns.tolist(), covs, strict=True):
+            rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[upper])))
 
 
 def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
@@ -128,7 +147,10 @@ def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
 
 
 def _check_finite(path: Path, trajectory: Trajectory) -> None:
-    bad = np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=1))
+    finite = np.isfinite(trajectory.poses).all(axis=1)
+    if trajectory.ground is not None:
+        finite &= np.isfinite(trajectory.ground).all(axis=1)
+    bad = np.flatnonzero(~finite)
     if bad.size:
         pose = trajectory.poses[bad[0]].tolist()
         raise TrajectoryError(f"{path}: pose {bad[0]} is {pose}, expected finite x, y, yaw; nothing was written")

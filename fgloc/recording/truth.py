@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import TruthConfig
-from fgloc.frames import quaternion_yaw
+from fgloc.frames import quaternion_matrix, quaternion_yaw, rpy_matrix
 from fgloc.recording.reader import Recording
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
@@ -20,6 +21,14 @@ def base_pose(event: TruthEvent, config: TruthConfig) -> FloatArray:
     """Planar pose ``(3,)`` of the base, from that of the body which the system tracks."""
     T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
     return se2.compose((event.position[0], event.position[1], quaternion_yaw(event.orientation)), T_body_base)
+
+
+def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:
+    """Height, roll and pitch ``(3,)`` of the base, from the pose of the body which the system tracks."""
+    R = quaternion_matrix(event.orientation) @ rpy_matrix(0.0, 0.0, -config.yaw_offset_rad)
+    height = float(event.position[2] - R[2, :2] @ np.asarray(config.offset_m))
+    roll, pitch = math.atan2(R[2, 1], R[2, 2]), -math.asin(min(max(R[2, 0], -1.0), 1.0))
+    return np.array([height, roll, pitch])
 
 
 def true_slips(recording: Recording) -> IntArray:
@@ -62,12 +71,14 @@ class TruthTrack:
             self._set_back_ns = stamp
         self._stamps.append(stamp)
         self._poses.extend(base_pose(event, self._config).tolist())
+        self._poses.extend(base_ground(event, self._config).tolist())
 
     def trajectory(self) -> Trajectory | None:
         """Poses with increasing stamps, the last one of each stamp; None if there are fewer than two."""
         stamps, poses = self._arrays()
         stamps, last = np.unique(stamps[::-1], return_index=True)
-        return None if len(stamps) < 2 else Trajectory(stamps, poses[::-1][last])
+        whole = poses[::-1][last]
+        return None if len(stamps) < 2 else Trajectory(stamps, whole[:, :3].copy(), ground=whole[:, 3:].copy())
 
     def _forget_after(self, stamp_ns: int) -> None:
         stamps, poses = self._arrays()
@@ -75,4 +86,4 @@ class TruthTrack:
         self._stamps, self._poses = array("q", stamps[kept].tolist()), array("d", poses[kept].ravel().tolist())
 
     def _arrays(self) -> tuple[IntArray, FloatArray]:
-        return np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 3)
+        return np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 6)

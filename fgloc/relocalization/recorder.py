@@ -11,13 +11,14 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.measurement_log import Keyframe
+from fgloc.graph.uneven import spatial
 from fgloc.relocalization.tracking_state import Tracking
 from fgloc.robust.decision_log import mode_decisions, segment_decision
 from fgloc.robust.motion_judge import MotionJudge
 from fgloc.robust.sensor_measurements import kind_of
 from fgloc.robust.sighting_judge import SightingJudge
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.types import Decision, Estimate, Mode, Step
+from fgloc.types import Decision, Estimate, FloatArray, Mode, Step
 
 
 class Recorder:
@@ -42,6 +43,7 @@ class Recorder:
         self._clock_sigma_s = config.recording.clock_sigma_s
         self._dead_reckoning_after_s = config.estimator.dead_reckoning_after_s
         self._tracking, self._motion, self._sightings, self._compensation = tracking, motion, sightings, compensation
+        self._installation = tracking.installation
         self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
 
     def count(self, frame: Keyframe) -> None:
@@ -68,7 +70,8 @@ class Recorder:
         modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)
         before, self._clock_jumps = [*self._clock_jumps, *self._motion.take_signs()], []
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
-        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes))
+        ground = spatial(belief, self._installation, frame.added_cov)
+        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes), ground)
 
     def unconfirmed(self, k: int, step: Step) -> Estimate | None:
         """The pose before the sightings are enough to begin the graph with; None: they hardly tell it."""
@@ -94,4 +97,11 @@ class Recorder:
         if mode is not Mode.LOST:
             return [replace(e, mode=mode) for e in estimates]
         covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
-        return [replace(e, mode=mode, cov=covs.get(e.stamp_ns, e.cov)) for e in estimates]
+        return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
+
+
+def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:
+    if cov is None:
+        return estimate
+    ground = estimate.ground
+    return replace(estimate, cov=cov, ground=None if ground is None else ground.with_planar(cov))

@@ -52,7 +52,7 @@ class Tracking:
         """Take the parts; ``keep_all``: the steps before the first pose are all kept for the replay."""
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
-        self._known = factors.known
+        self._known, self.installation = factors.known, factors.installation
         self._search = GlobalSearch(config, landmark_map, factors, keep_all)
         self.lost = False
         self.initial_pose_conflict: FloatArray | None = None

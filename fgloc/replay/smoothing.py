@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -9,11 +10,13 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly
-from fgloc.graph.batch import BatchSmoother
+from fgloc.graph.batch import BatchSmoother, Smoothed
 from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.uneven import ground_at
 from fgloc.types import (
     Estimate,
     FloatArray,
+    Ground,
     IntArray,
     LandmarkMap,
     MotionMeasurement,
@@ -51,14 +54,27 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     notes = []
     result = solver.result()
     estimates = [
-        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode)
-        for frame, pose, cov in zip(solver.frames, result.poses, result.covs, strict=True)
+        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode, (), ground)
+        for frame, pose, cov, ground in zip(
+            solver.frames, result.poses, result.covs, _ground(solver, result), strict=True
+        )
     ]
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
     return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
+
+
+def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:
+    """Of each keyframe; None: the floor is flat."""
+    if result.ground is None or result.ground_covs is None:
+        yield from (None for _ in solver.frames)
+        return
+    for frame, pose, ground, cov in zip(solver.frames, result.poses, result.ground, result.ground_covs, strict=True):
+        whole = cov.copy()
+        whole[:3, :3] += frame.added_cov
+        yield ground_at(ground, whole, float(pose[2]))
 
 
 def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

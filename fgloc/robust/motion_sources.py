@@ -36,7 +36,7 @@ class MotionSources:
         self._config = config
         self.factors = LandmarkFactors(None) if factors is None else factors
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
-        self.gyro, self._attitude = sensors.gyro, sensors.attitude
+        self.gyro, self.attitude = sensors.gyro, sensors.attitude
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
         self._untold_s = 0.0  # how long fixes have told the yaw along the way only, at most the lag
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
@@ -86,7 +86,7 @@ class MotionSources:
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
         learned = self._with_drift(self._measure_learned(step, velocity), step)
-        inertial = None if self._attitude is None else self._attitude.measure(step, self._wheels.twist)
+        inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
         readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0

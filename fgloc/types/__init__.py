@@ -34,13 +34,25 @@ from fgloc.types.measurements import (
     PointMeasurement,
     PoseMeasurement,
 )
-from fgloc.types.results import Decision, Estimate, InstallationFound, Mode, RunResult, Setting, TopicTimes, Trajectory
+from fgloc.types.results import (
+    PLANAR,
+    Decision,
+    Estimate,
+    Ground,
+    InstallationFound,
+    Mode,
+    RunResult,
+    Setting,
+    TopicTimes,
+    Trajectory,
+)
 from fgloc.types.steps import Step, by_class
 
 MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
 
 __all__ = [
     "MAX_LANDMARK_ID",
+    "PLANAR",
     "Camera",
     "CameraInfoEvent",
     "ControlEvent",
@@ -49,6 +61,7 @@ __all__ = [
     "Event",
     "FloatArray",
     "FrameMeasurement",
+    "Ground",
     "InertialEvent",
     "InertialReading",
     "InstallationFound",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,6 +49,30 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What makes a planar pose one in space, where the ground is uneven.
+
+    The base's rotation is ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    """
+
+    z: float  # m
+    roll: float  # rad
+    pitch: float  # rad, positive where the nose is down
+    cov: FloatArray  # (6, 6) of x, y, z, roll, pitch, yaw in the map frame, as in ROS
+
+    def with_planar(self, cov: FloatArray) -> Ground:
+        """With another covariance ``(3, 3)`` of x, y and yaw, which are then not correlated with the others."""
+        whole = self.cov.copy()
+        whole[PLANAR, :] = whole[:, PLANAR] = 0.0
+        whole[np.ix_(PLANAR, PLANAR)] = cov
+        return replace(self, cov=whole)
+
+
+PLANAR = (0, 1, 5)
+"""Rows of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """``T_map_base`` at one keyframe. ``cov`` is in the map frame."""
 
@@ -57,6 +81,7 @@ class Estimate:
     cov: FloatArray  # (3, 3)
     mode: Mode = Mode.OK
     decisions: tuple[Decision, ...] = ()
+    ground: Ground | None = None  # None: the floor is flat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +91,8 @@ class Trajectory:
     stamps_ns: IntArray  # (n,) strictly increasing
     poses: FloatArray  # (n, 3)
     covs: FloatArray | None = None  # (n, 3, 3)
+    ground: FloatArray | None = None  # (n, 3) height, roll and pitch; None: the floor is flat, or not known
+    ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw in the map frame
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -16,7 +16,13 @@ class GyroConfig(Section):
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
     bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
     tilt_sigma_rad: float = Field(
-        0.011, ge=1e-6, le=0.5, description="rad: how far mounting and bias tilt the accelerometer; on uneven ground"
+        0.0087, ge=0, le=0.5, description="rad: roll and pitch that the mounting is off by; estimated on uneven ground"
+    )
+    level_sigma_rad: float = Field(
+        0.005,
+        ge=0,
+        le=0.5,
+        description="rad: tilt that the accelerometer's bias makes, in roll and pitch; estimated on uneven ground",
     )
     acceleration_sigma: float = Field(
         0.15, ge=1e-3, le=100, description="m/s²: of the specific force of a step, beside gravity; on uneven ground"

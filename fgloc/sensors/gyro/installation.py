@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 BIASES = ("gyro.bias_x", "gyro.bias_y")  # rad/s, in the axes of the base
-TILTS = ("gyro.roll_rad", "gyro.pitch_rad")  # by how much the accelerometer sees the base tilted where it is level
+TILTS = ("gyro.roll_rad", "gyro.pitch_rad")  # of the IMU, beside its mounting as it is given
+LEVELS = ("gyro.level_x_rad", "gyro.level_y_rad")  # tilt about x and y that the accelerometer's bias makes
 
 
 def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
@@ -25,7 +26,8 @@ def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter
     if config.estimator.ground == "flat" or MotionRole.RATE not in roles:
         return (scale,)
     biases = (Parameter(name, config.gyro.bias_sigma) for name in BIASES)
-    return (scale, *biases, *(Parameter(name, config.gyro.tilt_sigma_rad) for name in TILTS))
+    tilts = (Parameter(name, config.gyro.tilt_sigma_rad) for name in TILTS)
+    return (scale, *biases, *tilts, *(Parameter(name, config.gyro.level_sigma_rad) for name in LEVELS))
 
 
 def found(config: Config) -> tuple[FoundRow, ...]:
