@@ -11,7 +11,7 @@ from fgloc.graph.factors import installed_motion_factor, pose_key
 from fgloc.graph.ground import gravity, ground_key
 from fgloc.graph.installation import GROUND, Installation
 from fgloc.graph.measurement_log import Keyframe
-from fgloc.graph.uneven import gravity_factor, ground_prior, step_factor, step_of
+from fgloc.graph.uneven import gravity_factor, ground_prior, step_factors, step_of
 from fgloc.types import FloatArray
 
 
@@ -56,7 +56,7 @@ class GroundMotions:
             step = step_of(frame.motions, before, installation)
             for motion in step.motions:
                 yield installed_motion_factor(frame.k, motion, poses[i - 1], installation)
-            yield step_factor(frame.k, step, before, installation)
+            yield from step_factors(frame.k, step, before, installation)
             seen = gravity(frame.motions, ground[i], before, installation)
             if seen is not None:
                 yield gravity_factor(frame.k, seen, ground[i], before, installation)

@@ -23,6 +23,9 @@ _PATH_PER_SQRT_M = 0.003  # m/√m: height of a path beside what the tilt of the
 _SINK_PER_SQRT_S = 1e-4  # m/√s: of a standing robot, so that no covariance is singular
 _TILT_PER_SQRT_M = 0.1  # rad/√m: without an IMU, how fast the slope of the floor changes ...
 _TILT_PER_SQRT_RAD = 0.02  # rad/√rad: ... and what a turn in place does to it
+_SMOOTH_PER_SQRT_M = 0.02  # rad/√m: the same of what an IMU shows to be a smooth stretch ...
+_SMOOTH_PER_SQRT_RAD = 0.01  # rad/√rad: ... or a turn in place
+_STILL_RAD = 2e-4  # of a robot that stands
 _SLOPE_RAD = 0.15  # rad: ... about level, by as much as `fgloc.graph.installation` allows for at the start
 _SUDDEN = 3.0  # Cauchy constant of the gravity's direction, in units of its sigma: slips and bumps are accelerations
 _EPS = 1e-6
@@ -88,6 +91,7 @@ class GroundStep:
         A: ``(3, 3)`` derivative by those before.
         D: ``(3, constants)`` derivative by the installation.
         cov: ``(3, 3)`` of what is added on the way.
+        turning: what the step tells of the installation alone; None: nothing measured its turn.
     """
 
     motions: tuple[MotionMeasurement, ...]
@@ -96,6 +100,22 @@ class GroundStep:
     A: FloatArray
     D: FloatArray
     cov: FloatArray
+    turning: Turning | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """A robot on smooth ground turns about its own z axis alone: what else is measured are bias and mounting.
+
+    Attributes:
+        turn: ``(2,)`` about x and y [rad], as measured, with the installation as it is known.
+        D: ``(2, constants)`` its derivative by the installation.
+        variance: of each, about 0.
+    """
+
+    turn: FloatArray
+    D: FloatArray
+    variance: float
 
 
 def ground_step(
@@ -122,7 +142,10 @@ def ground_step(
             by_theta[:, i] = derivative
             motion = se2.compose(motion, se2.exp(derivative * (theta[i] - assumed)))
     inertial = motions[0].inertial
-    turn, by_bias = _turn_of(inertial, float(motion[2]), theta, installation)
+    measured, by_bias = _turn_of(inertial, float(motion[2]), theta, installation)
+    smooth = _smooth(motion, measured)
+    share = 0.0 if inertial is None else smooth / (smooth + inertial.turn_variance)
+    turn = share * measured
     rows = 8 + len(motions)
     angles, moves, turns = np.tile(ground[1:], (rows, 1)), np.tile(motion, (rows, 1)), np.tile(turn, (rows, 1))
     angles[1:3] += _EPS * np.eye(2)
@@ -142,7 +165,7 @@ def ground_step(
         A[:, 1:] *= _kept(motion)
         ends[0, 1:] *= _kept(motion)
     else:
-        cov += by_turn @ by_turn.T * inertial.turn_variance
+        cov += by_turn @ by_turn.T * (share * inertial.turn_variance)
     projected = tuple(
         replace(
             m,
@@ -152,7 +175,16 @@ def ground_step(
         )
         for i, m in enumerate(motions)
     )
-    return GroundStep(projected, ground, ends[0], A, by_motion @ by_theta + by_turn @ by_bias, cov)
+    turning = None if inertial is None else Turning(measured, by_bias, smooth + inertial.turn_variance)
+    D = by_motion @ by_theta + share * by_turn @ by_bias
+    return GroundStep(projected, ground, ends[0], A, D, cov, turning)
+
+
+def _smooth(motion: FloatArray, turn: FloatArray) -> float:
+    """Variance of a turn about x or y by the ground; where a large one is measured, it is not smooth."""
+    way, turned = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
+    usual = _SMOOTH_PER_SQRT_M**2 * way + _SMOOTH_PER_SQRT_RAD**2 * turned + _STILL_RAD**2
+    return usual + float(turn @ turn)
 
 
 def _turn_of(

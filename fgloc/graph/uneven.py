@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -41,7 +41,13 @@ def predict(
     cross = planar.cross if planar.cross is not None else np.zeros((3, n))
     mean = np.concatenate([known.mean[:c], step.after])
     after = PoseWithCovariance(planar.pose, planar.cov, cross @ F.T, InstallationEstimate(mean, 0.5 * (cov + cov.T)))
-    return with_gravity(after, gravity(motions, step.after, mean, installation), installation)
+    if step.turning is not None:
+        H = np.zeros((2, 3 + n))
+        H[:, 3 : 3 + c] = step.turning.D
+        after = _corrected(after, step.turning.turn, H, step.turning.variance * np.eye(2))
+        assert after.installation is not None
+        mean = after.installation.mean
+    return with_gravity(after, gravity(motions, mean[c:], mean, installation), installation)
 
 
 def with_gravity(belief: PoseWithCovariance, seen: Gravity | None, installation: Installation) -> PoseWithCovariance:
@@ -49,12 +55,18 @@ def with_gravity(belief: PoseWithCovariance, seen: Gravity | None, installation:
     known = belief.installation
     if seen is None or known is None:
         return belief
-    P = joint_cov(belief, known)
-    H = np.zeros((2, len(P)))
+    H = np.zeros((2, 3 + len(known.mean)))
     H[:, 3 : 3 + installation.constants] = seen.D
     H[:, -2:] = np.eye(2)
-    gain = np.linalg.solve(H @ P @ H.T + seen.cov, H @ P).T
-    moved = -gain @ seen.residual
+    return _corrected(belief, seen.residual, H, seen.cov)
+
+
+def _corrected(belief: PoseWithCovariance, residual: FloatArray, H: FloatArray, cov: FloatArray) -> PoseWithCovariance:
+    known = belief.installation
+    assert known is not None
+    P = joint_cov(belief, known)
+    gain = np.linalg.solve(H @ P @ H.T + cov, H @ P).T
+    moved = -gain @ residual
     P = P - gain @ H @ P
     P = 0.5 * (P + P.T)
     theta = InstallationEstimate(known.mean + moved[3:], P[3:, 3:])
@@ -70,14 +82,21 @@ def ground_factors(
     k: int, motions: Sequence[MotionMeasurement], step: GroundStep, theta: FloatArray, installation: Installation
 ) -> list[gtsam.NonlinearFactor]:
     """How height, roll and pitch go on from keyframe k - 1 to k, and what gravity tells of them at k."""
-    made = [step_factor(k, step, theta, installation)]
+    made = list(step_factors(k, step, theta, installation))
     seen = gravity(motions, step.after, theta, installation)
     return made if seen is None else [*made, gravity_factor(k, seen, step.after, theta, installation)]
 
 
-def step_factor(k: int, step: GroundStep, theta: FloatArray, installation: Installation) -> gtsam.NonlinearFactor:
-    """How height, roll and pitch go on from keyframe k - 1 to k."""
+def step_factors(
+    k: int, step: GroundStep, theta: FloatArray, installation: Installation
+) -> Iterator[gtsam.NonlinearFactor]:
+    """How height, roll and pitch go on from keyframe k - 1 to k, and what that tells of the IMU."""
     c = installation.constants
+    if step.turning is not None and c:
+        at = gtsam.Values()
+        at.insert(INSTALLATION, theta[:c])
+        sigma = math.sqrt(step.turning.variance)
+        yield linear_factor({INSTALLATION: step.turning.D / sigma}, step.turning.turn / sigma, at)
     values = gtsam.Values()
     values.insert(ground_key(k - 1), step.before)
     values.insert(ground_key(k), step.after)
@@ -86,7 +105,7 @@ def step_factor(k: int, step: GroundStep, theta: FloatArray, installation: Insta
     if c:
         values.insert(INSTALLATION, theta[:c])
         blocks[INSTALLATION] = -W @ step.D
-    return linear_factor(blocks, np.zeros(_N), values)
+    yield linear_factor(blocks, np.zeros(_N), values)
 
 
 def gravity_factor(
