@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fgloc.config import Config, Role
 from fgloc.diagnosis.diagnosis import Diagnosis
+from fgloc.diagnosis.floor import FloorWatch
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.stream_facts import StreamFacts
 from fgloc.intake.validation import EventValidator
@@ -100,8 +101,11 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     joint = None if learned is None else registry.error_correlation(config, learned)
     wheels = registry.odometer(config)
     gyro = None if setup.imu_up is None else registry.rate_sensor(config, setup.imu_up)
-    motion = MotionSensors(wheels, learned, joint, gyro, registry.attitude_sensor(config, setup.T_base_imu))
+    flat, attitude = config.estimator.ground == "flat", registry.attitude_sensor(config, setup.T_base_imu)
+    motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
+    seen = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)  # what it refuses does not count
+    floor = FloorWatch(attitude, wheels, seen, landmark_map) if flat else None
     seen_by: Role = "sightings" if setup.detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     streams = [stream for sensor in sensors for stream in sensor.streams]
@@ -118,6 +122,6 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
         learned=learned,
         sensors=sensors,
         localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
-        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up),
+        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up, floor),
         notes=setup.notes,
     )

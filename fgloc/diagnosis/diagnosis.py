@@ -10,6 +10,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.collect import SightingCollector, WindowCutter
+from fgloc.diagnosis.floor import FloorWatch
 from fgloc.diagnosis.frame_checks import first_pose_sentence
 from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
@@ -49,6 +50,7 @@ class Diagnosis:
         T_base_sensor: FloatArray | None,
         seen_by: Role,
         imu_up: FloatArray | None,
+        floor: FloorWatch | None = None,
     ) -> None:
         """Set up for the sensors of a run.
 
@@ -59,7 +61,9 @@ class Diagnosis:
             T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
             seen_by: role whose stamps the sightings have: "image" or "sightings".
             imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: there is no gyro.
+            floor: watches whether it is flat; None: it may be as it is.
         """
+        self._floor = floor
         place = camera.T_base_cam if camera is not None else T_base_sensor
         self._config = config
         self._camera = camera is not None
@@ -86,6 +90,8 @@ class Diagnosis:
             step: as the localizer got it.
             wheels: their motion over the step; None without a measurement.
         """
+        if self._floor is not None:
+            self._floor.observe(step)
         self._cutter.begin(step)
         for event in step.sightings:
             at_s = self._cutter.seconds(event.stamp_ns)
@@ -124,6 +130,12 @@ class Diagnosis:
         known = {str(role): offset for role, offset in self._config.recording.stamp_offset_s.items()}
         off = self._offsets(self._faults.constant(), source)
         return {role: known.get(role, 0.0) - late for role, _, late, _, _ in off}
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """What is surely wrong with the configuration, and spoils the poses: a sentence each."""
+        sentence = None if self._floor is None else self._floor.sentence
+        return () if sentence is None else (sentence,)
 
     def notes(self, source: str, offsets: bool = True) -> tuple[str, ...]:
         """What does not fit together, a sentence each with its remedy.

@@ -199,7 +199,8 @@ class OnlineRun:
             return tuple(self._notes)
         now = time.monotonic()
         if now - self._told_s > _TOLD_EVERY_S:
-            self._told, self._told_s = self.parts.diagnosis.notes(self.parts.wheels.source), now
+            diagnosis = self.parts.diagnosis
+            self._told, self._told_s = (*diagnosis.mistakes, *diagnosis.notes(self.parts.wheels.source)), now
         return (*self._notes, *self._told, *self.parts.sentences)
 
 

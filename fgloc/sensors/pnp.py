@@ -14,6 +14,7 @@ from fgloc.sensors.cameras import without_distortion
 from fgloc.types import Camera, FloatArray, Landmark
 
 _MIN_DEPTH_M = 0.01
+_EXPLAINED_PX = 3.0  # a surveyed map and a calibrated camera leave less
 _ITERATIONS = 20
 _SAME = 1e-3  # metres and radians: two refined poses nearer than this are one
 _LEAVE_OUT_UP_TO = 8  # landmarks; among more, a mistaken one does not matter
@@ -109,6 +110,36 @@ def planar_base_candidates(camera: Camera, corners: FloatArray, landmark: Landma
         if refined is not None and not any(np.abs(se2.log(se2.between(p, refined[0]))).max() < _SAME for p, _ in found):
             found.append(refined)
     return sorted(found, key=lambda f: f[1])
+
+
+def up_in_base(camera: Camera, seen: Sequence[tuple[FloatArray, Landmark]]) -> FloatArray | None:
+    """The map's z axis ``(3,)`` in the base's axes, from several known markers in one image.
+
+    Args:
+        camera: intrinsics and mounting; any lens model.
+        seen: corners ``(4, 2)`` [px] of each marker, in the order of MarkerCorners.
+
+    Returns:
+        None where no pose explains them.
+
+    Source: Terzakis and Lourakis, "A consistently fast and globally optimal solution to the perspective-n-point
+    problem", ECCV 2020 (OpenCV's SQPNP).
+    """
+    ideal, pixels = without_distortion(camera, np.vstack([corners for corners, _ in seen]))
+    points = np.vstack([landmark.corners() for _, landmark in seen])
+    if not np.isfinite(pixels).all() or any(landmark.size_m <= 0.0 for _, landmark in seen):
+        return None
+    try:
+        found, r, t = cv2.solvePnP(points, pixels, ideal.K, None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        return None
+    if not found or not np.isfinite(r).all() or not np.isfinite(t).all():
+        return None
+    R_cam_map = cv2.Rodrigues(r)[0]
+    in_cam = points @ R_cam_map.T + np.asarray(t).ravel()
+    if in_cam[:, 2].min() < _MIN_DEPTH_M or _rms(_project(ideal.K, in_cam) - pixels) > _EXPLAINED_PX:
+        return None
+    return np.asarray(camera.T_base_cam[:3, :3] @ R_cam_map[:, 2])
 
 
 def candidates_from_points(sightings: Sequence[tuple[FloatArray, float, float]]) -> list[FloatArray]:

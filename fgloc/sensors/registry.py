@@ -191,8 +191,8 @@ def rate_sensor(config: Config, up: FloatArray) -> RateSensor:
 
 
 def attitude_sensor(config: Config, T_base_imu: FloatArray | None) -> AttitudeSensor | None:
-    """What measures roll and pitch; None: the ground is flat, or there is no inertial unit."""
-    if config.estimator.ground == "flat" or T_base_imu is None:
+    """What measures roll and pitch; None: there is no inertial unit."""
+    if T_base_imu is None:
         return None
     from fgloc.sensors.gyro.attitude import Attitude
 
