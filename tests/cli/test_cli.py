@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from datasets.bag import BagWriter
 from fgloc import cli, se2
+from fgloc.datasets.bag import BagWriter
 from fgloc.recording.outputs import write_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Trajectory
