@@ -1,0 +1,1 @@
+"""Front of `fgloc.datasets.sim`."""
