@@ -249,11 +249,6 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
         assert str(tmp_path / "out" / mode / "report.html") in stdout
 
 
-def test_demo_without_the_sample_says_where_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli.runs, "SAMPLE", tmp_path / "absent")
-    assert "clone the repository" in refused("demo", "--out", tmp_path / "out")
-
-
 def test_bundled_sample_is_localised(tmp_path):
     code, stdout, _ = fgloc("demo", "--out", tmp_path)
     assert code == 0
