@@ -180,6 +180,15 @@ def ground_step(
     return GroundStep(projected, ground, ends[0], A, D, cov, turning)
 
 
+def planar_turn(
+    motion: FloatArray, inertial: InertialReading | None, theta: FloatArray, installation: Installation
+) -> float:
+    """Turn [rad] about the map's z axis of a motion ``(3,)`` in the robot's plane, on ground as it is known now."""
+    turn, _ = _turn_of(inertial, float(motion[2]), theta, installation)
+    angles = theta[installation.constants + 1 :]
+    return float(driven(angles[None], motion[None], turn[None])[0][0, 2])
+
+
 def _smooth(motion: FloatArray, turn: FloatArray) -> float:
     """Variance of a turn about x or y by the ground; where a large one is measured, it is not smooth."""
     way, turned = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
