@@ -11,7 +11,9 @@ pose that guided the robot, and how long it drove, without the learned motion: a
 With ``--corners`` the camera sends corners with a detector's noise (`fgloc.datasets.sim.corners`); nothing is rendered.
 Cases (`fgloc.datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 8 to 28 s, on ice; onewheel, the left encoder counts nothing in that
-time; moved, a marker is 0.5 m from where the map has it. Finished drives are kept, so that an interrupted run goes on.
+time; moved, a marker is 0.5 m from where the map has it. Rows ``slope``, ``rough`` and ``flat.uneven_over_flat`` are
+described in `benchmarks.follow_ground`; ``--ground`` measures these alone. Finished drives are kept, so that an
+interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 
+from benchmarks import follow_ground
 from benchmarks.common import Row, main, not_run
 from benchmarks.follow_runs import Cell, Driven, run_all
 from fgloc.datasets.sim.camera import RenderError
@@ -79,6 +82,10 @@ def measure(
         yield from not_run([w.id for w in rows], str(error))
         return
     found: _Rows = {(case, pose): [driven[cells[seed, case, pose]] for seed in drawn] for case, pose in keys}
+    if quick:
+        yield from not_run(follow_ground.IDS, "left out of a quick run")
+    else:
+        yield from follow_ground.measure(drawn)
     for w in rows:
         if w not in todo:
             yield not_run([w.id], "left out of a quick run")[0]
@@ -117,5 +124,10 @@ if __name__ == "__main__":
     parser.add_argument("--corners", action="store_true", help="corners of markers, not images: a third of the time")
     parser.add_argument("--seeds", type=int, default=None, help="only the first so many")
     parser.add_argument("--jobs", type=int, default=None, help="processes")
+    parser.add_argument("--ground", action="store_true", help="only the rows on ground that is not flat")
     known, rest = parser.parse_known_args()
+    if known.ground:
+        chosen = SEEDS[known.split][: known.seeds]
+        main(lambda quick: follow_ground.measure(chosen[:1] if quick else chosen), follow_ground.__doc__ or "", rest)
+        raise SystemExit
     main(lambda quick: measure(quick, known.split, known.jobs, known.corners, known.seeds), __doc__ or "", rest)

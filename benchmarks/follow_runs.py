@@ -65,7 +65,7 @@ def run_all(cells: Sequence[Cell], jobs: int | None = None) -> dict[Cell, Driven
 def kept(cell: Cell) -> Driven:
     """A drive from the cache, or driven now and put there."""
     sees = "corners" if cell.corners else "images"
-    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{sees}_{_sources()}.json"
+    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{sees}_{source_hash()}.json"
     if path.is_file():
         return Driven(**json.loads(path.read_text(encoding="utf-8")))
     made = _driven(cell)
@@ -85,11 +85,12 @@ def _driven(cell: Cell) -> Driven:
 
 
 @cache
-def _sources() -> str:
+def source_hash(benchmark: Path = Path(__file__)) -> str:
+    """Of fgloc, with its simulator, and of a benchmark's module."""
     made = hashlib.sha256()
     parts = [_ROOT / "fgloc"]
     files = sorted(p for part in parts for p in part.rglob("*") if p.suffix in (".py", ".safetensors", ".yaml"))
-    for path in [*files, Path(__file__)]:
+    for path in [*files, benchmark]:
         made.update(path.relative_to(_ROOT).as_posix().encode())
         made.update(path.read_bytes())
     return made.hexdigest()[:12]

@@ -16,6 +16,7 @@ import yaml
 from fgloc.calibration.contradictions import contradicted
 from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
+from fgloc.evaluation.ground_plots import plot_height, plot_space
 from fgloc.evaluation.html import page, picture, table
 from fgloc.evaluation.judgements import GRAVITY, Judgement
 from fgloc.evaluation.matching import Matched
@@ -97,6 +98,8 @@ def write_results(result: RunResult, config: Config, out: Path, command: str, in
         "error": png(plot_error(result, matched)),
         "timeline": png(plot_timeline(result, matched, _slips(result, config))),
     }
+    if result.trajectory.ground is not None:
+        pictures |= {"space": png(plot_space(result, matched)), "height": png(plot_height(result, matched))}
     with atomic_folder(out, own=FILES) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)
         write_covariance_csv(stage / "covariance.csv", result.trajectory)
@@ -153,6 +156,7 @@ def render(
         picture(pictures["trajectory"], "Trajectory", "The estimate with 3σ ellipses over the truth and the map."),
         "<h2>Error and its 3σ band</h2>",
         picture(pictures["error"], "Error", "In the map frame. An honest band holds 99.7 % of the errors."),
+        *_ground(pictures),
         "<h2>Timeline</h2>",
         picture(pictures["timeline"], "Timeline", _TIMELINE),
         "<h2>Figures</h2>",
@@ -168,6 +172,17 @@ def render(
         f"<pre>{escape(yaml.safe_dump(dict(provenance), sort_keys=False, allow_unicode=True))}</pre>",
     ]
     return page(name, body)
+
+
+def _ground(pictures: Mapping[str, bytes]) -> list[str]:
+    """Of a run on uneven ground."""
+    if "space" not in pictures:
+        return []
+    return [
+        "<h2>Ground</h2>",
+        picture(pictures["space"], "Path in space", "Heights are drawn larger than they are."),
+        picture(pictures["height"], "Height profile", "Height, pitch and roll over the way, with their 3σ bands."),
+    ]
 
 
 def _tiles(metrics: Metrics) -> str:
@@ -221,6 +236,7 @@ def _figures(metrics: Metrics) -> str:
         ("end error", _number(metrics.end_error_m, 1.0, "{:.4f} m"), "distance from the truth at the end"),
         ("drift", _number(metrics.drift_percent, 1.0, "{:.3f} %"), "end error over distance travelled"),
         ("NEES / 3", _number(metrics.nees_over_3, 1.0, "{:.3f}"), "1 is honest, more is over-confident"),
+        *_ground_figures(metrics),
         (
             "coverage 1σ / 2σ / 3σ",
             " / ".join(_number(share.get(k), 100.0, "{:.1f} %") for k in ("1", "2", "3")),
@@ -238,6 +254,18 @@ def _figures(metrics: Metrics) -> str:
         f'<tr><td>{label}</td><td class="n">{text}</td><td class="why">{why}</td></tr>' for label, text, why in rows
     )
     return f"<table>{''.join(cells)}</table>"
+
+
+def _ground_figures(metrics: Metrics) -> list[tuple[str, str, str]]:
+    found = metrics.ground
+    if found is None:
+        return []
+    return [
+        ("ATE in space, rmse", f"{found.ate_rmse_m:.4f} m", "root mean square distance, with the height"),
+        ("height, rmse", f"{found.height_rmse_m:.4f} m", "root mean square error of the height"),
+        ("roll / pitch, rmse", f"{found.roll_rmse_deg:.3f} / {found.pitch_rmse_deg:.3f}°", "root mean square errors"),
+        ("NEES / 6", f"{found.nees_over_6:.3f}", "of x, y, z, roll, pitch and yaw; 1 is honest"),
+    ]
 
 
 def _sensors(result: RunResult) -> str:

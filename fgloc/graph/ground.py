@@ -18,7 +18,7 @@ from fgloc.graph.installation import Installation
 from fgloc.types import FloatArray, InertialReading, MotionMeasurement
 
 GRAVITY = 9.81  # m/s²
-_CONTACT_M = 0.06  # half a short wheelbase: the axle climbs a slope before the chassis has tilted by all of it
+_CONTACT_M = 0.09  # of the wheelbase: the axle climbs a slope before the chassis has tilted by all of it
 _PATH_PER_SQRT_M = 0.003  # m/√m: height of a path beside what the tilt of the chassis says
 _SINK_PER_SQRT_S = 1e-4  # m/√s: of a standing robot, so that no covariance is singular
 _TILT_PER_SQRT_M = 0.1  # rad/√m: without an IMU, how fast the slope of the floor changes ...

@@ -57,6 +57,7 @@ class Keyframe:
     budget: NoiseBudget = field(default_factory=NoiseBudget)  # ... and with which noise
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
     linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
+    ground_clock_cov: FloatArray | None = None  # (6, 6) as `added_cov`, of x, y, z, roll, pitch, yaw
     ground: FloatArray | None = None  # (3,) height, roll and pitch, as of the belief; on uneven ground
 
     @property

@@ -105,10 +105,12 @@ def _estimates(run: Run, base_frame: str) -> Iterator[_Timed]:
     stamps, poses, covs = run.trajectory.stamps_ns.tolist(), run.trajectory.poses, run.trajectory.covs
     assert covs is not None
     last_mode, told_ns = None, 0
-    for stamp, pose, cov, twist, mode in zip(stamps, poses, covs, _twists(run.trajectory), run.modes, strict=True):
-        yield stamp, ODOMETRY, standard.odometry(stamp, pose, cov, twist, base_frame)
-        yield stamp, POSE, standard.pose_with_covariance_stamped(stamp, pose, cov)
-        yield stamp, "/tf", standard.transform(stamp, pose, base_frame)
+    told = zip(stamps, poses, covs, _twists(run.trajectory), run.modes, strict=True)
+    for i, (stamp, pose, cov, twist, mode) in enumerate(told):
+        ground = run.trajectory.ground_at(i)
+        yield stamp, ODOMETRY, standard.odometry(stamp, pose, cov, twist, base_frame, ground=ground)
+        yield stamp, POSE, standard.pose_with_covariance_stamped(stamp, pose, cov, ground)
+        yield stamp, "/tf", standard.transform(stamp, pose, base_frame, ground)
         if mode is not last_mode or stamp - told_ns >= _DIAGNOSTICS_NS:
             last_mode, told_ns = mode, stamp
             x, y, yaw = np.sqrt(np.diag(cov)).tolist()

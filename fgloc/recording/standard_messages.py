@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fgloc.frames import yaw_quaternion
-from fgloc.types import FloatArray, Landmark, LandmarkMap, Mode
+from fgloc.frames import rpy_quaternion, yaw_quaternion
+from fgloc.types import FloatArray, Ground, Landmark, LandmarkMap, Mode
 
 MAP_FRAME = "map"  # REP 105
 STALE = 3  # DiagnosticStatus
@@ -28,12 +28,12 @@ def header(stamp_ns: int, frame_id: str) -> Message:
     return {"stamp": {"sec": stamp_ns // 1_000_000_000, "nanosec": stamp_ns % 1_000_000_000}, "frame_id": frame_id}
 
 
-def pose_with_covariance(pose: FloatArray, cov: FloatArray) -> Message:
+def pose_with_covariance(pose: FloatArray, cov: FloatArray, ground: Ground | None = None) -> Message:
     """geometry_msgs/PoseWithCovariance of ``pose (3,)`` and ``cov (3, 3)`` in the map frame.
 
-    Height, roll and pitch are zero, with no variance: the robot is taken to move in the plane.
+    Without ``ground`` height, roll and pitch are zero, with no variance: the robot is taken to move in the plane.
     """
-    return {"pose": _pose(pose), "covariance": _spatial(cov)}
+    return {"pose": _pose(pose, ground), "covariance": _spatial(cov) if ground is None else ground.cov.ravel()}
 
 
 def pose_stamped(stamp_ns: int, pose: FloatArray) -> Message:
@@ -41,9 +41,11 @@ def pose_stamped(stamp_ns: int, pose: FloatArray) -> Message:
     return {"header": header(stamp_ns, MAP_FRAME), "pose": _pose(pose)}
 
 
-def pose_with_covariance_stamped(stamp_ns: int, pose: FloatArray, cov: FloatArray) -> Message:
+def pose_with_covariance_stamped(
+    stamp_ns: int, pose: FloatArray, cov: FloatArray, ground: Ground | None = None
+) -> Message:
     """geometry_msgs/PoseWithCovarianceStamped in the map."""
-    return {"header": header(stamp_ns, MAP_FRAME), "pose": pose_with_covariance(pose, cov)}
+    return {"header": header(stamp_ns, MAP_FRAME), "pose": pose_with_covariance(pose, cov, ground)}
 
 
 def odometry(
@@ -53,20 +55,22 @@ def odometry(
     twist: FloatArray,
     base_frame: str,
     twist_cov: FloatArray | None = None,
+    ground: Ground | None = None,
 ) -> Message:
     """nav_msgs/Odometry of the base in the map; ``twist (3,)`` and its covariance are in the base's axes."""
     covariance = {} if twist_cov is None else {"covariance": _spatial(twist_cov)}
     return {
         "header": header(stamp_ns, MAP_FRAME),
         "child_frame_id": base_frame,
-        "pose": pose_with_covariance(pose, cov),
+        "pose": pose_with_covariance(pose, cov, ground),
         "twist": {"twist": {"linear": xyz(*twist[:2]), "angular": xyz(z=twist[2])}, **covariance},
     }
 
 
-def transform(stamp_ns: int, T_map_child: FloatArray, child_frame: str) -> Message:
+def transform(stamp_ns: int, T_map_child: FloatArray, child_frame: str, ground: Ground | None = None) -> Message:
     """tf2_msgs/TFMessage with one transform from the map."""
-    value = {"translation": xyz(*T_map_child[:2]), "rotation": rotation(T_map_child[2])}
+    pose = _pose(T_map_child, ground)
+    value = {"translation": pose["position"], "rotation": pose["orientation"]}
     return {"transforms": [{"header": header(stamp_ns, MAP_FRAME), "child_frame_id": child_frame, "transform": value}]}
 
 
@@ -103,8 +107,12 @@ def xyz(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> dict[str, float]:
     return {"x": float(x), "y": float(y), "z": float(z)}
 
 
-def _pose(pose: FloatArray) -> Message:
-    return {"position": xyz(*pose[:2]), "orientation": rotation(float(pose[2]))}
+def _pose(pose: FloatArray, ground: Ground | None = None) -> Message:
+    if ground is None:
+        return {"position": xyz(*pose[:2]), "orientation": rotation(float(pose[2]))}
+    quaternion = rpy_quaternion(ground.roll, ground.pitch, float(pose[2]))
+    position = xyz(float(pose[0]), float(pose[1]), ground.z)
+    return {"position": position, "orientation": dict(zip("xyzw", quaternion, strict=True))}
 
 
 def _spatial(cov: FloatArray) -> FloatArray:

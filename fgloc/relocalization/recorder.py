@@ -18,7 +18,7 @@ from fgloc.robust.motion_judge import MotionJudge
 from fgloc.robust.sensor_measurements import kind_of
 from fgloc.robust.sighting_judge import SightingJudge
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.types import Decision, Estimate, FloatArray, Mode, Step
+from fgloc.types import Decision, Estimate, FloatArray, Ground, Mode, Step
 
 
 class Recorder:
@@ -44,6 +44,7 @@ class Recorder:
         self._dead_reckoning_after_s = config.estimator.dead_reckoning_after_s
         self._tracking, self._motion, self._sightings, self._compensation = tracking, motion, sightings, compensation
         self._installation = tracking.installation
+        self._last_ground: FloatArray | None = None
         self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
 
     def count(self, frame: Keyframe) -> None:
@@ -71,7 +72,19 @@ class Recorder:
         before, self._clock_jumps = [*self._clock_jumps, *self._motion.take_signs()], []
         cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
         ground = spatial(belief, self._installation, frame.added_cov)
+        if ground is not None:
+            frame.ground_clock_cov = self._ground_by_clock(step, ground)
+            ground = replace(ground, cov=ground.cov + frame.ground_clock_cov)
         return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes), ground)
+
+    def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:
+        """Covariance ``(6, 6)`` of height, roll and pitch for a clock that is off, as `record` has it of x, y, yaw."""
+        now, before = np.array([ground.z, ground.roll, ground.pitch]), self._last_ground
+        self._last_ground = now
+        rates: FloatArray = np.zeros(6)
+        if before is not None and step.dt > 0.0:
+            rates[2:5] = (now - before) / step.dt
+        return np.asarray(np.outer(rates, rates) * self._clock_sigma_s**2)
 
     def unconfirmed(self, k: int, step: Step) -> Estimate | None:
         """The pose before the sightings are enough to begin the graph with; None: they hardly tell it."""

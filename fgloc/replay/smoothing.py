@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -74,7 +74,9 @@ def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:
     for frame, pose, ground, cov in zip(solver.frames, result.poses, result.ground, result.ground_covs, strict=True):
         whole = cov.copy()
         whole[:3, :3] += frame.added_cov
-        yield ground_at(ground, whole, float(pose[2]))
+        found = ground_at(ground, whole, float(pose[2]))
+        by_clock = frame.ground_clock_cov
+        yield found if by_clock is None else replace(found, cov=found.cov + by_clock)
 
 
 def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:

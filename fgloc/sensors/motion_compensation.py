@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from fgloc import se2
+from fgloc.frames import rotation_of
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.types import (
     FloatArray,
@@ -63,13 +65,26 @@ def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r
     return np.asarray(J @ cov @ J.T)
 
 
+def _tilted(seen: Sequence[LandmarkMeasurement], rates: FloatArray, seconds: float) -> list[LandmarkMeasurement]:
+    """Corners as the base sees them that has not yet tilted, or has tilted, by the rates ``(2,)`` about x and y."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_of((*(rates * (seconds if abs(seconds) < 1e-9 * _SHORT_NS else 0.0)).tolist(), 0.0))
+    moved: list[LandmarkMeasurement] = []
+    for m in seen:
+        if isinstance(m, PixelMeasurement):
+            camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
+            m = dataclasses.replace(m, camera=camera, tilting=rates)
+        moved.append(m)
+    return moved
+
+
 class MotionCompensation:
     """Moves sightings from their exposure to the keyframe, by the wheels and, where it is heard, the gyro's turn."""
 
     def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
         """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
         self._landmarks, self._jitter_s = poses.landmarks, jitter_s
-        self._wheels, self._gyro = motion.wheels, motion.gyro
+        self._wheels, self._gyro, self._attitude = motion.wheels, motion.gyro, motion.attitude
         self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
 
     def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
@@ -91,6 +106,9 @@ class MotionCompensation:
             late = [
                 dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
             ]
+            if self._attitude is not None and step.inertial:
+                rates = self._attitude.rates_at(step.inertial, exposure_ns)[:2]
+                late = _tilted(late, rates, (exposure_ns - step.stamp_ns) * 1e-9)
             if exposure_ns != step.stamp_ns:
                 motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)
                 if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:

@@ -97,6 +97,13 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def ground_at(self, i: int) -> Ground | None:
+        """What pose ``i`` has beside the planar one; None: the floor is flat."""
+        if self.ground is None or self.ground_covs is None:
+            return None
+        z, roll, pitch = self.ground[i].tolist()
+        return Ground(z, roll, pitch, self.ground_covs[i])
+
     def interpolate(self, stamp_ns: int | IntArray) -> FloatArray:
         """Poses between the known ones: linear in x and y, and in yaw the shorter way round.
 

@@ -76,7 +76,9 @@ def find_scenario(what: str) -> Scenario:
 def follow_path(
     scenario: Annotated[str, typer.Argument(help="a scenario of the bundled suite by name, or a YAML file")],
     out: Annotated[Path, typer.Option(help="folder of bag/, map.yaml, following.csv, following.png and so on")],
-    path: Annotated[str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour), or a file")],
+    path: Annotated[
+        str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour, ramp), or a file")
+    ],
     pose: Annotated[str, typer.Option(help=f"what guides the robot: {', '.join(POSES)}")] = "fgloc",
     seed: Annotated[int, typer.Option(min=0)] = 1,
     failure: Annotated[

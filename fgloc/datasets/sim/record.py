@@ -121,6 +121,8 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
     markers = {"sigma_px": 0.1}
     topics = {"command": "/cmd_vel", "odometry": "/odom", "truth": "/truth"}
     settings: dict[str, Any] = {"recording": {"topics": topics}, "wheels": wheels, "markers": markers}
+    if scenario.world.floor.uneven:
+        settings["estimator"] = {"ground": "uneven"}
     if scenario.uwb is not None:
         settings["uwb"] = uwb_settings(scenario, scenario.uwb)
     if scenario.gnss is not None:

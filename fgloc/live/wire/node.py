@@ -208,7 +208,7 @@ class Node:
             self._recent.add(now)
         self._last_ns = now.stamp_ns
         base, odom = self._odom.base, self._odom.latest()
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist()), base)
+        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist(), now.ground), base)
         self.published["odometry"] += 1
         if odom is None:
             self._outputs.transform(now.stamp_ns, now.pose, base)

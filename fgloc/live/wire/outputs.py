@@ -10,7 +10,7 @@ from fgloc import se2
 from fgloc.live.wire.names import OWN
 from fgloc.live.wire.participant import Participant
 from fgloc.recording import standard_messages as standard
-from fgloc.types import Estimate, FloatArray, LandmarkMap, Mode
+from fgloc.types import Estimate, FloatArray, Ground, LandmarkMap, Mode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +22,7 @@ class BaseState:
     cov: FloatArray  # (3, 3) in the map frame
     twist: FloatArray  # (3,) of the base in its own axes: m/s, m/s, rad/s
     twist_cov: FloatArray  # (3, 3) likewise
+    ground: Ground | None = None  # None: the floor is flat
 
 
 class Outputs:
@@ -48,13 +49,13 @@ class Outputs:
     def odometry(self, state: BaseState, base_frame: str) -> None:
         """Publish nav_msgs/Odometry of the base in the map."""
         values = standard.odometry(
-            state.stamp_ns, state.pose, state.cov, state.twist, base_frame, twist_cov=state.twist_cov
+            state.stamp_ns, state.pose, state.cov, state.twist, base_frame, state.twist_cov, state.ground
         )
         self._write(OWN + "odometry", values)
 
     def pose(self, estimate: Estimate) -> None:
         """Publish one keyframe's estimate."""
-        values = standard.pose_with_covariance_stamped(estimate.stamp_ns, estimate.pose, estimate.cov)
+        values = standard.pose_with_covariance_stamped(estimate.stamp_ns, estimate.pose, estimate.cov, estimate.ground)
         self._write(OWN + "pose", values)
 
     def transform(self, stamp_ns: int, T_map_child: FloatArray, child_frame: str) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from fgloc.ablation.failures import AnyFailure, Failure
+from fgloc.datasets.sim.floor import Floor
 from fgloc.datasets.sim.following.loop import Drive
 from fgloc.datasets.sim.following.path import load_path
 from fgloc.datasets.sim.following.poses import PoseName
@@ -33,6 +34,7 @@ class Case:
         title: for figures.
         floor: name of the scenario.
         path: name of the path.
+        ground: heights of the floor, as in ``world.floor``; the robot's configuration then says that it is uneven.
         failing: as in a suite of ablations; a moved marker without ids is the one that the robot has before it first.
     """
 
@@ -40,6 +42,7 @@ class Case:
     floor: str
     path: str
     failing: dict[str, Any] | None = None
+    ground: dict[str, Any] | None = None
 
 
 _IN_TIME = {"intervals": [FAILED_S]}
@@ -54,11 +57,17 @@ CASES: dict[str, Case] = {
         "left encoder dead for 20 s", "calibrated", "grid30",
         {"kind": "encoder_dead", "wheel": "left", "when": _IN_TIME},
     ),
+    "slope": Case(
+        "a ramp of 15° and humps", "calibrated", "ramp",
+        ground={"ramp": {"start_x": -1.5, "angle_deg": 15.0}, "humps": {"count": 8}},
+    ),
+    "rough": Case("a rough field", "calibrated", "ramp", ground={"rough": {"height_m": 0.03}}),
+    "level": Case("the same path on a flat floor", "calibrated", "ramp"),
     "moved": Case("a marker moved", "calibrated", "grid30", {"kind": "moved_marker", "distance_m": MOVED_M}),
 }  # fmt: skip
 
 
-def drive_of(name: str, pose: PoseName, seed: int, sees: Sees = "images") -> Drive:
+def drive_of(name: str, pose: PoseName, seed: int, sees: Sees = "images", always: bool = False) -> Drive:
     """A drive of a case: as installed by a careful person, and with no error besides.
 
     Args:
@@ -66,18 +75,22 @@ def drive_of(name: str, pose: PoseName, seed: int, sees: Sees = "images") -> Dri
         pose: that guides the robot; for some there is nothing to be seen.
         seed: of all that is drawn.
         sees: what the camera sends otherwise.
+        always: send it although it does not guide the robot.
     """
     case = CASES[name]
     made = load_suite(BUNDLED).find(case.floor)
     robot = made.robot.model_copy(update={"radius_scale": (1.0, 1.0)})
     changes = {"robot": robot, "camera": Camera(rate_hz=_CAMERA_HZ), "installation": Installation.as_installed()}
     scenario, path = made.model_copy(update=changes), load_path(case.path)
+    if case.ground is not None:
+        floor = Floor.model_validate(scenario.world.floor.model_dump() | case.ground)
+        scenario = scenario.model_copy(update={"world": scenario.world.model_copy(update={"floor": floor})})
     failing = case.failing
     if failing is not None and failing["kind"] == "moved_marker":
         placed = scenario.model_copy(update={"start": path.start})
         failing = failing | {"ids": [_ahead(placed, seed)]}
     failures = () if failing is None else (_FAILURE.validate_python(failing),)
-    return Drive(scenario, path, pose, seed, failures, "nothing" if pose in _BLIND else sees)
+    return Drive(scenario, path, pose, seed, failures, "nothing" if pose in _BLIND and not always else sees)
 
 
 def _ahead(scenario: Scenario, seed: int) -> int:
