@@ -107,6 +107,16 @@ class CornerBatch:
         by_time = (B @ flow[..., None])[..., 0]
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
+        if self._tilting is not None:
+            tipped = late[:, None, None, None] * self._tilting[:, None, None]
+            B = B + np.stack(
+                [
+                    -tipped[..., 1] * B[..., 2],
+                    tipped[..., 0] * B[..., 2],
+                    tipped[..., 1] * B[..., 0] - tipped[..., 0] * B[..., 1],
+                ],
+                axis=-1,
+            )
         scale = 1.0 / self._noise_px
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
