@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Bag, ModelOption, configured
-from fgloc.cli.terminal import columns, run_bar, say
+from fgloc.cli.progress import run_bar
+from fgloc.cli.terminal import columns, say
 from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:

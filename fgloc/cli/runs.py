@@ -24,8 +24,9 @@ from fgloc.cli.options import (
     WorkersOption,
     configured,
 )
+from fgloc.cli.progress import run_bar
 from fgloc.cli.sweeps import smooth_many
-from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
+from fgloc.cli.terminal import exit_code, exit_unless_trusted, number, say, say_table, typed
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
@@ -62,7 +63,7 @@ def demo(
         runs.append((mode, metrics))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
-    say(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
+    say_table(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs])
     say("")
     for mode, _ in runs:
         say(f"{mode:<8}{out / mode / 'report.html'}")
@@ -127,7 +128,7 @@ def calibrate(
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
     rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
-    say(columns(("setting", "given", "found"), rows))
+    say_table(("setting", "given", "found"), rows)
     say(f"configuration: {out}")
 
 
@@ -169,7 +170,7 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
     for mistake in result.mistakes:
         say(f"mistake: {mistake}")
-    say(columns(None, rows))
+    say_table(None, rows)
     for judgement in gravest(metrics.judgements, _TOLD):
         say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
     for note in result.notes:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
-from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar, say
+from fgloc.cli.progress import run_bar
+from fgloc.cli.terminal import exit_unless_trusted, say, say_table
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
 
@@ -88,7 +89,7 @@ def _tell(found: Survey, out: Path) -> None:
         cov = found.landmarks.landmarks[i].cov
         sigma = np.sqrt(np.diag(np.eye(6) if cov is None else cov))
         rows.append((str(i), str(views), f"{1e3 * sigma[:3].max():.1f} mm", f"{np.degrees(sigma[3:].max()):.2f} deg"))
-    say(columns(("marker", "views", "position", "direction"), rows))
+    say_table(("marker", "views", "position", "direction"), rows)
     for i, why in found.left_out.items():
         say(f"left out: marker {i}: {why}")
     for note in found.notes:

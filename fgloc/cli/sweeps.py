@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
-from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, say, typed
+from fgloc.cli.progress import jobs_bar
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, number, say, say_table, typed
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def ablate(
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
     with only_sweep(out):
-        with jobs_bar("runs", len(jobs)) as show:
+        with jobs_bar("runs") as show:
             records = sweep(jobs, out, workers, scheduler, retry, show)
         sentences = write_report(plan, jobs, records, out, typed())
     for sentence in sentences:
@@ -63,11 +64,11 @@ def smooth_many(
     if config_file is not None:
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
-    with only_sweep(out), jobs_bar("bags", len(plan.jobs)) as show:
+    with only_sweep(out), jobs_bar("bags") as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
-    say(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
+    say_table(head, [_row(name, by_name.get(name)) for name in plan.names])
     errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
     for name in plan.names:
         if name in errors:
