@@ -120,9 +120,7 @@ def _interrupted() -> Iterator[threading.Event]:
 
 
 def _tell(sentence: str) -> None:
-    from tqdm import tqdm
-
-    tqdm.write(sentence, file=sys.stdout)
+    say(sentence)
     sys.stdout.flush()
 
 
@@ -155,12 +153,16 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 @contextmanager
 def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     """The pose, on a terminal."""
-    from tqdm import tqdm
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
 
-    with tqdm(bar_format="{desc}", disable=None, file=sys.stderr, leave=False) as bar:
-        if bar.disable:
-            yield
-            return
+    on_screen = sys.stdout.isatty()  # then what is printed goes above the line
+    console = Console(stderr=True)
+    with Live(Text(), console=console, auto_refresh=False, transient=True, redirect_stdout=on_screen) as line:
         ended = threading.Event()
 
         def show() -> None:
@@ -169,7 +171,8 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
                 if pose is not None:
                     x, y, yaw = pose.pose
                     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-                    bar.set_description_str(f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m")
+                    text = f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+                    line.update(Text(text), refresh=True)
 
         showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)
         showing.start()
