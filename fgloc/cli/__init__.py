@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from fgloc.cli import begin, convert, exports, live, runs, sim, surveys, sweeps, tools, training
 from fgloc.cli.progress import shown
-from fgloc.cli.terminal import EXIT_BAD_INPUT, say
+from fgloc.cli.terminal import EXIT_BAD_INPUT, kept_on_interrupt, say
 from fgloc.errors import FglocError
 
 
@@ -23,7 +23,7 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            with shown():
+            with kept_on_interrupt(), shown():
                 return super().invoke(ctx)
         except FglocError as error:
             say(f"error: {error}", err=True)

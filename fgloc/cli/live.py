@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.cli.extras import need
 from fgloc.cli.options import Bag, ModelOption, configured
 from fgloc.cli.progress import run_bar
 from fgloc.cli.terminal import columns, say
@@ -53,6 +54,9 @@ def live(
     view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
 ) -> None:
     """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
+    need("live", "fgloc live")
+    if view:
+        need("view", "fgloc live --view")
     # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
     from fgloc.live.wire.node import Node
     from fgloc.live.wire.participant import Participant
@@ -85,6 +89,7 @@ def play(
     network: NetworkOption = False,
 ) -> None:
     """Publish a recording on ROS 2's wire with its recorded timing, and /clock."""
+    need("live", "fgloc play")
     from fgloc.live.wire.participant import Participant
     from fgloc.live.wire.play import Player
 

@@ -65,7 +65,7 @@ class Lines:
             return
         now = self._clock()
         began, before = self._began.setdefault(of.label, (now, of.done))
-        if now - self._last < LINE_S or now == began:
+        if now - self._last < LINE_S or now == began or of.done == of.total:
             return
         self._last = now
         self._write(_line(of, now - began, before))

@@ -64,8 +64,7 @@ def record(
     scenario = scenario.model_copy(update={"installation": None}) if perfect else scenario
     if longest is not None:
         scenario = scenario.model_copy(update={"duration_s": min(longest, scenario.duration_s)})
-    with kept_on_interrupt():
-        say(str(record_run(scenario, seed, out, camera)))
+    say(str(record_run(scenario, seed, out, camera)))
 
 
 @app.command(name="follow")
@@ -101,8 +100,7 @@ def follow_path(
         find_scenario(scenario), load_path(path), known[pose], seed, read_failures(failure or []),
         "corners" if corners else "images",
     )  # fmt: skip
-    with kept_on_interrupt():
-        done = {drive.path.name: (drive, follow(drive, out))}
+    done = {drive.path.name: (drive, follow(drive, out))}
     draw_drives(done, out / "following.png", close=False)
     say(table(done))
 
@@ -117,8 +115,7 @@ def follow_demo(
     from fgloc.datasets.sim.following.demo import PICTURE, demonstrate
 
     check_out(out)
-    with kept_on_interrupt():
-        say(demonstrate(out, jobs_, "corners" if corners else "images"))
+    say(demonstrate(out, jobs_, "corners" if corners else "images"))
     say(f"\n{out / PICTURE}")
 
 

@@ -9,7 +9,7 @@ import typer
 
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
 from fgloc.cli.progress import run_bar
-from fgloc.cli.terminal import exit_unless_trusted, say, say_table
+from fgloc.cli.terminal import exit_unless_trusted, next_step, say, say_table, shown_path
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
 
@@ -65,6 +65,12 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
+    paths = " ".join(shown_path(bag) for bag in bags)
+    configuration = "" if config is None else f" --config {shown_path(config)}"
+    next_step(
+        f"fgloc calibrate {paths} --map {shown_path(out)}{configuration} --out calibrated.yaml",
+        "find what wheels, camera and clocks are off by",
+    )
 
 
 def _of_points(bag: Path, out: Path, settings: Config) -> None:

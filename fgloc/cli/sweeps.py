@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.cli.extras import need
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
 from fgloc.cli.progress import jobs_bar
-from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, number, say, say_table, typed
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, kept_on_interrupt, number, say, say_table, typed
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
@@ -31,11 +32,13 @@ def ablate(
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
 
+    need("sweep", "fgloc ablate")
     check_out(out)
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
+    kept = f"finished runs are kept in {out}; the same command goes on with the others"
     with only_sweep(out):
-        with jobs_bar("runs") as show:
+        with kept_on_interrupt(kept), jobs_bar("runs") as show:
             records = sweep(jobs, out, workers, scheduler, retry, show)
         sentences = write_report(plan, jobs, records, out, typed())
     for sentence in sentences:
@@ -60,11 +63,13 @@ def smooth_many(
     from fgloc.ablation.records import only_sweep
     from fgloc.ablation.sweep import sweep
 
+    need("sweep", "fgloc smooth of several bags")
     check_out(out)
     if config_file is not None:
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
-    with only_sweep(out), jobs_bar("bags") as show:
+    kept = f"finished bags are kept in {out}; the same command goes on with the others"
+    with kept_on_interrupt(kept), only_sweep(out), jobs_bar("bags") as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")

@@ -58,7 +58,7 @@ def exit_unless_trusted(result: RunResult) -> None:
 
 
 @contextmanager
-def kept_on_interrupt(kept: str = "nothing was written, and an earlier result is as it was") -> Iterator[None]:
+def kept_on_interrupt(kept: str = "of this result nothing was written; an earlier one is as it was") -> Iterator[None]:
     """Say on Ctrl-C what there is, and end with the code that shells give to it."""
     try:
         yield
@@ -74,8 +74,15 @@ def group(about: str) -> typer.Typer:
 
 def warn(text: str) -> None:
     """What the user should act on, on stderr: in red on a terminal."""
-    head = typer.style("warning:", fg=typer.colors.RED, bold=True) if sys.stderr.isatty() else "warning:"
-    typer.echo(f"{head} {_plain(text)}", err=True)
+    say_remark("warning", text, err=True)
+
+
+def say_remark(kind: str, text: str, err: bool = False) -> None:
+    """A sentence under its kind; on a terminal all but notes are red."""
+    head, stream = f"{kind}:", sys.stderr if err else sys.stdout
+    if kind != "note" and stream.isatty():
+        head = typer.style(head, fg=typer.colors.RED, bold=True)
+    typer.echo(f"{head} {_plain(text)}", err=err)
 
 
 def next_step(command: str, why: str) -> None:
