@@ -32,7 +32,7 @@ LOST = [
     {"kind": "lift", "when": {"intervals": [[31, 50]]}},
 ]
 WIDTH_PX = 1000
-COLORS = 96
+COLORS = 255
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 

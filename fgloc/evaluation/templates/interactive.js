@@ -82,12 +82,15 @@
       fillcolor: m.color, opacity: 0.18, line: { width: 0 }, layer: "below" }));
     const ticks = run.ticks ? { tickvals: run.ticks.at, ticktext: run.ticks.told } : {};
     const log = (values) => run.logarithmic ? { type: "log" } : { rangemode: "tozero" };
+    const fit = run.sightings.accepted.t.length + run.sightings.rejected.t.length > 0;
+    const rows = fit ? [[0.7, 1], [0.37, 0.65], [0, 0.3]] : [[0.54, 1], [0, 0.46]];
+    const bottom = fit ? { yaxis3: axis(theme, { title: { text: "NIS / dof" }, domain: rows[2], type: "log" }) } : {};
     Plotly.react(time, timeTraces(theme), layout(theme, {
-      height: 620, shapes: shade, hovermode: "x",
-      xaxis: axis(theme, { title: { text: "time from the first pose [s]" }, anchor: "y3", ...ticks }),
-      yaxis: axis(theme, { title: { text: (run.errors ? "error, " : "") + "3σ [mm]" }, domain: [0.7, 1], ...log() }),
-      yaxis2: axis(theme, { title: { text: (run.errors ? "error, " : "") + "3σ [°]" }, domain: [0.37, 0.65], ...log() }),
-      yaxis3: axis(theme, { title: { text: "NIS / dof" }, domain: [0, 0.3], type: "log" }),
+      height: fit ? 620 : 460, shapes: shade, hovermode: "x",
+      xaxis: axis(theme, { title: { text: "time from the first pose [s]" }, anchor: fit ? "y3" : "y2", ...ticks }),
+      yaxis: axis(theme, { title: { text: (run.errors ? "error, " : "") + "3σ [mm]" }, domain: rows[0], ...log() }),
+      yaxis2: axis(theme, { title: { text: (run.errors ? "error, " : "") + "3σ [°]" }, domain: rows[1], ...log() }),
+      ...bottom,
     }), settings);
     time.removeAllListeners("plotly_hover");
     time.on("plotly_hover", (event) => {
