@@ -148,7 +148,7 @@ def _flags(result: RunResult, decisions: Sequence[Decision]) -> dict[str, FloatA
             found[d.kind, d.reason or "weight 0"].append(d.stamp_ns)
     common = sorted(found, key=lambda key: -len(found[key]))[:_MAX_FLAGS]
     return {
-        f"{kind}: {reason} ({len(found[kind, reason])})": seconds(result, found[kind, reason])
+        f"{kind}: {reason.replace('_', ' ')} ({len(found[kind, reason])})": seconds(result, found[kind, reason])
         for kind, reason in sorted(common)
     }
 
