@@ -143,6 +143,7 @@ def _simulation(place: Path) -> Writer:
 
 def _training(place: Path) -> Writer:
     from tests.synthetic_robot import write_bag
+
     from training.train import main as train
 
     out = place / "train" / "out"

@@ -202,7 +202,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
-    wheels = registry.odometer(config)
+    wheels = registry.odometer().build(config)
     wheels.measure(step)
     if not wheels.source:
         return None

@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
-from fgloc.sensors.base import Turn
+from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
@@ -55,11 +55,11 @@ class MotionSources:
     @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""
-        return self._learned is not None and not self._learned.model.card.reads_wheels
+        return self._learned is not None and not self._learned.model.card.reads(MotionRole.ODOMETER)
 
     @property
     def _learned_has_gyro(self) -> bool:
-        return self._learned is not None and self._learned.model.card.reads_gyro
+        return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
 
     def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
         """Ask every source once.
