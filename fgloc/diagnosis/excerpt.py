@@ -207,7 +207,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     if not wheels.source:
         return None
     excerpt.wheel_source = wheels.source
-    motions = [wheels.carry(step, a, b)[0] for a, b in pairwise(grid.tolist())]
+    motions = [wheels.motion_between(step, a, b)[0] for a, b in pairwise(grid.tolist())]
     return np.array([se2.log(m) for m in motions])
 
 

@@ -105,11 +105,13 @@ class Turn:
         yaw: [rad], rid of the bias.
         variance: [rad²], of the noise and of what the bias may be off.
         noise: [rad²], of the noise alone.
+        noise_density: [rad²/s], of the same.
     """
 
     yaw: float
     variance: float
     noise: float = 0.0
+    noise_density: float = 0.0
 
 
 class MotionRole(StrEnum):

@@ -144,6 +144,7 @@ class RawLandmarksRole:
     Attributes:
         size: of landmarks for which the map gives none [m]; None: not known.
         dictionary: of the landmarks that are detected; None: the map's.
+        ids: how many ids a dictionary has; `ConfigError` where there is none of this name.
         sigma_px: noise of a corner, on each axis.
         detector: of one run; `ConfigError` where settings and map do not say what is to be detected.
         fitting_dictionary: the dictionary that fits the raw data of a recording; None if none does.
@@ -151,6 +152,7 @@ class RawLandmarksRole:
 
     size: Callable[[Config], float | None]
     dictionary: Callable[[Config], str | None]
+    ids: Callable[[str], int]
     sigma_px: Callable[[Config], float]
     detector: Callable[[Config, LandmarkMap | None], SensorDetector]
     fitting_dictionary: Callable[[Any], str | None]

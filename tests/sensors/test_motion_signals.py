@@ -18,7 +18,7 @@ from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.signals import SignalReader, Signals
 from fgloc.sensors.signals import Signal
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import ControlEvent, MotionEvent, Step, by_class
+from fgloc.types import ControlEvent, InertialEvent, MotionEvent, Step, by_class
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
@@ -173,7 +173,7 @@ def test_contiguous_steps_remember_and_others_begin_anew() -> None:
     for k in range(4):
         reader.read(step(1.0 + 0.2 * k, 1.2 + 0.2 * k))
     assert before(reader, step(1.8, 2.0)) == pytest.approx(0.5 * 1.55, abs=1e-9)
-    assert len(reader._imu_events) < 50
+    assert len(reader._events[InertialEvent]) < 50
     fresh = before(SignalReader(card), step(1.8, 2.0))
     assert fresh == pytest.approx(0.9, abs=0.02)  # the first value, held
     for other in (step(2.2, 2.4), step(2.0, 2.2, segment=1)):
@@ -193,7 +193,7 @@ def test_cards_say_what_a_model_reads() -> None:
     assert make_card("displacement", inputs=ALL).reads(MotionRole.ODOMETER)
     assert not make_card("displacement", inputs=("commands", "gyro", "effort")).reads(MotionRole.ODOMETER)
     for changes, message in (
-        ({"inputs": ("commands", "effort"), "joints": None}, "need the card's joints"),
+        ({"inputs": ("commands", "effort"), "joints": None}, "needs the card's joints"),
         ({"inputs": ("commands", "wheels"), "joints": {"left": "l", "right": "r"}}, "needs left_radius"),
         ({"inputs": ("commands", "gyro"), "signal_edges_s": (0.1, 0.2)}, "increase from 0"),
     ):

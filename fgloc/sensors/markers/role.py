@@ -18,6 +18,12 @@ def _detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetecto
     return configured_detector(config, landmark_map)
 
 
+def _ids(dictionary: str) -> int:
+    from fgloc.sensors.markers.dictionaries import load_dictionary
+
+    return len(load_dictionary(dictionary).bytesList)
+
+
 def _fitting_dictionary(recording: Any) -> str | None:
     from fgloc.sensors.markers.hints import fitting_dictionary
 
@@ -27,6 +33,7 @@ def _fitting_dictionary(recording: Any) -> str | None:
 ROLE = RawLandmarksRole(
     size=lambda config: config.markers.default_size_m,
     dictionary=lambda config: config.markers.dictionary,
+    ids=_ids,
     sigma_px=lambda config: config.markers.sigma_px,
     detector=_detector,
     fitting_dictionary=_fitting_dictionary,
