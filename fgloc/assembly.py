@@ -98,10 +98,11 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
 def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, camera = setup.learned, setup.camera
-    joint = None if learned is None else registry.error_correlation(config, learned)
-    wheels = registry.odometer(config)
-    gyro = None if setup.imu_up is None else registry.rate_sensor(config, setup.imu_up)
-    flat, attitude = config.estimator.ground == "flat", registry.attitude_sensor(config, setup.T_base_imu)
+    joint = None if learned is None else registry.motion_model().correlation(config, learned)
+    wheels = registry.odometer().build(config)
+    gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
+    attitude = None if setup.T_base_imu is None else registry.rate_sensor().attitude(config, setup.T_base_imu)
+    flat = config.estimator.ground == "flat"
     motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)  # what it refuses does not count

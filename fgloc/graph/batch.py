@@ -48,7 +48,6 @@ class Smoothed:
     ground: FloatArray | None  # (n, 3) height, roll and pitch; None: the floor is flat
     ground_covs: FloatArray | None  # (n, 6, 6) of x, y, yaw, height, roll and pitch
     landmarks: Mapping[int, Landmark]  # those that were variables
-    factors: int  # held by the last graph
     error: float  # its GTSAM error
 
 
@@ -209,7 +208,6 @@ class BatchSmoother:
             ground=ground,
             ground_covs=spatial,
             landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
-            factors=self._graph.size(),
             error=self._graph.error(self._values),
         )
 
