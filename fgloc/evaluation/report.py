@@ -35,7 +35,7 @@ from fgloc.recording.truth import true_slips
 from fgloc.sensors.maps import write_map
 from fgloc.types import InstallationFound, IntArray, RunResult
 
-_FIGURES = ("trajectory", "error", "timeline")
+_FIGURES = ("trajectory", "error", "timeline", "space", "height")  # the last two: on uneven ground
 FILES = (
     "trajectory.tum",
     "covariance.csv",
