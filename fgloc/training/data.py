@@ -20,11 +20,12 @@ from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
-from fgloc.recording.truth import base_pose
+from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.training.config import DataConfig
 from fgloc.training.heard import TopicTimes
+from fgloc.training.slopes import in_robots_plane
 from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 
 _FINE_S = 0.02  # the truth is resampled to this before it is smoothed
@@ -133,6 +134,8 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
         up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
+        if len(truth) > 1:
+            rows = in_robots_plane(rows, np.array([base_ground(e, settings.truth) for e in truth]))
     else:
         stamps, rows = smoothed_truth(truth_from, config)
     for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
