@@ -41,6 +41,7 @@ KEYS = [
     "drift_percent",
     "nees_over_3",
     "coverage",
+    "ground",
     "real_time_factor",
     "step_ms",
     "factors",
@@ -88,7 +89,7 @@ def test_truth_based_metrics_are_null_without_truth(tmp_path):
     report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert list(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == KEYS[3:10]
+    assert [key for key in KEYS if content[key] is None] == KEYS[3:11]
 
 
 def test_truth_of_another_time_counts_as_none(tmp_path):
