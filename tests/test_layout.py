@@ -12,10 +12,9 @@ import pytest
 from config_rows import rows, sections, tables
 
 import fgloc
-from fgloc.config import Config, load_config
-from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
+GENERATED = {ROOT / "docs" / "reference" / "cli.md"}  # by docs/hooks.py, when the site is built
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
 BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
 UPWARD = {
@@ -139,22 +138,9 @@ def test_readme_names_the_packages_that_ci_installs():
 def test_links_of_the_documents_lead_somewhere():
     for page in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
-            if not target.startswith("http"):
+            generated = (page.parent / target) in GENERATED
+            if not target.startswith("http") and not generated:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
-
-
-def test_examples_of_the_documents_load(tmp_path):
-    examples = []
-    for page in (ROOT / "README.md", ROOT / "docs" / "configuration.md", ROOT / "docs" / "formats.md"):
-        examples += re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) >= 5
-    for number, text in enumerate(examples):
-        path = tmp_path / f"{number}.yaml"
-        path.write_text(text, encoding="utf-8")
-        if "landmarks:\n" in text:
-            assert load_map(path).landmarks
-        else:
-            assert load_config(path) != Config()
 
 
 def test_no_paths_of_one_machine():

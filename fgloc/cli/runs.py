@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +16,8 @@ from fgloc.cli.options import (
     Bag,
     Bags,
     ConfigOption,
+    FigureFormat,
+    FiguresOption,
     MapOption,
     McapOption,
     ModelOption,
@@ -23,6 +26,7 @@ from fgloc.cli.options import (
     SchedulerOption,
     WorkersOption,
     configured,
+    figure_formats,
 )
 from fgloc.cli.progress import run_bar
 from fgloc.cli.remarks import remarks
@@ -68,10 +72,10 @@ def demo(
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = shlex.join(["fgloc", command, str(SAMPLE), "--out", str(folder)])
-        result, metrics = _localise(
-            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
+        result = _localise(
+            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online"
         )
-        runs.append((mode, metrics))
+        runs.append((mode, _write(result, SAMPLE, folder, text)))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
     say_table(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs])
@@ -92,16 +96,18 @@ def smooth(
     scheduler: SchedulerOption = None,
     rrd: RrdOption = None,
     mcap: McapOption = None,
+    figures: FiguresOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
-        if rrd is not None or mcap is not None:
-            raise ConfigError("--rrd, --mcap: expected one bag; give each its own command")
+        if rrd is not None or mcap is not None or figures:
+            raise ConfigError("--rrd, --mcap, --figures: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
-    _finish(result, metrics, out, rrd, mcap)
+    forms = figure_formats(figures)
+    result = _localise(bag, map_file, configured(bag, config, model), out, "batch")
+    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
 def online(
@@ -113,11 +119,13 @@ def online(
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
     mcap: McapOption = None,
+    figures: FiguresOption = None,
 ) -> None:
     """Replay the recording as on a live robot; each pose depends only on what came before."""
+    forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
-    _finish(result, metrics, out, rrd, mcap)
+    result = _localise(bag, map_file, configured(bag, config, model), out, "online", pace)
+    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
 def calibrate(
@@ -152,23 +160,27 @@ def _localise(
     config: Config,
     out: Path,
     mode: Literal["batch", "online"],
-    command: str,
     pace: float | None = None,
-) -> tuple[RunResult, Metrics]:
-    """Run one recording and write its results."""
+) -> RunResult:
+    """Run one recording, once it is certain that the results can be written."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.evaluation.report import write_results
     from fgloc.recording.files import find_beside
-    from fgloc.recording.outputs import sha256_of
     from fgloc.runner import run
     from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
-    config = resolved(config, map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace=pace)
-    return result, write_results(result, result.config or config, out, command, sha256_of(bag))
+        return run(bag, map_path, resolved(config, map_path), mode, progress, pace=pace)
+
+
+def _write(result: RunResult, bag: Path, out: Path, command: str, figures: Sequence[FigureFormat] = ()) -> Metrics:
+    """Write the results of a run."""
+    from fgloc.config import Config
+    from fgloc.evaluation.report import write_results
+    from fgloc.recording.outputs import sha256_of
+
+    return write_results(result, result.config or Config(), out, command, sha256_of(bag), figures)
 
 
 def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mcap: Path | None) -> None:
