@@ -118,9 +118,8 @@ class TopicTimes:
 
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
-        return signals_of(
-            wanted, _all(self._imu), _all(self._joints), self.joints, origin_ns, self._biases, self.imu_up
-        )
+        imu, joints = _all(self._imu), _all(self._joints)
+        return signals_of(wanted, imu, joints, self.joints, origin_ns, self._biases, self.imu_up)
 
     def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
         """What the localizer's own filter knew of the bias some time before each IMU message."""
