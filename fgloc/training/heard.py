@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.sensors.channels import Mounting, WheelJoints
 from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned.card import WheelJoints
 from fgloc.sensors.learned.signals import Signals, signals_of
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Event, FloatArray, Step
+from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Step
 
 _E = TypeVar("_E", bound=Event)
 
@@ -118,8 +118,8 @@ class TopicTimes:
 
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
-        imu, joints = _all(self._imu), _all(self._joints)
-        return signals_of(wanted, imu, joints, self.joints, origin_ns, self._biases, self.imu_up)
+        events = {InertialEvent: _all(self._imu), JointsEvent: _all(self._joints)}
+        return signals_of(wanted, events.__getitem__, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
 
     def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
         """What the localizer's own filter knew of the bias some time before each IMU message."""

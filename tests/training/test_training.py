@@ -15,6 +15,7 @@ from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
+from fgloc.sensors.base import MotionRole
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Input, Kind, Split
 from fgloc.sensors.learned.load import read_model
@@ -150,7 +151,7 @@ def test_wheels_with_unequal_radii_are_learned_and_slip_free_odometry_beaten(tmp
         update=dict(leave_one_out=False, split=split, network=network, optimization=optimization, calibration=quick)
     )
     card = training.train(config, split, runs, tmp_path / "m.safetensors", "a test")
-    assert card.reads_wheels
+    assert card.reads(MotionRole.ODOMETER)
     assert card.wheel_kinematics.yaw_per_m == pytest.approx(-0.01 / 0.26 * 2, rel=0.1)
     learned = roll_model(load_model(tmp_path / "m.safetensors"), runs["run2"], 0.2)
     wheels = roll_wheels(runs["run2"], 0.2)
