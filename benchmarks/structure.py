@@ -38,6 +38,7 @@ SENSORS = {  # name -> where it lives in fgloc/sensors, its section of the confi
     "uwb": (("uwb",), "uwb", ()),
     "gnss": (("gnss",), "gnss", ()),
 }
+_LISTS = ("SensorSections", "SensorInput", "built_in")  # of the registry: sections, methods of `Live`, sensors
 _CITED = re.compile(r"(?<![\w/.*<-])(?:\.\./)*[\w][\w./-]*\.(?:md|py)\b(?!\w)")
 
 Found = list[str]
@@ -61,8 +62,12 @@ def flat_files(root: Path) -> Found:
 
 def imported(path: Path) -> set[str]:
     """Dotted names of what a module imports; of ``from a import b`` both ``a`` and ``a.b``."""
+    return _imported(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def _imported(tree: ast.Module) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -146,19 +151,25 @@ def loaded(path: Path) -> set[str]:
 
 
 def sensor_leaks(root: Path) -> Found:
-    """Modules of fgloc, outside a sensor's own, that name its classes, its events, its configuration or its name."""
+    """Modules of fgloc, outside a sensor's own, that import it or name its classes, events, settings or its name.
+
+    The registry may do so where it lists the sensors, and nowhere else.
+    """
     found = []
     for sensor, (homes, section, classes) in SENSORS.items():
         folder = root / "fgloc" / "sensors"
         own = {path for home in homes for path in (folder / f"{home}.py", *(folder / home).rglob("*.py"))}
         defined = {node.name for path in own if path.is_file() for node in _public_classes(path)}
         for path in core_modules(root):
-            if path in own or path == folder / "registry.py":
+            if path in own:
                 continue
-            homemade = {
-                name.rpartition(".")[2] for name in imported(path) if name.startswith("fgloc.sensors.")
-            } & defined
-            if named := sorted(homemade | _names_of(path, classes, sensor, section or "-")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            if path == folder / "registry.py":
+                tree.body = [node for node in tree.body if not _lists_sensors(node)]
+            names = {name for name in _imported(tree) if name.startswith("fgloc.sensors.")}
+            homemade = {name.rpartition(".")[2] for name in names} & defined
+            packages = {".".join(name.split(".")[:3]) for name in names if name.split(".")[2] in homes}
+            if named := sorted(homemade | packages | _names_of(tree, classes, sensor, section or "-")):
                 found.append(f"{path.relative_to(root)} names {sensor}: {', '.join(named)}")
     return found
 
@@ -168,9 +179,14 @@ def _public_classes(path: Path) -> list[ast.ClassDef]:
     return [node for node in body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
 
 
-def _names_of(path: Path, classes: Iterable[str], sensor: str, section: str) -> set[str]:
+def _lists_sensors(node: ast.stmt) -> bool:
+    """Whether a statement of the registry is one of those that take a line a sensor, or an import for them."""
+    return isinstance(node, ast.Import | ast.ImportFrom) or getattr(node, "name", "") in _LISTS
+
+
+def _names_of(tree: ast.Module, classes: Iterable[str], sensor: str, section: str) -> set[str]:
     named = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Name) and node.id in classes:
             named.add(node.id)
         elif isinstance(node, ast.Attribute) and re.search(rf"config\.{section}$", ast.unparse(node)):

@@ -97,9 +97,9 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
 def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, camera = setup.learned, setup.camera
-    joint = None if learned is None else registry.error_correlation(config, learned)
-    wheels = registry.odometer(config)
-    gyro = None if setup.imu_up is None else registry.rate_sensor(config, setup.imu_up)
+    joint = None if learned is None else registry.motion_model().correlation(config, learned)
+    wheels = registry.odometer().build(config)
+    gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
     motion = MotionSensors(wheels, learned, joint, gyro)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen_by: Role = "sightings" if setup.detector is None else "image"

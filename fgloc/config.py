@@ -23,16 +23,7 @@ _Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
 _Sigma = Annotated[float, Field(ge=1e-6, le=1e4)]  # m or rad
 Role = str
 """Of a topic: a built-in one, or one that a sensor of another package brings."""
-BUILT_IN_ROLES: tuple[Role, ...] = (
-    "odometry",
-    "command",
-    "joints",
-    "imu",
-    "image",
-    "camera_info",
-    "sightings",
-    "truth",
-)
+BUILT_IN_ROLES = ("odometry", "command", "joints", "imu", "image", "camera_info", "sightings", "truth")
 
 
 def role_names() -> tuple[Role, ...]:
@@ -203,6 +194,15 @@ class BatchConfig(Section):
     max_iterations: int = Field(50, ge=1, le=1000, description="of Levenberg–Marquardt, each")
 
 
+class LiveConfig(Section):
+    """A live run."""
+
+    startup_s: float = Field(
+        2.0, ge=0, le=1e6, description="the run begins this long after its first event, without what has not come"
+    )
+    image_queue: int = Field(4, gt=0, le=100_000, description="images that may wait for detection; the oldest goes")
+
+
 class TruthConfig(Section):
     """What is known of the truth's frame. Only evaluation reads it."""
 
@@ -224,6 +224,7 @@ class Config(registry.SensorSections):
     estimator: EstimatorConfig = EstimatorConfig()
     weights: WeightsConfig = WeightsConfig()
     batch: BatchConfig = BatchConfig()
+    live: LiveConfig = LiveConfig()
     truth: TruthConfig = TruthConfig()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -280,7 +281,7 @@ def yaml_of(config: Config, folder: Path) -> str:
     for section, key in files_of(type(config)):
         path = getattr(getattr(config, section), key)
         if path is not None:
-            data[section][key] = registry.shipped_name(path) or os.path.relpath(path, folder)
+            data[section][key] = registry.motion_model().shipped_name(path) or os.path.relpath(path, folder)
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
 
 

@@ -73,7 +73,7 @@ class Localizer:
         with self.stopwatch("sightings"):
             sightings = self._compensation.measure(step, self.factors.time_offset_s)
         # 2. No pose yet, or lost: collect steps and search the map
-        if self.tracking.waiting:
+        if self.tracking.initializing:
             return self._initialization.add(step, readings, sightings)
         return self._advance(step, readings, sightings)
 
@@ -100,7 +100,7 @@ class Localizer:
         # 5. Judge by the fused pose: the motion sources' drift, and landmarks that were moved
         if seen.accepted:
             self.tracking.record_fix()
-        self.motion.commit(motion, belief if seen.accepted else None, seen.tells_yaw)
+        self.motion.commit(motion, belief if seen.accepted else None, seen.observes_yaw)
         moved, pose_changed = self.sightings.exclude_moved(step, motion, seen)
         if pose_changed:
             self.motion.restart()

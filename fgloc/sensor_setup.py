@@ -82,7 +82,7 @@ def recorded_setup(
     facts = RecordingFacts(recording)
     _need_motion(facts)
     if landmark_map is None and map_path is not None:
-        landmark_map = load_map(map_path, registry.landmark_size(config))
+        landmark_map = load_map(map_path, registry.raw_landmarks().size(config))
     return facts, sensor_setup(facts, landmark_map, config)
 
 
@@ -107,10 +107,10 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
-    detector = registry.detector(config, landmark_map) if "image" in facts.roles else None
+    detector = registry.raw_landmarks().detector(config, landmark_map) if "image" in facts.roles else None
     imu_up = None
-    learned = registry.motion_predictor(config, lambda: mounted_up(facts, config, facts.first))
-    if "imu" in facts.roles and registry.rate_is_used(config):
+    learned = registry.motion_model().build(config, lambda: mounted_up(facts, config, facts.first))
+    if "imu" in facts.roles and registry.rate_sensor().is_used(config):
         imu_up = mounted_up(facts, config, facts.first)
     return SensorSetup(config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, sensors, tuple(notes))
 
@@ -230,13 +230,13 @@ def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
     base = base_frame(stream, config, first)
     event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
     if event is not None and event.frame_id in stream.frames and base in stream.frames:
-        return np.asarray(registry.rate_scale(config) * stream.frames.lookup(base, event.frame_id)[2, :3])
-    return np.array([0.0, 0.0, registry.rate_scale(config)])
+        return np.asarray(registry.rate_sensor().scale(config) * stream.frames.lookup(base, event.frame_id)[2, :3])
+    return np.array([0.0, 0.0, registry.rate_sensor().scale(config)])
 
 
 def base_up(recording: Recording, config: Config) -> FloatArray | None:
     """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
-    if "imu" not in recording.roles or not registry.rate_is_used(config):
+    if "imu" not in recording.roles or not registry.rate_sensor().is_used(config):
         return None
     return mounted_up(recording, config, first_events(recording))
 

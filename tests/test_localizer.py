@@ -28,11 +28,11 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.relocalization.pose_fit import fit_pose
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.motion_compensation import carry
+from fgloc.sensors.motion_compensation import compensated
 from fgloc.types import LandmarkMap, Mode, PixelMeasurement
 
 MAPS = {"corners": room, "beacons": beacons}
@@ -152,7 +152,7 @@ def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
     for _ in range(40):
         seen = PixelMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
         wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
-        fit = joint_fit(keyframe, [carry(seen, wrong, cov)], factors, settings)
+        fit = fit_pose(keyframe, [compensated(seen, wrong, cov)], factors, settings)
         error = se2.log(se2.between(fit.pose, keyframe))
         values.append(float(error @ np.linalg.solve(fit.cov, error)))
     assert np.mean(values) < 3.0 * 1.5

@@ -106,7 +106,7 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
             "code": code_hash(),
         }
         seen = {name: inputs[name] for name in ("bag", "map", "code")} | {
-            "dictionary": registry.landmark_dictionary(cell.config)
+            "dictionary": registry.raw_landmarks().dictionary(cell.config)
         }
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}
@@ -205,7 +205,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
-    landmark_map = load_map(cell.map, registry.landmark_size(config)) if cell.map is not None else None
+    landmark_map = load_map(cell.map, registry.raw_landmarks().size(config)) if cell.map is not None else None
     ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
     if cell.start == "truth":

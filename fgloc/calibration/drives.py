@@ -55,7 +55,7 @@ class Drive:
         """
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
-        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), registry.odometer(config)
+        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), registry.odometer().build(config)
         motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
         moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[PixelMeasurement]] = []
@@ -141,13 +141,13 @@ def _checked(
 def _check(bag: Path, recording: Recording, config: Config) -> None:
     if not {"image", "sightings"} & set(recording.roles):
         raise RecordingError(f"{bag}: no images and no corners of markers: nothing to survey; see `fgloc info {bag}`")
-    if "image" in recording.roles and not registry.landmark_dictionary(config):
-        fitting = registry.fitting_dictionary(recording)
+    if "image" in recording.roles and not registry.raw_landmarks().dictionary(config):
+        fitting = registry.raw_landmarks().fitting_dictionary(recording)
         listed = (
             f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
         )
         raise ConfigError(f"{bag}: no marker dictionary; {listed}, or markers.dictionary in --config")
-    if registry.landmark_size(config) is None:
+    if registry.raw_landmarks().size(config) is None:
         raise ConfigError(
             f"{bag}: the distance of markers follows from their size: give the side of the black square in "
             "metres, --size 0.16, or markers.default_size_m in --config"

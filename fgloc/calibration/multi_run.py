@@ -15,11 +15,10 @@ from fgloc.recording.files import find_beside
 from fgloc.replay.options import Progress
 from fgloc.runner import run
 from fgloc.sensors import registry
+from fgloc.sensors.roles import with_values
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before
-_WHEELS = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # before anything was seen
-_COMMANDS = _WHEELS | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
 _FAR = 3.0  # of these sigmas that a gain may move at most
 _UNSEEN = 0.95  # share of its sigma that is left to a gain that no measurement determines
 
@@ -44,20 +43,27 @@ def calibrate(
     now = config
     for _ in range(_ROUNDS):
         settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
-        wheels = [s for s in settings if s.name.startswith("wheels.")]
-        at = {s.name: s for s in wheels}
-        values = {name.partition(".")[2]: round(s.found, 7) for name, s in at.items()}
-        now = now.model_copy(update={"wheels": now.wheels.model_copy(update=values)})
-    given = {s.name: getattr(config.wheels, s.name.partition(".")[2]) for s in wheels}
+        values = {_key(s): round(s.found, 7) for s in _of_odometer(settings)}
+        now = with_values(now, registry.motion_names().odometer, values)
+    before = getattr(config, registry.motion_names().odometer)
+    given = {s.name: getattr(before, _key(s)) for s in _of_odometer(settings)}
     settings = tuple(replace(s, given=given.get(s.name, s.given)) for s in settings)
     _check(settings)
     return with_settings(config, settings), settings
 
 
+def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:
+    return [s for s in settings if s.name.startswith(f"{registry.motion_names().odometer}.")]
+
+
+def _key(setting: Setting) -> str:
+    return setting.name.partition(".")[2]
+
+
 def _check(settings: Sequence[Setting]) -> None:
-    wheels = [s for s in settings if s.name.startswith("wheels.")]
+    wheels = _of_odometer(settings)
     if any(abs(s.found - s.given) > _FAR * s.prior_sigma for s in wheels):
-        listed = ", ".join(f"{s.name.partition('.')[2]} {s.found:.4f} ± {s.sigma:.4f}" for s in wheels)
+        listed = ", ".join(f"{_key(s)} {s.found:.4f} ± {s.sigma:.4f}" for s in wheels)
         raise EstimatorError(
             f"the wheels cannot be calibrated on this run: {listed} is no robot's; see the rejections of "
             "`fgloc smooth`, and begin with gains that are less far off"
@@ -67,10 +73,9 @@ def _check(settings: Sequence[Setting]) -> None:
 def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Progress | None) -> RunResult:
     """The bag smoothed with wide priors on the wheels; on commands if there are no wheels."""
     map_path = map_path or find_beside(bag, "map.yaml")
-    for sigmas in (_COMMANDS,) if config.wheels.source == "command" else (_WHEELS, _COMMANDS):
-        motion, wheels = config.motion.model_copy(update={"use": False}), config.wheels.model_copy(update=sigmas)
-        alone = config.model_copy(update={"motion": motion, "wheels": wheels})
-        result = run(bag, map_path, alone, "batch", progress, check=False)
+    odometer = registry.odometer()
+    for freed in odometer.freed(registry.motion_model().without(config)):
+        result = run(bag, map_path, freed, "batch", progress, check=False)
         if result.found is not None and result.found.wheels != "command":
             break
     if not any(result.counts.get(kind) for kind in registry.landmark_kinds()):
@@ -79,8 +84,8 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
             f"gains of the wheels; see `fgloc info {bag}`"
         )
     assert result.found is not None
-    radius = next((s for s in result.found.settings if s.name == "wheels.scale_v"), None)
-    if not result.found.wheels or radius is None or radius.sigma > _UNSEEN * radius.prior_sigma:
+    gain = next((s for s in result.found.settings if s.name == odometer.distance_gain), None)
+    if not result.found.wheels or gain is None or gain.sigma > _UNSEEN * gain.prior_sigma:
         raise EstimatorError(
             f"{bag}: no messages of wheels, or of commands in their place, between sightings: see wheels.source "
             f"and `fgloc info {bag}`"

@@ -70,7 +70,8 @@ def survey(
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
-    sizes = dict.fromkeys(seen, registry.landmark_size(config) or 0.0) | {i: m.size_m for i, m in anchors.items()}
+    size = registry.raw_landmarks().size(config) or 0.0
+    sizes = dict.fromkeys(seen, size) | {i: m.size_m for i, m in anchors.items()}
     legs, start, left_out = _joined(drives, sizes, anchors, config.landmarks.min_sightings)
     _need_ends(distances, start, left_out)
     graph = SurveyGraph(legs, start, set(anchors), config, distances)
@@ -82,7 +83,7 @@ def survey(
         raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
-    dictionary = registry.landmark_dictionary(config) or (given.dictionary if given is not None else "")
+    dictionary = registry.raw_landmarks().dictionary(config) or (given.dictionary if given is not None else "")
     landmarks = LandmarkMap(dict(sorted((kept | unseen).items())), dictionary, "surveyed")
     first = drives[0].parts
     found = found_values(graph.installation, graph.belief, first.config, first.camera, graph.landmark_map)

@@ -84,6 +84,6 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     if model is None:
         return config
     try:
-        return registry.with_motion_model(config, model)
+        return registry.motion_model().given(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error

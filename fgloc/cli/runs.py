@@ -28,8 +28,20 @@ from fgloc.cli.options import (
     configured,
     figure_formats,
 )
+from fgloc.cli.progress import run_bar
+from fgloc.cli.remarks import remarks
 from fgloc.cli.sweeps import smooth_many
-from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
+from fgloc.cli.terminal import (
+    exit_code,
+    exit_unless_trusted,
+    next_step,
+    number,
+    say,
+    say_remark,
+    say_table,
+    shown_path,
+    typed,
+)
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
@@ -66,7 +78,7 @@ def demo(
         runs.append((mode, _write(result, SAMPLE, folder, text)))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
-    say(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
+    say_table(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs])
     say("")
     for mode, _ in runs:
         say(f"{mode:<8}{out / mode / 'report.html'}")
@@ -135,8 +147,11 @@ def calibrate(
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
     rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
-    say(columns(("setting", "given", "found"), rows))
+    say_table(("setting", "given", "found"), rows)
     say(f"configuration: {out}")
+    paths = " ".join(shown_path(bag) for bag in bags)
+    next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
+    next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")
 
 
 def _localise(
@@ -179,14 +194,11 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
-    for mistake in result.mistakes:
-        say(f"mistake: {mistake}")
-    say(columns(None, rows))
+    for remark in remarks(result, metrics):
+        say_remark(*remark)
+    say_table(None, rows)
     for judgement in gravest(metrics.judgements, _TOLD):
         say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
-    for note in result.notes:
-        if note not in result.mistakes:
-            say(f"note: {note}")
     exit_unless_trusted(result)
 
 

@@ -48,7 +48,7 @@ class SightingCollector:
 
     def spots(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
         """What was seen where."""
-        if event.in_pixels and self._map is None and registry.landmark_size(self._config) is None:
+        if event.in_pixels and self._map is None and registry.raw_landmarks().size(self._config) is None:
             return
         for m in self._sensor.measure(event):
             if isinstance(m, PixelMeasurement):

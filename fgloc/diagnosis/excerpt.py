@@ -202,12 +202,12 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
-    wheels = registry.odometer(config)
+    wheels = registry.odometer().build(config)
     wheels.measure(step)
     if not wheels.source:
         return None
     excerpt.wheel_source = wheels.source
-    motions = [wheels.carry(step, a, b)[0] for a, b in pairwise(grid.tolist())]
+    motions = [wheels.motion_between(step, a, b)[0] for a, b in pairwise(grid.tolist())]
     return np.array([se2.log(m) for m in motions])
 
 

@@ -143,7 +143,7 @@ class _Search:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):
             return False
-        if registry.landmark_dictionary(self.config) != registry.landmark_dictionary(parts.config):
+        if registry.raw_landmarks().dictionary(self.config) != registry.raw_landmarks().dictionary(parts.config):
             self.detections.clear()
             parts, excerpt = self._read(recording)
         self._fit(recording, excerpt, parts)

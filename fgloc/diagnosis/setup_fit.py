@@ -17,6 +17,7 @@ from fgloc.diagnosis.excerpt import Stretch, usable
 from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
+from fgloc.sensors import registry
 from fgloc.sensors.cameras import pinhole, undistort_points
 from fgloc.sensors.pnp import marker_pose_candidates
 from fgloc.types import Camera, FloatArray, IntArray, Landmark, LandmarkMap, PixelMeasurement
@@ -94,7 +95,7 @@ class Problem:
         """
         self._stretches, self._setup = stretches, setup
         ideal = pinhole(setup.camera)
-        sigma = float(np.hypot(setup.config.markers.sigma_px, _SIGMA_PX))
+        sigma = float(np.hypot(registry.raw_landmarks().sigma_px(setup.config), _SIGMA_PX))
         self._motion = Motion(stretches, setup.turned, setup.config)
         self._corners: list[FloatArray] = []
         self._measured: list[PixelMeasurement] = []

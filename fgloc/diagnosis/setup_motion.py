@@ -10,6 +10,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.excerpt import GRID_S, Stretch
 from fgloc.diagnosis.window import rigid
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, IntArray
 
 EXTRAS = ("size", "map_scale", "radius", "track", "yaw_per_m", "late_s", "gyro_late_s", "gyro_scale", "gyro_bias")
@@ -43,7 +44,8 @@ class Motion:
             config: noise of wheels and gyro.
         """
         self._stretches, self._turned_by = stretches, turned
-        self._noise, self._gyro_noise = config.wheels.noise, config.gyro.yaw_per_sqrt_s
+        self._noise = registry.odometer().errors(config).noise
+        self._gyro_noise = registry.rate_sensor().errors(config).yaw_per_sqrt_s
         lengths = [len(s.times) for s in stretches]
         self.stretch_of = np.repeat(np.arange(len(stretches)), lengths)
         self.pairs: IntArray = np.flatnonzero(np.diff(self.stretch_of) == 0)
@@ -144,7 +146,8 @@ class Motion:
 
 def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
     """Prior sigmas of `EXTRAS` in an ordinary installation; what can be no unknown is held."""
-    wheels, camera = config.wheels, config.camera
+    wheels, camera = registry.odometer().errors(config), config.camera
+    gyro = registry.rate_sensor().errors(config)
     late = float(np.hypot(camera.time_offset_sigma_s, wheels.time_offset_sigma_s))
     sigmas = (
         _SIZE_SIGMA,
@@ -154,8 +157,8 @@ def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
         max(wheels.yaw_per_m_sigma, _HELD),
         late,
         camera.time_offset_sigma_s,
-        config.gyro.scale_sigma if has_gyro else _HELD,
-        config.gyro.bias_sigma if has_gyro else _HELD,
+        gyro.scale_sigma if has_gyro else _HELD,
+        gyro.bias_sigma if has_gyro else _HELD,
     )
     return dict(zip(EXTRAS, sigmas, strict=True))
 

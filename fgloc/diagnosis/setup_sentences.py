@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +14,7 @@ from fgloc.diagnosis.setup_changes import Change, angle_of, k1_of
 from fgloc.diagnosis.setup_fit import Setup
 from fgloc.diagnosis.setup_motion import EXTRAS
 from fgloc.sensors import registry
+from fgloc.sensors.roles import SetupMistake, with_values
 from fgloc.types import FloatArray, LandmarkMap
 
 _SAID_DEG = 1.0  # degrees: less is not put into words
@@ -53,8 +53,6 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
             return _lens(change, given)
         case "mounting" | "position":
             return _mounting(change, given)
-        case "radius" | "track":
-            return _geometry(change.kind, values, given, source)
         case "image_clock":
             return _clock(given, image, "images" if image == "image" else "sightings", values["late_s"])
         case "wheel_clock":
@@ -62,7 +60,7 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
         case "gyro_clock":
             return _clock(given, "imu", registry.motion_names().rate, -values["gyro_late_s"])
         case _:
-            return _wheels(change, given, source)
+            return _odometer(change, given, source)
 
 
 def _size(given: Setup, factor: float) -> Correction:
@@ -170,29 +168,6 @@ def _roll(T: FloatArray) -> float:
     return math.atan2(-T[2, 0], -T[2, 1])
 
 
-def _geometry(kind: str, values: Mapping[str, float], given: Setup, source: str) -> Correction:
-    wheels, factor = given.config.wheels, math.exp(values[kind])
-    if kind == "track":
-        if source == "ticks" and wheels.track is not None:
-            new = {"track": wheels.track * factor}
-        else:
-            new = {"scale_omega": wheels.scale_omega / factor}
-        what = "The wheels turn the robot"
-        how = f"{1.0 / factor:.3f} times as far as given: set {_lines(new)}."
-        return Correction(f"{what} {how}", _set(given.config, "wheels", **new), given.landmark_map)
-    if source == "ticks" and wheels.left_radius is not None and wheels.right_radius is not None:
-        new = {"left_radius": wheels.left_radius * factor, "right_radius": wheels.right_radius * factor}
-        sentence = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
-    else:
-        new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
-        sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
-    return Correction(sentence, _set(given.config, "wheels", **new), given.landmark_map)
-
-
-def _lines(values: Mapping[str, float]) -> str:
-    return " and ".join(f"wheels.{name}: {value:.4g}" for name, value in values.items())
-
-
 def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
     offsets = dict(given.config.recording.stamp_offset_s)
     offset = offsets.get(role, 0.0) - late_s
@@ -206,32 +181,12 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
     )
 
 
-def _wheels(change: Change, given: Setup, source: str) -> Correction:
-    wheels = given.config.wheels
-    if change.kind == "odometry_frame":
-        c, s = change.setup.turned[:2, 0]
-        angle = math.degrees(math.atan2(s, c))
-        sentence = (
-            f"The odometry's twist is in axes turned by {-angle:.0f}° against the base: set wheels.source: pose, or "
-            "correct its child_frame_id."
-        )
-        return Correction(sentence, _set(given.config, "wheels", source="pose"), given.landmark_map)
-    if source == "ticks" and change.kind == "exchanged" and wheels.left_joint and wheels.right_joint:
-        sentence = (
-            "The left and the right wheel are exchanged: set wheels.left_joint: "
-            f"{wheels.right_joint} and wheels.right_joint: {wheels.left_joint}."
-        )
-        new = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
-        return Correction(sentence, _set(given.config, "wheels", **new), given.landmark_map)
-    how = {
-        "exchanged": "turn the robot the other way (left and right exchanged)",
-        "reversed": "turn backward when the robot goes forward",
-        "both_reversed": "turn backward when the robot goes forward, and left and right are exchanged",
-    }[change.kind]
-    line = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
-    return Correction(f"The wheels {how}: {line}.", given.config, given.landmark_map)
+def _odometer(change: Change, given: Setup, source: str) -> Correction:
+    values = dict(zip(EXTRAS, change.setup.extras.tolist(), strict=True))
+    mistake = SetupMistake(change.kind, math.exp(values.get(change.kind, 0.0)), change.setup.turned, source)
+    found = registry.odometer().correct(mistake, given.config)
+    return Correction(found.sentence, _set(given.config, found.section, **found.values), given.landmark_map)
 
 
 def _set(config: Config, section: str, **values: Any) -> Config:
-    part = getattr(config, section)
-    return config.model_copy(update={section: part.model_copy(update=values)})
+    return with_values(config, section, values)

@@ -135,7 +135,7 @@ def _sensors(result: RunResult) -> list[Row]:
     for name, topic in result.spans.items():
         steps = np.diff(np.sort(topic.times)) / topic.every
         rate = f"{1.0 / np.median(steps):.1f}" if len(steps) and np.median(steps) > 0 else "–"
-        rows.append((name, str(topic.count), rate, f"{topic.longest_silence_s:.2f}" if topic.count > 1 else "–"))
+        rows.append((name, str(topic.count), rate, f"{topic.longest_gap_s:.2f}" if topic.count > 1 else "–"))
     return rows
 
 

@@ -7,7 +7,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable
 
-from fgloc.errors import EstimatorError, FglocError
+from fgloc.config import LiveConfig
+from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
@@ -32,14 +33,13 @@ class Engine:
         step_s, longest_s: wall time of an update: mean of the last ones, and the longest.
     """
 
-    def __init__(self, run: OnlineRun, outlet: Outlet, startup_s: float, image_queue: int) -> None:
+    def __init__(self, run: OnlineRun, outlet: Outlet, config: LiveConfig) -> None:
         """Start the threads.
 
         Args:
             run: what is to be fed.
             outlet: takes what comes out.
-            startup_s: how long its roles are waited for, by receive times.
-            image_queue: images that may wait.
+            config: how long its roles are waited for, by receive times, and how many images may wait.
         """
         self.busy = threading.RLock()
         self.changed = threading.Condition()
@@ -48,7 +48,7 @@ class Engine:
         self.step_s = self.longest_s = 0.0
         self._run = run
         self._outlet = outlet
-        self._startup_s = startup_s
+        self._startup_s = config.startup_s
         self._inbox: deque[Queued | PoseWithCovariance] = deque()
         self._line: deque[Queued] = deque()  # gated, in order; only the estimation thread changes it
         self._held: deque[Queued] = deque(maxlen=_MOST_EVENTS)  # before the parts are built
@@ -56,7 +56,7 @@ class Engine:
         self._working = False
         self._closing = False
         self._failed: FglocError | None = None
-        self.worker = DetectionWorker(self.changed, image_queue)
+        self.worker = DetectionWorker(self.changed, config.image_queue)
         self._thread = threading.Thread(target=self._estimate, name="fgloc-estimation", daemon=True)
         self._thread.start()
 
@@ -143,8 +143,7 @@ class Engine:
                 self._use_line()
                 self._report(self._run.finish())
         except Exception as error:  # raised again by the next call from outside
-            failure = error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")
-            failure.__cause__ = error.__cause__ if failure is error else error
+            failure = unexpected(error, "the live run")
             with self.changed:
                 self._failed = failure
                 self._working = False

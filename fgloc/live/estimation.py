@@ -31,8 +31,6 @@ class Settings:
     state: Path | None
     roles: Collection[Role] | None
     camera: Camera | None
-    startup_s: float
-    image_queue: int
 
 
 class Estimation:
@@ -48,7 +46,7 @@ class Estimation:
         read = Resumed(None, "") if self._state is None else read_state(self._state, fingerprint(landmark_map))
         facts = LiveFacts(settings.config, settings.roles, settings.camera)
         self.run = OnlineRun(settings.config, landmark_map, facts, read.state)
-        self._engine = Engine(self.run, outlet, settings.startup_s, settings.image_queue)
+        self._engine = Engine(self.run, outlet, settings.config.live)
         if read.note:
             self._note(read.note)
         self._saver = threading.Thread(target=self._save_regularly, name="fgloc-state", daemon=True)

@@ -110,7 +110,7 @@ class Extrapolator:
             if anchor.segment != self._segment:
                 self._anchors.clear()
                 self._segment = anchor.segment
-            self._anchors.append(_Held(anchor, self._means, registry.odometer(self._config)))
+            self._anchors.append(_Held(anchor, self._means, registry.odometer().build(self._config)))
             while self._anchors[0].stamp_ns < anchor.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
             for events in self._events.values():

@@ -52,8 +52,6 @@ class Live(EventMaker):
         state: Path | None = None,
         roles: Collection[Role] | None = None,
         camera: Camera | None = None,
-        startup_s: float = 2.0,
-        image_queue: int = 4,
         process: bool | EstimationProcess = False,
     ) -> None:
         """Start the threads; nothing is estimated before events come in.
@@ -62,12 +60,10 @@ class Live(EventMaker):
             config: all settings, as `load_config` reads them.
             landmark_map: the map, or its file; None: landmarks are estimated too.
             state: file that the state is saved to every second and at the end, and resumed from.
-            roles: what will come in. The run begins when all of it is there; None: after ``startup_s``.
+            roles: what will come in. The run begins when all of it is there; None: ``live.startup_s`` of the settings
+                after the first event, by receive times, with what has come. With ``roles`` it begins then without
+                those that are not there. What comes later joins later.
             camera: the calibrated and mounted camera, if no CameraInfo and transforms will tell it.
-            startup_s: how long [s] roles are waited for, by receive times. Without ``roles`` the run always begins this
-                long after the first event, with what has come; with them it begins earlier if all are there, and
-                without those that are not. What comes later joins later.
-            image_queue: images that may wait for detection; of more the oldest is dropped.
             process: estimate in another process (or in this one, which was started before), so that `push`, `pose_at`
                 and the caller's own threads never wait for an update. It costs some processor time for every event.
 
@@ -75,13 +71,13 @@ class Live(EventMaker):
             MapError, ModelError: as their loaders have it.
         """
         if isinstance(landmark_map, Path):
-            landmark_map = load_map(landmark_map, registry.landmark_size(config))
-        registry.motion_predictor(config)  # a file that cannot be used is refused now, not when the robot drives
+            landmark_map = load_map(landmark_map, registry.raw_landmarks().size(config))
+        registry.motion_model().build(config, None)  # refuses a file now, not when the robot drives
         self._recording = config.recording
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
         self._reception = Reception(config)
         self._results = _Results(config)
-        settings = Settings(config, landmark_map, state, roles, camera, startup_s, image_queue)
+        settings = Settings(config, landmark_map, state, roles, camera)
         self._estimation = _begun(process, settings, self._results)
 
     def __enter__(self) -> Live:

@@ -72,7 +72,7 @@ class EstimationProcess:
 
     def begin(self, settings: Settings, outlet: Outlet) -> None:
         """Set up the run; otherwise as `Estimation`."""
-        self._most_images = settings.image_queue
+        self._most_images = settings.config.live.image_queue
         self._connection.send(settings)
         for name, work in (("send", self._send), ("receive", lambda: self._receive(outlet))):
             thread = threading.Thread(target=work, name=f"fgloc-{name}", daemon=True)

@@ -10,6 +10,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.state import OdometryState, RunState, row3
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, Mode, MotionEvent, Step
 
 _KNOWN = (Mode.OK, Mode.DEAD_RECKONING)  # modes whose pose is worth going on from
@@ -34,7 +35,7 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
     Args:
         state: what the last run saved.
         step: the first one.
-        config: noise of the wheels.
+        config: error model of the odometer.
         wall_ns: wall clock at the step; tells the time away if the stamps' clock was set back.
 
     Returns:
@@ -86,14 +87,15 @@ def _by_odometry(state: RunState, step: Step, gap_s: float) -> FloatArray | None
 
 def _odometry_cov(state: RunState, motion: FloatArray, gap_s: float, config: Config) -> FloatArray:
     """Covariance ``(3, 3)`` of that motion: along a path that is as long as the speed before suggests, or the chord."""
-    noise, wheels = config.wheels.noise, config.wheels
+    errors = registry.odometer().errors(config)
+    noise = errors.noise
     speed, turn = math.hypot(*state.twist[:2]), abs(state.twist[2])
     path = max(math.hypot(*motion[:2]), speed * gap_s)
     turned = max(abs(float(motion[2])), turn * gap_s)
     yaw = noise.yaw_per_sqrt_m**2 * path + noise.yaw_per_sqrt_rad**2 * turned + noise.yaw_per_sqrt_s**2 * gap_s
-    yaw += (wheels.turn_scale_sigma * turned) ** 2 + (wheels.yaw_per_m_sigma * path) ** 2 + (_STAMP_S * turn) ** 2
+    yaw += (errors.turn_scale_sigma * turned) ** 2 + (errors.yaw_per_m_sigma * path) ** 2 + (_STAMP_S * turn) ** 2
     common = noise.xy_per_sqrt_rad**2 * turned + noise.xy_per_sqrt_s**2 * gap_s
-    common += (wheels.scale_sigma * path) ** 2 + (_STAMP_S * speed) ** 2 + yaw * path**2 / 3.0
+    common += (errors.scale_sigma * path) ** 2 + (_STAMP_S * speed) ** 2 + yaw * path**2 / 3.0
     x = noise.x_per_sqrt_m**2 * path + common
     y = noise.y_per_sqrt_m**2 * path + common
     return np.diag([x, y, yaw]) + 1e-9 * np.eye(3)

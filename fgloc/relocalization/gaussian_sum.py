@@ -83,7 +83,7 @@ class GaussianSum:
         off[:, 2] -= share @ off[:, 2]
         return PoseWithCovariance(mean, se2.rotate_cov((off * share[:, None]).T @ off, -float(mean[2])))
 
-    def likeliest(self) -> PoseWithCovariance | None:
+    def most_probable(self) -> PoseWithCovariance | None:
         """The hypothesis with the largest weight; None before the first sighting."""
         if not len(self.poses):
             return None

@@ -16,7 +16,7 @@ from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
-from fgloc.sensors.motion_compensation import carry
+from fgloc.sensors.motion_compensation import compensated
 from fgloc.types import (
     FloatArray,
     LandmarkMap,
@@ -65,7 +65,7 @@ class GlobalSearch:
     """Collects steps while the pose is unknown.
 
     Attributes:
-        waiting: whether the first pose is still looked for.
+        initializing: whether the first pose is still looked for.
         hypotheses: where the robot may be before that is confirmed.
     """
 
@@ -83,12 +83,12 @@ class GlobalSearch:
         self.hypotheses = GaussianSum(config, landmark_map)
         self._since_ns: int | None = None  # the first sighting of the search
         self._tried_ns = 0  # when a place was looked for last
-        self.waiting = True
+        self.initializing = True
 
     def reset(self) -> None:
         """Look for the pose again."""
         self.forget()
-        self.waiting = self._first = True
+        self.initializing = self._first = True
 
     @property
     def searching(self) -> bool:
@@ -154,14 +154,14 @@ class GlobalSearch:
         """
         if not self._first or not self._steps:
             return None
-        likeliest = self.hypotheses.likeliest()
-        if likeliest is not None:
-            return self._start(likeliest)
+        best = self.hypotheses.most_probable()
+        if best is not None:
+            return self._start(best)
         origin = PoseWithCovariance(np.zeros(3), ORIGIN.copy())
         return dataclasses.replace(self._start(origin), first=origin)
 
     def _start(self, newest: PoseWithCovariance) -> InitialPose:
-        self.waiting = False
+        self.initializing = False
         steps = (*self._earlier, *self._steps)
         first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
         self.forget()
@@ -178,7 +178,7 @@ class GlobalSearch:
         for index in range(len(self._steps) - 1, -1, -1):
             collected = self._steps[index]
             for m in collected.sightings:
-                yield carry(m, motion, cov)
+                yield compensated(m, motion, cov)
             if collected.motions and index > 0:
                 step, step_cov = fuse(collected.motions)
                 back = se2.inverse(step)

@@ -58,7 +58,7 @@ class Initialization:
         """Before a step is measured: begin a segment where nothing connects it to the last, or search if lost."""
         if step.segment != self._segment or self._restart is not None:
             self._begin_segment(step)
-        elif not self._tracking.waiting and self._tracking.is_unlocalized(self._estimator.belief):
+        elif not self._tracking.initializing and self._tracking.is_unlocalized(self._estimator.belief):
             self._sightings.modes.forget()
             self._tracking.get_lost()
 

@@ -10,7 +10,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, apart
-from fgloc.relocalization.pose_fit import Fit, PoseFit, joint_fit, sighting_costs
+from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     FloatArray,
@@ -135,7 +135,7 @@ class PlaceSearch:
         return [m for m, kept in zip(sightings, explained, strict=True) if kept]
 
     def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
-        return joint_fit(start, sightings, self._factors, self._config, iterations)
+        return fit_pose(start, sightings, self._factors, self._config, iterations)
 
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:

@@ -43,7 +43,7 @@ class Fit:
         return chi2_bound(probability, max(self.redundancy, 1))
 
 
-def joint_fit(
+def fit_pose(
     start: FloatArray,
     sightings: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
@@ -69,7 +69,7 @@ class PoseFit:
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray, iterations: int) -> Fit | None:
-        """As `joint_fit`."""
+        """As `fit_pose`."""
         pose, previous = start, math.inf
         for step in range(iterations):
             normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0

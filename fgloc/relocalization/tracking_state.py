@@ -106,9 +106,9 @@ class Tracking:
         return self.since_fix_s > self._config.dead_reckoning_after_s
 
     @property
-    def waiting(self) -> bool:
+    def initializing(self) -> bool:
         """Whether the pose is looked for on the whole map."""
-        return self._search.waiting
+        return self._search.initializing
 
     @property
     def mode(self) -> Mode:
@@ -181,7 +181,7 @@ class Tracking:
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""
         self.lost = True
-        self._search.waiting = True
+        self._search.initializing = True
 
     def is_unlocalized(self, belief: PoseWithCovariance | None) -> bool:
         """Whether the pose is so little known that only a search of the map can find it again."""
@@ -192,7 +192,7 @@ class Tracking:
 
     def start_known(self) -> None:
         """The pose is known; stop looking for it."""
-        self._search.waiting = False
+        self._search.initializing = False
 
     def collect(
         self,
@@ -201,7 +201,7 @@ class Tracking:
         sightings: Sequence[LandmarkMeasurement],
         readings: MotionReadings,
     ) -> InitialPose | None:
-        """While waiting: add a step; the start once it is clear."""
+        """While initializing: add a step; the start once it is clear."""
         return self._search.collect(step, motions, sightings, readings)
 
     def unconfirmed(self) -> PoseWithCovariance | None:
@@ -221,7 +221,7 @@ class Tracking:
         Args:
             blind: nothing could have been seen, so that the map's origin does as well as any place.
         """
-        if not self.waiting or self.lost:
+        if not self.initializing or self.lost:
             return None
         belief = self._search.hypotheses.belief()
         start = self._search.give_up() if blind or belief is not None else None
@@ -246,7 +246,7 @@ class Tracking:
         """
         searching = bool(outliers) or self._search.searching
         decided = self.keeps_initial_pose and self.initial_pose_conflict is not None
-        if not searching or decided or self.waiting or not self._adaptive:
+        if not searching or decided or self.initializing or not self._adaptive:
             return None
         started = self._search.collect(step, motions, outliers, readings, known=True)
         if started is None or self.keeps_initial_pose:

@@ -12,7 +12,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.relocalization.pose_fit import Fit, joint_fit
+from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
 from fgloc.stats import chi2_bound
@@ -152,7 +152,7 @@ class Association:
         gated = [s for s, d in zip(rejected, decisions, strict=True) if d.reason == "gate"]
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
-        fit = joint_fit(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
+        fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
         if fit is None or fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability):
             return None
         x, y, yaw = se2.between(predicted.pose, fit.pose)

@@ -118,11 +118,11 @@ class MotionJudge:
             self.rejections["motion.silent"] += 1
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
 
-    def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, tells_yaw: bool) -> None:
+    def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
         """The robot went on by a step: see `MotionSources.commit`."""
         if fix is not None:
             self.record_fix()
-        self.sources.commit(motion.readings, fix, tells_yaw)
+        self.sources.commit(motion.readings, fix, observes_yaw)
 
     def record_fix(self) -> None:
         """Sightings, or a given pose, tell where the robot is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -13,11 +14,12 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
-from fgloc.sensors.base import Turn
+from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
+_MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 
@@ -38,7 +40,7 @@ class MotionSources:
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro = sensors.gyro
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
-        self._untold_s = 0.0  # how long fixes have told the yaw along the way only, at most the lag
+        self._yaw_indirect_s = 0.0  # how far back the yaw rests on the gyro, where fixes observe it along the way only
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
 
     @property
@@ -55,11 +57,11 @@ class MotionSources:
     @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""
-        return self._learned is not None and not self._learned.model.card.reads_wheels
+        return self._learned is not None and not self._learned.model.card.reads(MotionRole.ODOMETER)
 
     @property
     def _learned_has_gyro(self) -> bool:
-        return self._learned is not None and self._learned.model.card.reads_gyro
+        return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
 
     def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
         """Ask every source once.
@@ -78,8 +80,10 @@ class MotionSources:
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
-            untold_s = max(since_fix_s, self._untold_s)
-            turn = self.gyro.measure(step, None if wheels is None or _is_commanded_to_move(step) else motion, untold_s)
+            without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
+            turn = self.gyro.measure(
+                step, None if wheels is None or _is_commanded_to_move(step) else motion, without_yaw_s
+            )
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
@@ -113,8 +117,8 @@ class MotionSources:
         return {name: (by[name], assumed) for name, (_, assumed) in known.items()}
 
     def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
-        """The learned motion with the drift of the gyro that it reads, where no fix tells the yaw by itself."""
-        if learned is None or self._turn is None or not self._learned_has_gyro or self._untold_s == 0.0:
+        """The learned motion with the drift of the gyro that it reads, where no fix observes the yaw by itself."""
+        if learned is None or self._turn is None or not self._learned_has_gyro or self._yaw_indirect_s == 0.0:
             return learned
         drift = max(self._turn.variance - self._turn.noise, 0.0)
         return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
@@ -154,14 +158,14 @@ class MotionSources:
             motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
-    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, tells_yaw: bool = True) -> None:
+    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, observes_yaw: bool = True) -> None:
         """The robot went on by a step.
 
         Args:
             readings: of that step.
             fix: where sightings have it now; None if there were none.
-            tells_yaw: whether they told the yaw by themselves. Positions and ranges tell it along the way: the yaw of a
-                fix is then mostly the gyro's own, and does not teach its bias.
+            observes_yaw: whether one of them observes the yaw by itself. Positions and ranges do along the way: the yaw
+                of a fix then rests on the gyro too, and only two fixes far apart correct its bias.
         """
         if fix is not None:
             self._silent_s = 0.0
@@ -171,16 +175,33 @@ class MotionSources:
             self.gyro.forget_fix()
             return
         turn = readings.gyro
-        if fix is not None:
-            seconds = (turn.stamp_ns - turn.start_ns) * 1e-9
-            self._untold_s = 0.0 if tells_yaw else min(self._untold_s + seconds, self._config.estimator.lag_s)
-        self.gyro.turned(float(turn.motion[2]), (turn.stamp_ns - turn.start_ns) * 1e-9)
-        if fix is not None and tells_yaw:
-            self.gyro.fix(float(fix.pose[2]), float(fix.cov[2, 2]))
+        seconds = (turn.stamp_ns - turn.start_ns) * 1e-9
+        self.gyro.turned(float(turn.motion[2]), seconds)
+        if fix is None:
+            return
+        yaw, variance = float(fix.pose[2]), float(fix.cov[2, 2])
+        if observes_yaw:
+            self._yaw_indirect_s = 0.0
+            self.gyro.fix(yaw, variance)
+        else:
+            memory_s = self._yaw_memory_s(variance)
+            self._yaw_indirect_s = min(self._yaw_indirect_s + seconds, memory_s, self._config.estimator.lag_s)
+            self.gyro.fix(yaw, variance, apart_s=_MEMORIES * memory_s)
+
+    def _yaw_memory_s(self, variance: float) -> float:
+        """How far back [s] a yaw of this variance [rad²] can rest on the gyro alone.
+
+        Over a time t its noise and its bias make a variance of q t + b² t²: where the yaw is known better than that,
+        fixes have replaced the turns before.
+        """
+        if self.gyro is None or self._turn is None:
+            return 0.0
+        noise, bias = self._turn.noise_density, self.gyro.bias_variance
+        return 2.0 * variance / (noise + math.sqrt(noise**2 + 4.0 * bias * variance))
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
-        self._silent_s = self._untold_s = 0.0
+        self._silent_s = self._yaw_indirect_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
 

@@ -48,9 +48,9 @@ class JudgedSightings:
     elsewhere: PoseWithCovariance | None = None
 
     @property
-    def tells_yaw(self) -> bool:
+    def observes_yaw(self) -> bool:
         """Whether any accepted one tells the yaw by itself."""
-        return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.tells_yaw for s in self.accepted)
+        return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.observes_yaw for s in self.accepted)
 
     def dropped(self, reason: str) -> JudgedSightings:
         """The same where the graph could not take any of them."""

@@ -19,6 +19,8 @@ from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMe
 
 if TYPE_CHECKING:
     from fgloc.config import Config, GateConfig, Section
+    from fgloc.sensors.channels import Channel
+    from fgloc.sensors.roles import MotionSource, RawLandmarksRole
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
@@ -74,12 +76,12 @@ def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
 
 
 class RawMistake(NamedTuple):
-    """What messages alone show to be wrong with the settings.
+    """What a recording shows to be wrong with the settings of a sensor.
 
     Attributes:
         sentence: for the user.
         section: of ``robot.yaml``.
-        values: that undo it.
+        values: that undo it; empty where no settings do.
     """
 
     sentence: str
@@ -103,11 +105,13 @@ class Turn:
         yaw: [rad], rid of the bias.
         variance: [rad²], of the noise and of what the bias may be off.
         noise: [rad²], of the noise alone.
+        noise_density: [rad²/s], of the same.
     """
 
     yaw: float
     variance: float
     noise: float = 0.0
+    noise_density: float = 0.0
 
 
 class MotionRole(StrEnum):
@@ -184,8 +188,9 @@ class BuiltIn:
         name: of its rows in ``steps.csv``, and in the counts.
         streams: what it reads.
         title: in sentences; "": its name.
-        role: as a motion source; None: it is none.
-        installation: what it is off by; of a motion source.
+        motion: its role as a motion source; None: it is none.
+        raw_landmarks: its role as what finds landmarks in raw data; None: it does not.
+        channels: what it offers to motion models as inputs.
         mistakes: what the first messages of a recording show to be wrong with its settings.
         failing_as: by what name failures call it; "": by its own.
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
@@ -200,8 +205,9 @@ class BuiltIn:
     name: str
     streams: tuple[Stream, ...] = ()
     title: str = ""
-    role: MotionRole | None = None
-    installation: MotionInstallation | None = None
+    motion: MotionSource | None = None
+    raw_landmarks: RawLandmarksRole | None = None
+    channels: tuple[Channel, ...] = ()
     mistakes: Callable[[Sequence[Event], Config], tuple[RawMistake, ...]] | None = None
     failing_as: str = ""
     failures: Callable[[], tuple[type[Any], ...]] = tuple

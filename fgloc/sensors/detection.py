@@ -55,7 +55,7 @@ class RememberingDetector(Detector, Protocol):
 
 
 class SensorDetector(Detector, Protocol):
-    """The detector of a sensor, as `fgloc.sensors.registry.detector` makes it; it does not depend on earlier data.
+    """The detector of a sensor, as `fgloc.sensors.roles.RawLandmarksRole` makes it; it does not depend on earlier data.
 
     Attributes:
         dictionary: of the landmarks that it finds.

@@ -46,7 +46,7 @@ class Odometer(Protocol):
         """Motion over the step; measured again, the same step gives the same."""
         ...
 
-    def carry(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+    def motion_between(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
         """``T_from_to (3,)`` between two times near the step, with its covariance ``(3, 3)``."""
         ...
 
@@ -72,7 +72,7 @@ class RateSensor(Protocol):
     bias_variance: float
     rejections: Counter[str]
 
-    def measure(self, step: Step, wheels: ArrayLike | None, blind_s: float = 0.0) -> Turn | None:
+    def measure(self, step: Step, wheels: ArrayLike | None, since_fix_s: float = 0.0) -> Turn | None:
         """Turn over the step."""
         ...
 
@@ -88,8 +88,8 @@ class RateSensor(Protocol):
         """The robot went on by a step."""
         ...
 
-    def fix(self, yaw: float, variance: float) -> None:
-        """Take in a yaw that sightings told."""
+    def fix(self, yaw: float, variance: float, apart_s: float = 0.0) -> None:
+        """Take in a yaw that fixes determine; the turn between two that are ``apart_s`` apart corrects the bias."""
         ...
 
     def forget_fix(self) -> None:

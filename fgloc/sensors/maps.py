@@ -25,8 +25,8 @@ from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
+from fgloc.sensors import registry
 from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
-from fgloc.sensors.markers.dictionaries import load_dictionary
 from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
 
 _MAX_SIZE_M = 5.0
@@ -75,7 +75,7 @@ class _Builder:
         if not self.landmarks:
             raise root.fail("no landmarks in the map")
         if dictionary:
-            capacity = len(load_dictionary(dictionary).bytesList)
+            capacity = registry.raw_landmarks().ids(dictionary)
             beyond = [i for i in self.landmarks if i >= capacity]
             if beyond:
                 notes.append(f"{path}: {dictionary} has ids below {capacity}; {beyond} will never be seen.")
@@ -143,7 +143,7 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
     dictionary = "" if named is None else named.text()
     if named is not None:
         try:
-            load_dictionary(dictionary)
+            registry.raw_landmarks().ids(dictionary)
         except ConfigError as error:
             raise named.fail(str(error)) from error
     if size is not None:

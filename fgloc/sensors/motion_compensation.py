@@ -21,7 +21,7 @@ from fgloc.types import (
 _SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
 
 
-def carry(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
+def compensated(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
     """Move a sighting to the keyframe.
 
     Args:
@@ -92,22 +92,22 @@ class MotionCompensation:
                 dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
             ]
             if exposure_ns != step.stamp_ns:
-                motion, cov = self._wheels.carry(step, step.stamp_ns, exposure_ns)
+                motion, cov = self._wheels.motion_between(step, step.stamp_ns, exposure_ns)
                 if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
                     motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
-                late = [carry(m, motion, cov) for m in late]
+                late = [compensated(m, motion, cov) for m in late]
             measured.extend(late)
         for sensed in step.sensed:
             now: list[LandmarkMeasurement] = list(self._sensor_of[type(sensed)].measure(sensed))
             if now and sensed.stamp_ns != step.stamp_ns:
                 motion, cov = self._motion_to(step, sensed.stamp_ns)
-                now = [carry(m, motion, cov) for m in now]
+                now = [compensated(m, motion, cov) for m in now]
             measured.extend(now)
         return measured
 
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
         """``T_keyframe_then`` for another time, with its covariance."""
-        motion, cov = self._wheels.carry(step, step.stamp_ns, at_ns)
+        motion, cov = self._wheels.motion_between(step, step.stamp_ns, at_ns)
         if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
             turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
             motion = np.array([*motion[:2], turned])

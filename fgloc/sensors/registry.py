@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from fgloc.extensions import outside_sensors
 from fgloc.files.section import Section
@@ -21,22 +20,26 @@ from fgloc.sensors.base import (
     Sensor,
     Stream,
 )
+from fgloc.sensors.command_input import CommandInput
 from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.learned.config import MotionConfig, shipped_name
+from fgloc.sensors.gyro.input import GyroInput
+from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.markers.config import MarkersConfig
+from fgloc.sensors.markers.input import MarkersInput
+from fgloc.sensors.range_bearing.input import RangeBearingInput
+from fgloc.sensors.roles import ModelRole, OdometerRole, RateRole, RawLandmarksRole
 from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
 from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.types import Event, FloatArray, LandmarkSighting, RawEvent
+from fgloc.sensors.wheels.input import WheelsInput
+from fgloc.types import Event, LandmarkSighting, RawEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config
-    from fgloc.sensors.detection import SensorDetector
-    from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor, Odometer, RateSensor
+    from fgloc.sensors.channels import Channel
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
-    from fgloc.types import LandmarkMap
 
-__all__ = ["SensorSections", "built_in", "shipped_name"]
+_Role = TypeVar("_Role", OdometerRole, RateRole, ModelRole)
 
 
 class SensorSections(Section):
@@ -48,6 +51,10 @@ class SensorSections(Section):
     markers: MarkersConfig = MarkersConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     motion: MotionConfig = MotionConfig()
+
+
+class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):
+    """Methods that make the events of the built-in sensors from plain numbers."""
 
 
 @cache
@@ -145,7 +152,7 @@ class MotionNames(NamedTuple):
 @cache
 def motion_names() -> MotionNames:
     """Which sensor has which role as a motion source."""
-    names = {sensor.role: sensor.name for sensor in built_in() if sensor.role is not None}
+    names = {sensor.motion.kind: sensor.name for sensor in built_in() if sensor.motion is not None}
     return MotionNames(*(names[role] for role in MotionRole))
 
 
@@ -161,9 +168,7 @@ def title_of(name: str) -> str:
 
 def motion_installations() -> tuple[MotionInstallation, ...]:
     """What the motion sources are off by: odometer, rate sensor, model."""
-    order = (MotionRole.ODOMETER, MotionRole.RATE, MotionRole.MODEL)
-    by_role = {sensor.role: sensor.installation for sensor in built_in()}
-    return tuple(made for role in order if (made := by_role[role]) is not None)
+    return odometer().installation, rate_sensor().installation, motion_model().installation
 
 
 def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
@@ -172,91 +177,39 @@ def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Pa
     return tuple(sorted(made, key=lambda p: p.rank))
 
 
-def odometer(config: Config) -> Odometer:
-    """The odometer of one run.
-
-    Raises:
-        ConfigError: its settings do not fit together.
-    """
-    from fgloc.sensors.wheels.motion import WheelMotion
-
-    return WheelMotion(config.wheels)
+def odometer() -> OdometerRole:
+    """What measures every step."""
+    return _with_role(OdometerRole)
 
 
-def rate_sensor(config: Config, up: FloatArray) -> RateSensor:
-    """The rate sensor of one run; ``up (3,)``: the base's z axis in its frame."""
-    from fgloc.sensors.gyro.rate import Gyro
-
-    return Gyro(config.gyro, up)
+def rate_sensor() -> RateRole:
+    """What measures the turn alone."""
+    return _with_role(RateRole)
 
 
-def rate_is_used(config: Config) -> bool:
-    """Whether the rate sensor is to be used."""
-    return config.gyro.use
+def motion_model() -> ModelRole:
+    """What predicts the motion from control inputs."""
+    return _with_role(ModelRole)
 
 
-def rate_scale(config: Config) -> float:
-    """True over reported rate."""
-    return config.gyro.scale
+def raw_landmarks() -> RawLandmarksRole:
+    """What finds landmarks in raw data."""
+    return next(sensor.raw_landmarks for sensor in built_in() if sensor.raw_landmarks is not None)
 
 
-def motion_predictor(config: Config, up: Callable[[], FloatArray] | None = None) -> MotionPredictor | None:
-    """The motion model of one run; None: none is used.
-
-    Args:
-        config: all settings.
-        up: gives the base's z axis ``(3,)`` in the frame of the rate sensor; None: it is mounted level.
-
-    Raises:
-        ModelError: the model cannot be used.
-    """
-    if not config.motion.use or config.motion.model is None:
-        return None
-    from fgloc.sensors.learned.load import load_model
-    from fgloc.sensors.learned.source import LearnedMotion
-
-    model = load_model(config.motion.model)
-    return LearnedMotion(model, config.motion, (0.0, 0.0, 1.0) if up is None else up())
+def _with_role(kind: type[_Role]) -> _Role:
+    return next(sensor.motion for sensor in built_in() if isinstance(sensor.motion, kind))
 
 
-def error_correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrelation | None:
-    """How the errors of odometer and predictor go together; None: they are taken as independent."""
-    joint: ErrorCorrelation | None = predictor.model.joint
-    return joint if config.motion.correlation == "joint" else None
+def channels() -> Mapping[str, Channel]:
+    """Inputs that the sensors offer to motion models, by name, in the order in which a network reads them."""
+    return _channels()
 
 
-def with_motion_model(config: Config, model: Path) -> Config:
-    """With another motion model; `pydantic.ValidationError` where there is none of this name."""
-    motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
-    return config.model_copy(update={"motion": motion})
-
-
-def landmark_size(config: Config) -> float | None:
-    """Size [m] of landmarks for which the map gives none."""
-    return config.markers.default_size_m
-
-
-def landmark_dictionary(config: Config) -> str | None:
-    """Dictionary of the landmarks that are detected; None: the map's."""
-    return config.markers.dictionary
-
-
-def detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetector:
-    """The detector of the sensor that has raw data.
-
-    Raises:
-        ConfigError: the settings and the map do not say what is to be detected.
-    """
-    from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
-
-    return configured_detector(config, landmark_map)
-
-
-def fitting_dictionary(recording: Any) -> str | None:
-    """The dictionary of landmarks that fits the raw data of a recording; None if none does."""
-    from fgloc.sensors.markers.hints import fitting_dictionary as fitting
-
-    return fitting(recording)
+@cache
+def _channels() -> dict[str, Channel]:
+    offered = [channel for sensor in built_in() for channel in sensor.channels]
+    return {channel.name: channel for channel in sorted(offered, key=lambda channel: channel.rank)}
 
 
 def detected_kinds() -> tuple[str, ...]:

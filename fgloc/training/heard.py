@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config
 from fgloc.intake.event_buffer import EventBuffer
+from fgloc.sensors.channels import Mounting, WheelJoints
 from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned.card import WheelJoints
 from fgloc.sensors.learned.signals import Signals, signals_of
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Event, FloatArray, Step
+from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Step
 
 _STEP_NS = 200_000_000  # of the gyro's filter
 _BLIND_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
@@ -115,9 +115,8 @@ class TopicTimes:
 
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
-        return signals_of(
-            wanted, _all(self._imu), _all(self._joints), self.joints, origin_ns, self._biases, self.imu_up
-        )
+        events = {InertialEvent: _all(self._imu), JointsEvent: _all(self._joints)}
+        return signals_of(wanted, events.__getitem__, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
 
     def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
         """What the localizer's own filter knew of the bias some time before each IMU message."""

@@ -6,7 +6,7 @@ import torch
 
 from fgloc.errors import RecordingError
 from fgloc.sensors.learned.card import Kinematics, Split
-from fgloc.sensors.learned.signals import Signal
+from fgloc.sensors.signals import Signal
 from fgloc.training.calibrate import fit_kinematics, fit_lag
 from fgloc.training.checkpoint import Checkpoints, Curve
 from fgloc.training.config import NetworkConfig, TrainConfig
@@ -47,7 +47,7 @@ def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
 
 
 def _wheels_of(run: Run) -> Signal:
-    wheels = run.heard.signals(("wheels",), run.origin_ns).wheels
+    wheels = run.heard.signals(("wheels",), run.origin_ns).named("wheels")
     if wheels is None:
         raise RecordingError(
             f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"

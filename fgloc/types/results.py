@@ -106,7 +106,7 @@ class TopicTimes:
     times: FloatArray  # (n,)
     count: int
     every: int
-    longest_silence_s: float
+    longest_gap_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovari
 from fgloc.graph.noise_models import gaussian
 from fgloc.graph.planar_batch import cartesian
 from fgloc.robust.association import Association
-from fgloc.sensors.motion_compensation import carry
+from fgloc.sensors.motion_compensation import compensated
 from fgloc.types import (
     Camera,
     FrameMeasurement,
@@ -175,7 +175,7 @@ def test_carried_sightings_agree_with_those_made_at_the_keyframe():
         point_sighting(then, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
         FrameMeasurement(0, 0, se2.between(then, landmarks.landmarks[0].planar), np.eye(3) * 1e-2),
     ]
-    carried = [carry(m, motion, np.eye(3) * 1e-6) for m in sightings]
+    carried = [compensated(m, motion, np.eye(3) * 1e-6) for m in sightings]
     for one in factors.linearize(carried, keyframe):
         assert one.residual == pytest.approx(0.0, abs=1e-5)
 

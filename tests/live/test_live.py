@@ -27,6 +27,7 @@ from fgloc.runner import run
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.markers.events import ImageEvent
 from fgloc.sensors.markers.tracking import TrackingDetector
+from fgloc.sensors.roles import with_values
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Mode, TransformEvent, TruthEvent
 
@@ -155,7 +156,7 @@ def test_a_slip_that_has_just_begun_does_not_carry_the_pose_away():
     truth = [e for e in events if isinstance(e, TruthEvent)]
     stamps, x, y = (np.array(c) for c in zip(*((e.stamp_ns, *e.position[:2]) for e in truth), strict=True))
     apart = []
-    with Live(settings, sample / "map.yaml", roles=roles, image_queue=100) as live:
+    with Live(with_values(settings, "live", {"image_queue": 100}), sample / "map.yaml", roles=roles) as live:
         for event in events:
             live.push(event)
             if event.received_ns > start + 14.2e9 and isinstance(event, JointsEvent):
@@ -227,7 +228,8 @@ def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
     with open_recording(sample / "bag", settings.recording) as recording:
         events = until(4.0, recording.events())
         images = [e.stamp_ns for e in events if isinstance(e, ImageEvent)]
-        with Live(settings, sample / "map.yaml", roles=recording.roles, image_queue=3) as live:
+        settings = with_values(settings, "live", {"image_queue": 3})
+        with Live(settings, sample / "map.yaml", roles=recording.roles) as live:
             began = time.perf_counter()
             for event in events:
                 live.push(event)
@@ -307,7 +309,7 @@ def test_a_gyro_that_begins_later_joins_without_losing_the_pose():
 
 def test_without_roles_the_run_begins_after_a_while_and_a_calibration_may_come_later():
     world = World(room(), seconds=6.0)
-    with Live(config(), world.map, startup_s=1.0) as live:
+    with Live(config(live={"startup_s": 1.0}), world.map) as live:
         feed(live, until(0.5, world.events()))
         early = live.status()
         assert not early.running

@@ -7,7 +7,7 @@ import pytest
 from live_feed import ROLES, errors, feed, in_order, live_in, received
 from robot_world import START_NS, World, beacons, config, room
 
-from fgloc.config import Config
+from fgloc.config import Config, LiveConfig
 from fgloc.live import Live
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
@@ -214,7 +214,7 @@ def test_in_simulated_time_all_goes_by_the_stamps():
 
 def test_an_unknown_role_is_waited_for_no_longer_than_told():
     world = World(beacons(), seconds=6.0)
-    with Live(Config(), world.map, roles=("odometry", "imu"), startup_s=1.5) as live:
+    with Live(Config(live=LiveConfig(startup_s=1.5)), world.map, roles=("odometry", "imu")) as live:
         events = world.events()
         early = [e for e in events if after(e) < 1.4]
         feed(live, early)

@@ -168,7 +168,7 @@ def jumping(count, length=8):
 @pytest.mark.parametrize("count", [40, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_the_clock_may_jump_again_and_again(count):
     world = World(beacons(), seconds=3.0)
-    with live_in(world, startup_s=0.1, roles=("odometry", "sightings")) as live:
+    with live_in(world, config(live={"startup_s": 0.1}), roles=("odometry", "sightings")) as live:
         for k, event in enumerate(jumping(count)):
             live.push(event)
             if k % 500 == 0:

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,8 @@ from fgloc.config import Config, load_config
 from fgloc.datasets.bag import BagWriter
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.live import Live, LivePose
+from fgloc.live import LivePose
 from fgloc.live.wire import intake, play
-from fgloc.live.wire import node as nodes
 from fgloc.live.wire.node import Node
 from fgloc.live.wire.odom_frame import OdomFrame
 from fgloc.live.wire.participant import Participant
@@ -34,6 +32,7 @@ from fgloc.live.wire.teller import Teller
 from fgloc.recording.storage import Storage
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.roles import with_values
 from fgloc.types import Mode, TransformEvent
 
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run"
@@ -108,9 +107,9 @@ def excerpt(folder, seconds):
 
 
 def test_poses_on_the_wire_are_those_of_an_online_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(nodes, "Live", partial(Live, image_queue=1000))  # however busy this machine is
     bag = excerpt(tmp_path / "bag", 8.0)
     config, landmarks = load_config(SAMPLE / "robot.yaml"), load_map(SAMPLE / "map.yaml")
+    config = with_values(config, "live", {"image_queue": 1000})  # however busy this machine is
     with Session(config, landmarks) as session, Participant(DOMAIN) as one, Player(bag, one) as player:
         assert player.wait_for_readers(20.0)
         player.play(2.5)

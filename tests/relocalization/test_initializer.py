@@ -79,7 +79,7 @@ def test_one_marker_seen_clearly_gives_the_pose():
     start = search.step(lambda pose: seen_corners(pose, marker, rng.normal(0, 0.3, (4, 2))))
     assert close(start, TRUTH, *(3.5 * np.sqrt(np.diag(start.newest.cov))[1:]))
     assert close(start, TRUTH, 0.2, 0.1)
-    assert not search.initializer.waiting
+    assert not search.initializer.initializing
     assert len(start.steps) == 1
 
 
@@ -111,7 +111,7 @@ def test_fault_55_one_range_and_bearing_gives_no_pose_however_often():
     rng = np.random.default_rng(0)
     for _ in range(15):
         assert search.step(lambda pose: seen_point(pose, a, rng.normal(0, (0.06, 0.015)))) is None
-    assert search.initializer.waiting
+    assert search.initializer.initializing
 
 
 def test_marker_poses_give_the_pose_if_their_yaw_is_used():
@@ -157,7 +157,7 @@ def test_two_equally_good_places_are_not_decided():
 
     assert search.step(as_both, as_other) is None
     assert search.step(as_both, as_other) is None
-    assert search.initializer.waiting
+    assert search.initializer.initializing
 
 
 def test_sightings_older_than_the_configured_time_are_forgotten():
@@ -192,7 +192,7 @@ def test_on_a_wrong_map_the_search_stays_bounded(markers):
         visible = [m for m in real if project(search.next_pose, m) is not None]
         search.step(*(lambda pose, m=m: seen_corners(pose, m) for m in visible))
         assert len(search.initializer._steps) <= 11, k
-    assert search.initializer.waiting
+    assert search.initializer.initializing
 
 
 def test_of_three_beacons_no_two_are_taken_at_their_word():

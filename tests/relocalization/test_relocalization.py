@@ -10,7 +10,7 @@ import fgloc.relocalization.place_search
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.localizer import Localizer
-from fgloc.relocalization.pose_fit import joint_fit
+from fgloc.relocalization.pose_fit import fit_pose
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -41,7 +41,7 @@ class Wheels(WheelMotion):
     def twist(self, step: Step, at_ns: int) -> np.ndarray:
         return MOTION * (1e9 / STEP_NS)
 
-    def carry(self, step: Step, start_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    def motion_between(self, step: Step, start_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
         return se2.exp(MOTION * ((end_ns - start_ns) / STEP_NS)), np.eye(3) * 1e-8
 
     def measure(self, step: Step) -> MotionMeasurement:
@@ -128,7 +128,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     run = Localizer(Config(), standing, MotionSensors(Wheels()), PoseSensors(Nonsense()))
     fits = []
     search = fgloc.relocalization.place_search
-    monkeypatch.setattr(search, "joint_fit", lambda *a: fits.append(len(a[1])) or joint_fit(*a))
+    monkeypatch.setattr(search, "fit_pose", lambda *a: fits.append(len(a[1])) or fit_pose(*a))
     sums = []
     for k in range(40):
         fits.clear()

@@ -11,12 +11,14 @@ from motion_models import make_card, make_tensors
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
+from fgloc.sensors.base import MotionRole
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import LearnedMotion, load_model, save_model
 from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.signals import Signal, SignalReader, Signals
+from fgloc.sensors.learned.signals import SignalReader, Signals
+from fgloc.sensors.signals import Signal
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import ControlEvent, MotionEvent, Step, by_class
+from fgloc.types import ControlEvent, InertialEvent, MotionEvent, Step, by_class
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND
@@ -85,12 +87,12 @@ def test_signals_of_a_step() -> None:
     signals = reader.read(drive(3.0, 3.2), gyro_bias=0.1)
     assert isinstance(signals, Signals)
     limits = np.array([0.0, 0.13])
-    assert signals.gyro is not None
-    np.testing.assert_allclose(signals.gyro.means(limits), [[0.4]], atol=1e-9)
-    assert signals.wheels is not None
-    np.testing.assert_allclose(signals.wheels.means(limits), [[0.25, 0.1 / 0.26]], atol=1e-6)
-    assert signals.effort is not None
-    np.testing.assert_allclose(signals.effort.means(limits), [[0.4, 0.2]], atol=1e-9)
+    assert signals.named("gyro") is not None
+    np.testing.assert_allclose(signals.named("gyro").means(limits), [[0.4]], atol=1e-9)
+    assert signals.named("wheels") is not None
+    np.testing.assert_allclose(signals.named("wheels").means(limits), [[0.25, 0.1 / 0.26]], atol=1e-6)
+    assert signals.named("effort") is not None
+    np.testing.assert_allclose(signals.named("effort").means(limits), [[0.4, 0.2]], atol=1e-9)
 
 
 def test_wheel_rates_stand_in_for_angles() -> None:
@@ -99,8 +101,8 @@ def test_wheel_rates_stand_in_for_angles() -> None:
     rates = tuple(replace(e, position=np.zeros(0), velocity=np.array([0.0, 6.0, 4.0])) for e in step.of(JointsEvent))
     signals = reader.read(with_events(step, JointsEvent, rates))
     assert isinstance(signals, Signals)
-    assert signals.wheels is not None
-    np.testing.assert_allclose(signals.wheels.means(np.array([0.0, 0.2])), [[0.25, 0.1 / 0.26]], atol=1e-9)
+    assert signals.named("wheels") is not None
+    np.testing.assert_allclose(signals.named("wheels").means(np.array([0.0, 0.2])), [[0.25, 0.1 / 0.26]], atol=1e-9)
 
 
 def test_best_known_kinematics_carry_the_model(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -164,14 +166,14 @@ def test_contiguous_steps_remember_and_others_begin_anew() -> None:
     def before(reader: SignalReader, at: Step) -> float:
         signals = reader.read(at)
         assert isinstance(signals, Signals)
-        assert signals.gyro is not None
-        return float(signals.gyro.means(np.array([-0.1, -0.4]))[0, 0])
+        assert signals.named("gyro") is not None
+        return float(signals.named("gyro").means(np.array([-0.1, -0.4]))[0, 0])
 
     reader = SignalReader(card)
     for k in range(4):
         reader.read(step(1.0 + 0.2 * k, 1.2 + 0.2 * k))
     assert before(reader, step(1.8, 2.0)) == pytest.approx(0.5 * 1.55, abs=1e-9)
-    assert len(reader._imu_events) < 50
+    assert len(reader._events[InertialEvent]) < 50
     fresh = before(SignalReader(card), step(1.8, 2.0))
     assert fresh == pytest.approx(0.9, abs=0.02)  # the first value, held
     for other in (step(2.2, 2.4), step(2.0, 2.2, segment=1)):
@@ -188,10 +190,10 @@ def test_a_model_is_not_asked_without_its_signals(tmp_path: Path, rng: np.random
 
 
 def test_cards_say_what_a_model_reads() -> None:
-    assert make_card("displacement", inputs=ALL).reads_wheels
-    assert not make_card("displacement", inputs=("commands", "gyro", "effort")).reads_wheels
+    assert make_card("displacement", inputs=ALL).reads(MotionRole.ODOMETER)
+    assert not make_card("displacement", inputs=("commands", "gyro", "effort")).reads(MotionRole.ODOMETER)
     for changes, message in (
-        ({"inputs": ("commands", "effort"), "joints": None}, "need the card's joints"),
+        ({"inputs": ("commands", "effort"), "joints": None}, "needs the card's joints"),
         ({"inputs": ("commands", "wheels"), "joints": {"left": "l", "right": "r"}}, "needs left_radius"),
         ({"inputs": ("commands", "gyro"), "signal_edges_s": (0.1, 0.2)}, "increase from 0"),
     ):
@@ -205,5 +207,5 @@ def test_an_imu_may_be_mounted_upside_down() -> None:
     card = make_card("displacement", inputs=("commands", "gyro"))
     signals = SignalReader(card, imu_up=(0.0, 0.0, -1.0)).read(drive(3.0, 3.2), gyro_bias=0.1)
     assert isinstance(signals, Signals)
-    assert signals.gyro is not None
-    np.testing.assert_allclose(signals.gyro.means(np.array([0.0, 0.1])), [[-0.6]], atol=1e-9)
+    assert signals.named("gyro") is not None
+    np.testing.assert_allclose(signals.named("gyro").means(np.array([0.0, 0.1])), [[-0.6]], atol=1e-9)

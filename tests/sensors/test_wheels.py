@@ -292,7 +292,7 @@ def test_source_none_measures_nothing_but_can_carry():
     steps = run(stepper(), [odometry(t, twist=(1.0, 0.0)) for t in times(1, 2, 20)])
     wheels = WheelMotion(WheelsConfig(source="none"))
     assert all(wheels.measure(step) is None for step in steps)
-    motion, cov = wheels.carry(steps[-1], steps[-1].stamp_ns, steps[-1].stamp_ns - ns(0.1))
+    motion, cov = wheels.motion_between(steps[-1], steps[-1].stamp_ns, steps[-1].stamp_ns - ns(0.1))
     assert not motion.any()
     assert cov[0, 0] > 0.04**2
 
@@ -357,11 +357,11 @@ def test_carry_goes_both_ways_and_agrees_with_measure(drive):
     wheels = WheelMotion(WheelsConfig(source="pose"))
     for step in steps[:40]:
         measured = wheels.measure(step)
-    motion, cov = wheels.carry(step, step.start_ns, step.stamp_ns)
+    motion, cov = wheels.motion_between(step, step.start_ns, step.stamp_ns)
     assert motion == pytest.approx(measured.motion, abs=1e-12)
     assert cov == pytest.approx(measured.cov, abs=1e-15)
-    back, back_cov = wheels.carry(step, step.stamp_ns, step.stamp_ns - ns(3.0))
-    there, there_cov = wheels.carry(step, step.stamp_ns - ns(3.0), step.stamp_ns)
+    back, back_cov = wheels.motion_between(step, step.stamp_ns, step.stamp_ns - ns(3.0))
+    there, there_cov = wheels.motion_between(step, step.stamp_ns - ns(3.0), step.stamp_ns)
     assert se2.compose(there, back) == pytest.approx(np.zeros(3), abs=1e-12)
     assert back == pytest.approx(drive.motion(step.stamp_ns, step.stamp_ns - ns(3.0)), abs=1e-3)
     # Going there and back by the same measurement ends where it began, without any error.

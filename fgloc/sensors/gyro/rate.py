@@ -87,7 +87,7 @@ class Gyro:
         yaw = raw - self.bias * dt
         drift = self.bias_variance * ((since_fix_s + dt) ** 2 - since_fix_s**2)
         noise = self._config.yaw_per_sqrt_s**2 * dt
-        return Turn(yaw, noise + drift, noise)
+        return Turn(yaw, noise + drift, noise, self._config.yaw_per_sqrt_s**2)
 
     def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
         """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
@@ -105,17 +105,18 @@ class Gyro:
         self._turned += yaw
         self._turned_s += seconds
 
-    def fix(self, yaw: float, variance: float) -> None:
-        """Take in the yaw at the end of the last step, as sightings have told it; two of them teach the bias.
+    def fix(self, yaw: float, variance: float, apart_s: float = 0.0) -> None:
+        """Take in the yaw at the end of the last step, as fixes determine it; the turn between two corrects the bias.
 
         Args:
             yaw: [rad].
             variance: [rad²].
+            apart_s: how far apart the two have to be at least, so that their errors do not depend on this gyro.
         """
         if variance > _GOOD_YAW**2:
             return
         if self._anchor is not None:
-            if self._turned_s < _APART_S:
+            if self._turned_s < max(_APART_S, apart_s):
                 return
             before, spread = self._anchor
             error = math.remainder(self._turned - (yaw - before), math.tau)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fgloc.sensors.base import BuiltIn, MotionRole, Stream
+from fgloc.sensors.base import BuiltIn, Stream
 from fgloc.sensors.gyro import messages, validation
+from fgloc.sensors.gyro.channels import CHANNELS
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.gyro.findings import ImuChecks
-from fgloc.sensors.gyro.installation import INSTALLATION
+from fgloc.sensors.gyro.role import ROLE
 from fgloc.types import Event
 
 if TYPE_CHECKING:
@@ -42,8 +43,8 @@ GYRO = BuiltIn(
         ),
     ),
     failing_as="imu",
-    role=MotionRole.RATE,
-    installation=INSTALLATION,
+    motion=ROLE,
+    channels=CHANNELS,
     failures=_failures,
     carried=_carried,
 )

@@ -6,17 +6,28 @@ import math
 from itertools import pairwise
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from fgloc.config import Section
+from fgloc.sensors import registry
+from fgloc.sensors.base import MotionRole
+from fgloc.sensors.channels import WheelJoints
 from fgloc.sensors.noise_density import NoiseDensity
 
 FORMAT = "fgloc-motion"
 VERSION = 1
+_OWN_INPUTS = ("commands", "velocity")  # others are channels that sensors bring
+
+
+def _known_input(name: str) -> str:
+    if name not in (known := (*_OWN_INPUTS, *registry.channels())):
+        raise ValueError(f"expected one of {', '.join(known)}")
+    return name
+
 
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix = tuple[Row, Row, Row]
-Input = Literal["commands", "velocity", "gyro", "effort", "wheels"]
+Input = Annotated[str, AfterValidator(_known_input)]
 Kind = Literal["naive", "lag", "arx", "velocity", "rate", "displacement", "gru"]
 Family = Literal["naive", "velocity", "displacement"]
 FAMILIES: dict[Kind, Family] = {
@@ -28,7 +39,6 @@ FAMILIES: dict[Kind, Family] = {
     "displacement": "displacement",
     "gru": "displacement",
 }
-CHANNELS: dict[str, int] = {"gyro": 1, "effort": 2, "wheels": 2}  # of the measured inputs, in the network's order
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(lt=1)]
 
@@ -61,21 +71,6 @@ class Lag(Section):
 
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)]
     lag_s: tuple[Positive, Positive] = Field(description="time constants of v and ω")
-
-
-class WheelJoints(Section):
-    """Wheels whose angles or torques a model reads; the names are those of `fgloc.config.WheelsConfig`."""
-
-    left: str | None = Field(None, description="joint of the left wheel; None: the one named so")
-    right: str | None = None
-    left_radius: Positive | None = Field(None, description="m; the input wheels needs it")
-    right_radius: Positive | None = None
-    track: Positive | None = None
-
-    @property
-    def measured(self) -> bool:
-        """Whether the geometry is known."""
-        return None not in (self.left_radius, self.right_radius, self.track)
 
 
 class ErrorMemory(Section):
@@ -169,23 +164,17 @@ class ModelCard(Section):
         """Width of the network's input that this card implies; 0 if there is no network."""
         if self.family != "displacement":
             return 0 if self.kind in ("naive", "lag") else 5
-        measured = len(self.signal_edges_s) * sum(CHANNELS[name] for name in self.measured)
+        measured = len(self.signal_edges_s) * sum(registry.channels()[name].width for name in self.measured)
         return 2 * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
 
     @property
     def measured(self) -> tuple[str, ...]:
         """Inputs that sensors measure during the step, in the network's order."""
-        return tuple(name for name in CHANNELS if name in self.inputs)
+        return tuple(name for name in registry.channels() if name in self.inputs)
 
-    @property
-    def reads_gyro(self) -> bool:
-        """Whether the model reads the gyro: its motion then has the gyro's turn in it."""
-        return "gyro" in self.inputs
-
-    @property
-    def reads_wheels(self) -> bool:
-        """Whether the model reads the wheels' speed: then it cannot witness their slip."""
-        return "wheels" in self.inputs
+    def reads(self, role: MotionRole) -> bool:
+        """Whether the model reads the motion by a motion source: then it depends on it, and cannot tell its faults."""
+        return any(registry.channels()[name].role == role for name in self.measured)
 
     @property
     def n_outputs(self) -> int:
@@ -211,10 +200,13 @@ class ModelCard(Section):
             raise ValueError(f"a {self.kind} model needs {_needs(self.kind)}; the card does not fit")
         if self.members > 1 and self.kind != "displacement":
             raise ValueError(f"a {self.kind} model has one network, the card says {self.members}")
-        if self.joints is None and {"effort", "wheels"} & set(self.inputs):
-            raise ValueError("the inputs effort and wheels need the card's joints; it names none")
-        if self.reads_wheels and (self.joints is None or not self.joints.measured):
-            raise ValueError("the input wheels needs left_radius, right_radius and track of the card's joints")
+        for channel in (registry.channels()[name] for name in self.measured):
+            if channel.needs_joints and self.joints is None:
+                raise ValueError(f"the input {channel.name} needs the card's joints; it names none")
+            if channel.needs_geometry and (self.joints is None or not self.joints.measured):
+                raise ValueError(
+                    f"the input {channel.name} needs left_radius, right_radius and track of the card's joints"
+                )
         if self.family != "displacement" and self.measured:
             raise ValueError(f"a {self.kind} model reads commands and velocity, not {', '.join(self.measured)}")
         n_scales = self.n_outputs if self.family != "displacement" else 3

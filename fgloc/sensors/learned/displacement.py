@@ -7,11 +7,13 @@ import math
 import numpy as np
 
 from fgloc.errors import ModelError
+from fgloc.sensors.base import MotionRole
 from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.sensors.learned.forms import MotionPrediction, composed, duration_of, follow, gains, joint_of, sub_steps
 from fgloc.sensors.learned.network import Answering, Float32Array
-from fgloc.sensors.learned.signals import Signal, Signals
+from fgloc.sensors.learned.signals import Signals
+from fgloc.sensors.signals import Signal
 from fgloc.types import ControlEvent, FloatArray
 
 _MIN_DENSITY = 1e-8  # m²/s, m²/s, rad²/s: nobody knows motion better than this
@@ -162,7 +164,8 @@ def measured_twists(
 ) -> None:
     """Replace in the twists ``(n, 3)`` of sub-steps what the signals know better: wheels all, a gyro the yaw rate."""
     limits = np.column_stack([starts, starts + dt])
-    if signals.wheels is not None:
-        base[:] = signals.wheels.means(limits - wheel_kinematics.delay_s)[:, 0] @ gains(wheel_kinematics)
-    if signals.gyro is not None:
-        base[:, 2] = signals.gyro.means(limits)[:, 0, 0]
+    wheels, rate = signals.of_role(MotionRole.ODOMETER), signals.of_role(MotionRole.RATE)
+    if wheels is not None:
+        base[:] = wheels.means(limits - wheel_kinematics.delay_s)[:, 0] @ gains(wheel_kinematics)
+    if rate is not None:
+        base[:, 2] = rate.means(limits)[:, 0, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fgloc.sensors.base import BuiltIn, MotionRole
-from fgloc.sensors.learned.installation import INSTALLATION
+from fgloc.sensors.base import BuiltIn
+from fgloc.sensors.learned.role import ROLE
 
-LEARNED = BuiltIn(name="learned", title="learned motion", role=MotionRole.MODEL, installation=INSTALLATION)
+LEARNED = BuiltIn(name="learned", title="learned motion", motion=ROLE)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fgloc.sensors.base import BuiltIn, Stream
 from fgloc.sensors.markers import messages, validation
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.sensors.markers.role import ROLE
 from fgloc.sensors.topic_checks import RawChecks, SightingsChecks
 from fgloc.types import LandmarkSighting, PixelMeasurement
 
@@ -50,6 +51,7 @@ MARKERS = BuiltIn(
         ),
     ),
     failing_as="camera",
+    raw_landmarks=ROLE,
     measures=_measures,
     measured=(PixelMeasurement,),
     failures=_failures,

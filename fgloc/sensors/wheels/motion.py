@@ -120,7 +120,7 @@ class WheelMotion:
         self._taken[step] = measured
         return measured
 
-    def carry(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+    def motion_between(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
         """Motion between two times near the step, forwards or backwards.
 
         Args:
@@ -142,7 +142,7 @@ class WheelMotion:
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Of the base ``(3,)`` [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
-        motion, _ = self.carry(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
+        motion, _ = self.motion_between(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
         return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
 
     def derivatives(

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from fgloc.sensors.base import BuiltIn, Joined, MotionRole, RawMistake, Stream
+from fgloc.sensors.base import BuiltIn, Joined, RawMistake, Stream
 from fgloc.sensors.wheels import messages, validation
+from fgloc.sensors.wheels.channels import CHANNELS
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.findings import OdometryChecks
-from fgloc.sensors.wheels.installation import INSTALLATION
+from fgloc.sensors.wheels.role import ROLE
 from fgloc.types import Event
 
 if TYPE_CHECKING:
@@ -71,8 +72,8 @@ WHEELS = BuiltIn(
             validator=validation.joints,
         ),
     ),
-    role=MotionRole.ODOMETER,
-    installation=INSTALLATION,
+    motion=ROLE,
+    channels=CHANNELS,
     mistakes=_mistakes,
     failures=_failures,
     carried=_carried,
