@@ -105,7 +105,7 @@ def _look(bag: Path) -> _Seen:
             names,
             pair,
             fit_geometry(pair, joints, odometry) if told and pair is not None else None,
-            registry.fitting_dictionary(recording) if "image" in info.roles else None,
+            registry.raw_landmarks().fitting_dictionary(recording) if "image" in info.roles else None,
             find_beside(bag, "map.yaml") is not None,
         )
 
