@@ -80,13 +80,7 @@ def write_results(
         CovarianceError: a covariance is not positive definite.
     """
     metrics, matched = compute_metrics(result, config), match_result(result, config)
-    source = None if result.source is None else str(result.source)
-    provenance = {
-        "command": command,
-        "input": {"path": source, "sha256": input_hash},
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
-        "config": config.model_dump(mode="json"),
-    }
+    provenance = _provenance(result, config, command, input_hash)
     drawn = _drawn(result, matched, config)
     images = {f"{name}.png": png(figure) for name, figure in drawn.items()}
     files = {f"{name}.{form}": image_of(figure, form) for form in figures for name, figure in drawn.items()}
@@ -104,6 +98,17 @@ def write_results(
                 write_map(result.found.landmarks, stage / "map.yaml")
         write_text(stage / "report.html", render(result, metrics, matched, images, provenance))
     return metrics
+
+
+def _provenance(result: RunResult, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
+    """What ``config.json`` holds: how the result came about."""
+    source = None if result.source is None else str(result.source)
+    return {
+        "command": command,
+        "input": {"path": source, "sha256": input_hash},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "config": config.model_dump(mode="json"),
+    }
 
 
 def _drawn(result: RunResult, matched: Matched | None, config: Config) -> dict[str, Figure]:
