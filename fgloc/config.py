@@ -139,9 +139,7 @@ class EstimatorConfig(Section):
     kind: Literal["fixed_lag", "isam2", "ekf"] = Field(
         "fixed_lag", description="isam2: the whole run; ekf: a filter of the pose alone, for comparison"
     )
-    ground: Literal["flat", "uneven"] = Field(
-        "flat", description="uneven: height, roll and pitch are estimated too; flat: the floor is the map's z = 0"
-    )
+    ground: Literal["flat", "uneven"] = Field("flat", description="uneven: height, roll and pitch are estimated too")
     lag_s: float = Field(10.0, ge=0.05, le=1e5)
     relinearize_threshold: float = Field(0.01, ge=1e-6, le=10)
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")

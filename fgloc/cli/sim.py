@@ -71,7 +71,9 @@ def record(
 def follow_path(
     scenario: ScenarioArgument,
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder of bag/, map.yaml, following.csv, following.png")],
-    path: Annotated[str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour, ramp), or a file")],
+    path: Annotated[
+        str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour, ramp), or a file")
+    ],
     pose: Annotated[
         str, typer.Option(help="what guides the robot: fgloc, truth, wheels, learned, fgloc-no-model and others")
     ] = "fgloc",

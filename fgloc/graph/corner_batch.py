@@ -45,7 +45,7 @@ class CornerBatch:
         self._pixels = np.array([m.corners_px for m in seen])
         self._sigma = np.array([m.sigma_px for m in seen])
         self._twist = np.array([m.twist for m in seen])
-        self._tilting = np.array([m.tilting for m in seen]) if installation.ground else None
+        self._tilting = np.array([(*m.tilting, 0.0) for m in seen]) if installation.ground else None
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
         self._moved = _roots([m.motion_cov for m in seen])
@@ -68,11 +68,14 @@ class CornerBatch:
         On uneven ground the poses are ``(m, 6)``, with height, roll and pitch at the end, and so are the Jacobians by
         them; of poses ``(m, 3)`` those are at the end of the installation, and so are the Jacobians.
         """
+        if self._tilting is None or poses.shape[1] > 3:
+            return self._evaluate(poses, theta, by_installation)
+        ground = np.broadcast_to(theta[self._constants :], (len(poses), 3))
+        stack = self._evaluate(np.column_stack([poses, ground]), theta, by_installation)
+        return self._ground_in_installation(stack, by_installation)
+
+    def _evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool) -> Stacked:
         n = len(poses)
-        if self._tilting is not None and poses.shape[1] == 3:
-            ground = np.broadcast_to(theta[self._constants :], (n, 3))
-            stack = self.evaluate(np.column_stack([poses, ground]), theta, by_installation)
-            return self._ground_in_installation(stack, by_installation)
         camera = np.zeros(12) if self._camera is None else theta[self._camera]
         marker = np.append(theta, 0.0)[self._columns[:, 12:]]
         # 1. Corners in the map, in the base frame, at the exposure, in the camera
@@ -93,8 +96,7 @@ class CornerBatch:
         flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
         if self._tilting is not None:
-            p, r = self._tilting[:, None, 0], self._tilting[:, None, 1]
-            flow += np.stack([r * q[:, :, 2], -p * q[:, :, 2], p * q[:, :, 1] - r * q[:, :, 0]], axis=2)
+            flow += _cross(self._tilting[:, None], q)
         late = camera[11] - self._offset
         mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
         X = mounted - camera[:3] - _cross(camera[3:6], mounted)
@@ -108,15 +110,7 @@ class CornerBatch:
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
         if self._tilting is not None:
-            tipped = late[:, None, None, None] * self._tilting[:, None, None]
-            B = B + np.stack(
-                [
-                    -tipped[..., 1] * B[..., 2],
-                    tipped[..., 0] * B[..., 2],
-                    tipped[..., 1] * B[..., 0] - tipped[..., 0] * B[..., 1],
-                ],
-                axis=-1,
-            )
+            B = B + late[:, None, None, None] * _cross(B, self._tilting[:, None, None])
         scale = 1.0 / self._noise_px
         J: FloatArray = np.stack(
             [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
@@ -127,18 +121,22 @@ class CornerBatch:
         J = (J * scale[:, None, None, None]).reshape(n, 8, -1)
         if not by_installation:
             return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
+        assert by_lens is not None
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
         H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
         H[..., 6:11] = by_lens
         H[..., 11] = by_time
-        M = B @ Rz.transpose(0, 2, 1)[:, None]
+        self._by_marker(H, B @ Rz.transpose(0, 2, 1)[:, None], local)
+        H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
+        return Stacked(residual, J, H, self._columns, behind)
+
+    def _by_marker(self, H: FloatArray, M: FloatArray, local: FloatArray) -> None:
+        """Fill in derivatives by the marker, from those by a point in the map ``(m, 4, 2, 3)``; 0 what is no state."""
         H[..., 12:15] = M
         H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
         H[..., :12] *= self._camera is not None
         H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
-        H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
-        return Stacked(residual, J, H, self._columns, behind)
 
     def _ground_in_installation(self, stack: Stacked, by_installation: bool) -> Stacked:
         """Derivatives by height, roll and pitch as the last ones by the installation."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from operator import is_not
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -17,8 +16,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.corner_batch import MIN_DEPTH_M
-from fgloc.graph.ground import ground_key, rotations
+from fgloc.graph.ground import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.graph.linear_factors import INSTALLATION as INSTALLATION
+from fgloc.graph.linear_factors import insert_installation, installation_blocks, linear_factor
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
@@ -55,10 +56,6 @@ def pose_key(k: int) -> int:
 def landmark_key(landmark_id: int) -> int:
     """Key of an estimated landmark."""
     return int(gtsam.symbol("l", landmark_id))
-
-
-INSTALLATION = int(gtsam.symbol("i", 0))
-"""Key of the installation state: one vector."""
 
 
 def installed_motion_factor(
@@ -106,20 +103,6 @@ def installed_prior_factor(
     W = whitening_of(cov)
     blocks = {pose_key(k): W[:, :3]} | installation_blocks(k, W[:, 3:], constants)
     return [linear_factor(blocks, np.zeros(3 + n), values)]
-
-
-def insert_installation(k: int, theta: FloatArray, constants: int, values: gtsam.Values) -> None:
-    """Where a factor of keyframe k is linear: the installation ``(n,)``, the last rows of which may be its own."""
-    if constants:
-        values.insert(INSTALLATION, theta[:constants])
-    if len(theta) > constants:
-        values.insert(ground_key(k), theta[constants:])
-
-
-def installation_blocks(k: int, H: FloatArray, constants: int) -> dict[int, FloatArray]:
-    """Derivatives ``(d, n)`` by the installation, by key; the last of them may be keyframe k's own."""
-    blocks = {INSTALLATION: H[:, :constants]} if constants else {}
-    return blocks if H.shape[1] == constants else {**blocks, ground_key(k): H[:, constants:]}
 
 
 def sighting_factors(
@@ -314,12 +297,3 @@ class LandmarkFactors:
         if landmark.landmark_id not in self._corners:
             self._corners[landmark.landmark_id] = landmark.corners()
         return self._corners[landmark.landmark_id]
-
-
-def linear_factor(
-    blocks: Mapping[int, FloatArray], residual: FloatArray, values: gtsam.Values
-) -> gtsam.NonlinearFactor:
-    """A factor of whitened residual ``(d,)``, linear about these values; up to three keys with their Jacobians."""
-    pairs: list[Any] = [part for key, A in blocks.items() for part in (key, A)]
-    noise = gtsam.noiseModel.Unit.Create(len(residual))
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*pairs, -residual, noise), values)  # type: ignore[call-overload]

@@ -15,6 +15,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.graph.installation import Installation
+from fgloc.sensors import registry
 from fgloc.types import FloatArray, InertialReading, MotionMeasurement
 
 GRAVITY = 9.81  # m/s²
@@ -29,8 +30,6 @@ _STILL_RAD = 2e-4  # of a robot that stands
 _SLOPE_RAD = 0.15  # rad: ... about level, by as much as `fgloc.graph.installation` allows for at the start
 _SUDDEN = 3.0  # Cauchy constant of the gravity's direction, in units of its sigma: slips and bumps are accelerations
 _EPS = 1e-6
-_TILTED = {"gyro.roll_rad": 0, "gyro.pitch_rad": 1}  # rows of roll and pitch as the accelerometer has them
-_LEVELLED = {"gyro.level_x_rad": 0, "gyro.level_y_rad": 1}
 
 
 def ground_key(k: int) -> int:
@@ -146,16 +145,7 @@ def ground_step(
     smooth = _smooth(motion, measured)
     share = 0.0 if inertial is None else smooth / (smooth + inertial.turn_variance)
     turn = share * measured
-    rows = 8 + len(motions)
-    angles, moves, turns = np.tile(ground[1:], (rows, 1)), np.tile(motion, (rows, 1)), np.tile(turn, (rows, 1))
-    angles[1:3] += _EPS * np.eye(2)
-    turns[3:5] += _EPS * np.eye(2)
-    for i, direction in enumerate(np.eye(3)):
-        moves[5 + i] = se2.compose(motion, se2.exp(_EPS * direction))
-    moves[8:] = [m.motion for m in motions]
-    planar, climbed, tilted = driven(angles, moves, turns)
-    ends = np.column_stack([ground[0] + climbed, tilted])
-    slopes = (ends[1:8] - ends[0]).T / _EPS  # (3, 7) by angles, turns, motion
+    planar, ends, slopes = _perturbed(motions, motion, turn, ground)
     P = np.column_stack([se2.log(se2.between(planar[0], planar[5 + i])) for i in range(3)]) / _EPS
     by_turn, by_motion = slopes[:, 2:4], slopes[:, 4:]
     A = np.column_stack([np.eye(3)[:, 0], slopes[:, :2]])
@@ -196,6 +186,27 @@ def _smooth(motion: FloatArray, turn: FloatArray) -> float:
     return usual + float(turn @ turn)
 
 
+def _perturbed(
+    motions: Sequence[MotionMeasurement], motion: FloatArray, turn: FloatArray, ground: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A step as it is, and a little changed.
+
+    Returns:
+        Planar motions ``(8 + k, 3)``: as it is; by roll, pitch, both turns and the motion (right perturbation) changed;
+        those of each of the k motions. Height, roll and pitch after them ``(8 + k, 3)``. Their derivatives ``(3, 7)``.
+    """
+    rows = 8 + len(motions)
+    angles, moves, turns = np.tile(ground[1:], (rows, 1)), np.tile(motion, (rows, 1)), np.tile(turn, (rows, 1))
+    angles[1:3] += _EPS * np.eye(2)
+    turns[3:5] += _EPS * np.eye(2)
+    for i, direction in enumerate(np.eye(3)):
+        moves[5 + i] = se2.compose(motion, se2.exp(_EPS * direction))
+    moves[8:] = [m.motion for m in motions]
+    planar, climbed, tilted = driven(angles, moves, turns)
+    ends = np.column_stack([ground[0] + climbed, tilted])
+    return planar, ends, (ends[1:8] - ends[0]).T / _EPS
+
+
 def _turn_of(
     inertial: InertialReading | None, yaw: float, theta: FloatArray, installation: Installation
 ) -> tuple[FloatArray, FloatArray]:
@@ -205,7 +216,9 @@ def _turn_of(
         return np.zeros(2), by_bias
     turn = inertial.turn.copy()
     dt = inertial.seconds
-    columns = {"gyro.bias_x": (0, -dt), "gyro.bias_y": (1, -dt), "gyro.roll_rad": (1, -yaw), "gyro.pitch_rad": (0, yaw)}
+    names = registry.rate_sensor().attitude_names
+    (bias_x, bias_y), (roll, pitch) = names.biases, names.tilts
+    columns = {bias_x: (0, -dt), bias_y: (1, -dt), roll: (1, -yaw), pitch: (0, yaw)}
     for name, (row, gain) in columns.items():
         if name in installation.index:
             i = installation.index[name]
@@ -270,10 +283,12 @@ def gravity(
     measured = np.array([math.atan2(y, z), math.atan2(-x, math.hypot(y, z))])
     D = np.zeros((2, installation.constants))
     residual = ground[1:] - measured
-    for name, row in {**_TILTED, **_LEVELLED}.items():
-        if name in installation.index:
-            D[row, installation.index[name]] = 1.0
-            residual[row] += theta[installation.index[name]]
+    names = registry.rate_sensor().attitude_names
+    for pair in (names.tilts, names.levels):
+        for row, name in enumerate(pair):
+            if name in installation.index:
+                D[row, installation.index[name]] = 1.0
+                residual[row] += theta[installation.index[name]]
     variance = inertial.force_variance / GRAVITY**2
     off = (math.hypot(x, y, z) - GRAVITY) ** 2 / GRAVITY**2
     usual = variance * np.eye(2)

@@ -199,12 +199,10 @@ class IncrementalEstimator(Estimator):
         return theta if ground is None else np.concatenate([theta[: self.installation.constants], ground])
 
     def _ground_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
-        """Beside those of the motions; none where the floor is flat."""
         if not self.installation.ground or not frame.motions:
             return []
-        theta = self._theta_before(frame)
-        step = step_of(frame.motions, theta, self.installation)
-        return ground_factors(frame.k, frame.motions, step, theta, self.installation)
+        motions, theta = frame.motions, self._theta_before(frame)
+        return ground_factors(frame.k, motions, step_of(motions, theta, self.installation), theta, self.installation)
 
     def _graph_of(
         self, frame: Keyframe, initial: PoseWithCovariance, prior: PoseWithCovariance | None
@@ -215,7 +213,7 @@ class IncrementalEstimator(Estimator):
         known = initial.installation or self.installed
         constants = self.installation.constants
         if self.installation.ground:
-            known = self._on_ground(frame, initial, known)
+            known = known if initial.installation is not None else self._on_ground(frame, known)
             values.insert(ground_key(frame.k), known.mean[constants:])
         if self._fresh and constants:
             values.insert(INSTALLATION, known.mean[:constants])
@@ -245,14 +243,13 @@ class IncrementalEstimator(Estimator):
             graph.add(factor)
         return graph, values
 
-    def _on_ground(
-        self, frame: Keyframe, initial: PoseWithCovariance, known: InstallationEstimate
-    ) -> InstallationEstimate:
+    def _on_ground(self, frame: Keyframe, known: InstallationEstimate) -> InstallationEstimate:
         """The installation with height, roll and pitch of this keyframe, which may not be the newest."""
-        if initial.installation is not None or frame.ground is None:
+        if frame.ground is None:
             return known
-        mean = np.concatenate([known.mean[: self.installation.constants], frame.ground])
-        return InstallationEstimate(mean, known.cov)
+        return InstallationEstimate(
+            np.concatenate([known.mean[: self.installation.constants], frame.ground]), known.cov
+        )
 
     def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
         """Give a first value to a landmark that is a variable and not yet in the graph."""

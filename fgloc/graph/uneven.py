@@ -9,11 +9,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from fgloc.graph.factors import INSTALLATION, linear_factor
 from fgloc.graph.ground import Gravity, GroundStep, gravity, ground_key, ground_step
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
 from fgloc.graph.joint import fuse_installed, joint_cov
 from fgloc.graph.joint import predict as predict_on_plane
+from fgloc.graph.linear_factors import INSTALLATION, linear_factor
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import whitening_of
 from fgloc.types import FloatArray, Ground, MotionMeasurement

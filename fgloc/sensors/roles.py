@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from fgloc.sensors.base import MotionInstallation, MotionRole, RawMistake
 from fgloc.sensors.noise_density import NoiseDensity
@@ -94,6 +94,14 @@ class OdometerRole:
     correct: Callable[[SetupMistake, Config], RawMistake]
 
 
+class AttitudeNames(NamedTuple):
+    """Parameters of the installation that roll and pitch depend on, on uneven ground; each about x and y."""
+
+    biases: tuple[str, str]  # of the rates [rad/s], in the axes of the base
+    tilts: tuple[str, str]  # of the mounting, beside the given one [rad]
+    levels: tuple[str, str]  # tilt that the accelerometer's bias makes [rad]
+
+
 @dataclass(frozen=True, slots=True)
 class RateRole:
     """Measures the turn alone.
@@ -105,6 +113,7 @@ class RateRole:
         is_used: whether it is to be used.
         scale: true over reported rate.
         attitude: what measures roll and pitch, from all settings and its mounting ``T_base_imu (4, 4)``.
+        attitude_names: of the parameters that those depend on.
     """
 
     kind: ClassVar[MotionRole] = MotionRole.RATE
@@ -114,6 +123,7 @@ class RateRole:
     is_used: Callable[[Config], bool]
     scale: Callable[[Config], float]
     attitude: Callable[[Config, FloatArray], AttitudeSensor]
+    attitude_names: AttitudeNames
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fgloc.sensors.gyro.installation import INSTALLATION
-from fgloc.sensors.roles import RateErrors, RateRole
+from fgloc.sensors.gyro.installation import BIASES, INSTALLATION, LEVELS, TILTS
+from fgloc.sensors.roles import AttitudeNames, RateErrors, RateRole
 from fgloc.types import FloatArray
 
 if TYPE_CHECKING:
@@ -36,4 +36,5 @@ ROLE = RateRole(
     is_used=lambda config: config.gyro.use,
     scale=lambda config: config.gyro.scale,
     attitude=_attitude,
+    attitude_names=AttitudeNames(BIASES, TILTS, LEVELS),
 )
