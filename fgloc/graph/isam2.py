@@ -194,9 +194,8 @@ class IncrementalEstimator(Estimator):
 
     def _theta_before(self, frame: Keyframe) -> FloatArray:
         """Installation ``(n,)`` as it is known now, with height, roll and pitch at the keyframe before this one."""
-        before, theta = self.log.keyframes.get(frame.k - 1), self.installed.mean
-        ground = None if before is None else before.ground
-        return theta if ground is None else np.concatenate([theta[: self.installation.constants], ground])
+        before = self.log.keyframes.get(frame.k - 1)
+        return (self.installed if before is None else self._on_ground(before, self.installed)).mean
 
     def _ground_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
         if not self.installation.ground or not frame.motions:
