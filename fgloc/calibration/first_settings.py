@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fgloc.config import Config, Role
 from fgloc.frames import BASE_NAMES
@@ -13,10 +12,8 @@ from fgloc.recording.files import find_beside
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
+from fgloc.sensors.first_settings import FirstLook, FirstSection
 from fgloc.types import Event
-
-if TYPE_CHECKING:
-    from fgloc.sensors.wheels.geometry import WheelGeometry, WheelPair
 
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
@@ -31,7 +28,7 @@ _MEANINGS: dict[Role, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class FirstSettings:
+class RobotFile:
     """What `first_settings` found.
 
     Attributes:
@@ -49,14 +46,10 @@ class FirstSettings:
 class _Seen:
     info: RecordingInfo
     frames: tuple[str, ...]
-    joints: tuple[str, ...]
-    pair: WheelPair | None
-    geometry: WheelGeometry | None
-    dictionary: str | None
-    has_map: bool
+    sections: tuple[FirstSection, ...]
 
 
-def first_settings(bag: Path) -> FirstSettings:
+def first_settings(bag: Path) -> RobotFile:
     """Read a recording through and write down what it tells of the robot.
 
     Raises:
@@ -68,8 +61,11 @@ def first_settings(bag: Path) -> FirstSettings:
         f"# Robot of {bag.name}. What is commented out has to be filled in or is the default.",
         "# All keys: docs/configuration.md. `fgloc info BAG --config robot.yaml` checks it.",
         *_recording(seen, missing),
-        *_wheels(seen, missing),
-        *_markers(seen, missing),
+    ]
+    for section in seen.sections:
+        lines += ["", *section.lines] if section.lines else []
+        missing += section.missing
+    lines += [
         "",
         "# Learned motion: once trained (fgloc train --init BAG... --out train.yaml), or of a robot of this kind.",
         "# motion:",
@@ -77,37 +73,23 @@ def first_settings(bag: Path) -> FirstSettings:
     ]
     lacking = ("nothing tells", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
-    return FirstSettings("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
+    return RobotFile("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
 
 
 def _look(bag: Path) -> _Seen:
-    from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
-    from fgloc.sensors.wheels.geometry import fit_geometry, wheel_pair
-
     config = Config()
-    joints: list[JointsEvent] = []
-    odometry: list[OdometryEvent] = []
+    wanted = registry.first_settings()
+    events: dict[type[Event], list[Event]] = {kind: [] for of in wanted for kind in of.events}
 
     def watch(event: Event) -> None:
-        if isinstance(event, JointsEvent):
-            joints.append(event)
-        elif isinstance(event, OdometryEvent):
-            odometry.append(event)
+        if type(event) in events:
+            events[type(event)].append(event)
 
     with Recording(bag, config.recording) as recording:
         info = inspect_recording(recording, config, watch)
-        names = tuple(dict.fromkeys(name for event in joints[:100] for name in event.names))
-        pair = wheel_pair(names)
-        told = pair is not None and len(odometry) > 0
-        return _Seen(
-            info,
-            tuple(name for name in BASE_NAMES if name in recording.frames),
-            names,
-            pair,
-            fit_geometry(pair, joints, odometry) if told and pair is not None else None,
-            registry.raw_landmarks().fitting_dictionary(recording) if "image" in info.roles else None,
-            find_beside(bag, "map.yaml") is not None,
-        )
+        look = FirstLook(info.roles, events, recording, find_beside(bag, "map.yaml") is not None)
+        frames = tuple(name for name in BASE_NAMES if name in recording.frames)
+        return _Seen(info, frames, tuple(of.section(look) for of in wanted))
 
 
 def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
@@ -133,62 +115,3 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
             "errors in the reports"
         )
-
-
-def _wheels(seen: _Seen, missing: list[str]) -> Iterator[str]:
-    if not seen.joints:
-        return
-    yield ""
-    yield f"# Joints in the recording: {', '.join(seen.joints)}."
-    pair, geometry = seen.pair, seen.geometry
-    if pair is None:
-        missing.append(
-            f"which joints are the wheels: {', '.join(seen.joints)}; give wheels.left_joint and wheels.right_joint, "
-            "their radii and the track"
-        )
-    if geometry is None:
-        if pair is not None:
-            missing.append("radii and track of the wheels: measure them (wheels.left_radius, right_radius, track)")
-        yield "# Fill in to use the angles of the wheels, which are better than the driver's odometry:"
-        yield "# wheels:"
-        yield "#   source: ticks"
-        yield f"#   left_joint: {pair.left if pair else ''}"
-        yield f"#   right_joint: {pair.right if pair else ''}"
-        yield "#   left_radius:   # m"
-        yield "#   right_radius:  # m"
-        yield "#   track:         # m, between the wheels' contact points"
-        return
-    assert pair is not None
-    yield "# Radius and track are those with which the driver made its odometry; measure them all the same."
-    yield "wheels:"
-    yield "  source: ticks"
-    yield f"  left_joint: {pair.left}"
-    yield f"  right_joint: {pair.right}"
-    yield f"  left_radius: {geometry.radius_m:.4g}  # m"
-    yield f"  right_radius: {geometry.radius_m:.4g}"
-    yield f"  track: {geometry.track_m:.4g}  # m, between the wheels' contact points"
-    yield "  # scale_sigma: 0.01  # how far the radii may be off; fgloc calibrate finds by how much they are"
-
-
-def _markers(seen: _Seen, missing: list[str]) -> Iterator[str]:
-    if "image" not in seen.info.roles:
-        return
-    yield ""
-    yield "markers:"
-    if seen.dictionary is not None:
-        yield f"  dictionary: {seen.dictionary}  # what is seen in the images fits it"
-    else:
-        missing.append("the dictionary of the markers: no marker was found in the images (markers.dictionary)")
-        yield "  # dictionary: DICT_4X4_50"
-    if seen.has_map:
-        yield "  # default_size_m:  # the map beside the bag has the sizes"
-    else:
-        missing.append(
-            "the size of the markers: measure the side of the black square and give it (markers.default_size_m)"
-        )
-        yield "  # default_size_m: 0.16  # side of the black square; every distance follows from it"
-    yield "  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes"
-    if "camera_info" not in seen.info.roles:
-        yield ""
-        yield "# The recording has no CameraInfo:"
-        yield "# camera: {file: camera.yaml}  # as camera_calibration writes it"

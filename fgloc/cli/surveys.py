@@ -65,6 +65,10 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
+    _tell_next(bags, out, config)
+
+
+def _tell_next(bags: list[Path], out: Path, config: Path | None) -> None:
     paths = " ".join(shown_path(bag) for bag in bags)
     configuration = "" if config is None else f" --config {shown_path(config)}"
     next_step(
