@@ -31,7 +31,7 @@ from benchmarks.adaptive_recordings import SEEDS, Split, prepare
 from benchmarks.adaptive_runs import CASES, cell
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
-from datasets.sim.camera import RenderError
+from fgloc.datasets.sim.camera import RenderError
 from fgloc.types import FloatArray
 
 

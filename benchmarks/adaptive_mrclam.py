@@ -19,9 +19,9 @@ from benchmarks.adaptive_recordings import Recorded
 from benchmarks.adaptive_runs import MOVED_M, changed, distrusting, failure, moved_id, replay
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, not_run
-from datasets import mrclam
 from fgloc import se2
 from fgloc.config import load_config
+from fgloc.datasets import mrclam
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording

@@ -23,10 +23,10 @@ import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from datasets.sim.record import describe, is_recorded, robot_settings
-from datasets.sim.scenario import Scenario
-from datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 from fgloc.config import Config
+from fgloc.datasets.sim.record import describe, is_recorded, robot_settings
+from fgloc.datasets.sim.scenario import Scenario
+from fgloc.datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording

@@ -19,8 +19,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks.adaptive_recordings import cache_folder
-from datasets.sim.following import PoseName, follow
-from datasets.sim.following.cases import drive_of
+from fgloc.datasets.sim.following import PoseName, follow
+from fgloc.datasets.sim.following.cases import drive_of
 from fgloc.errors import FglocError
 from fgloc.files.atomic import atomic_file
 
@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What came of it: see `datasets.sim.following.results.Score`; or why it failed."""
+    """What came of it: see `fgloc.datasets.sim.following.results.Score`; or why it failed."""
 
     track_mm: float = float("nan")
     reached: float = 0.0
@@ -87,7 +87,7 @@ def _driven(cell: Cell) -> Driven:
 @cache
 def _sources() -> str:
     made = hashlib.sha256()
-    parts = [_ROOT / "fgloc", _ROOT / "datasets" / "sim"]
+    parts = [_ROOT / "fgloc"]
     files = sorted(p for part in parts for p in part.rglob("*") if p.suffix in (".py", ".safetensors", ".yaml"))
     for path in [*files, Path(__file__)]:
         made.update(path.relative_to(_ROOT).as_posix().encode())

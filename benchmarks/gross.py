@@ -27,9 +27,9 @@ from benchmarks.adaptive_recordings import Split, cache_folder
 from benchmarks.common import Row, main, not_run
 from benchmarks.gross_recordings import MISTAKES, write
 from benchmarks.installed_recordings import SEEDS, Take, folder, prepare
-from datasets.sim.camera import RenderError
 from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
+from fgloc.datasets.sim.camera import RenderError
 from fgloc.diagnosis.gross_mistakes import inspect_all
 from fgloc.errors import FglocError
 from fgloc.replay.options import RunMode

@@ -25,21 +25,21 @@ import torch
 
 from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
-from datasets import mrclam
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
+from fgloc.datasets import mrclam
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.sensors.learned import MotionModel, load_model, save_model
 from fgloc.sensors.learned.card import Kinematics, Split
 from fgloc.sensors.learned.load import model_of, read_model
+from fgloc.training.adapt import adapted
+from fgloc.training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc.training.data import Run, cut, make_run
+from fgloc.training.evaluate import STEP_S, Figures, evaluate
+from fgloc.training.rollouts import Rollout, roll_kinematics, roll_model
+from fgloc.training.train import leave_one_out, train
 from fgloc.types import ControlEvent, FloatArray
-from training.adapt import adapted
-from training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from training.data import Run, cut, make_run
-from training.evaluate import STEP_S, Figures, evaluate
-from training.rollouts import Rollout, roll_kinematics, roll_model
-from training.train import leave_one_out, train
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

@@ -16,20 +16,20 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import Row
-from datasets import drive
 from fgloc.config import load_config
+from fgloc.datasets import drive
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Input, Split
+from fgloc.training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc.training.data import Run, make_run
+from fgloc.training.evaluate import evaluate
+from fgloc.training.heard import TopicTimes
+from fgloc.training.rollouts import Rollout, roll_model, roll_wheels
+from fgloc.training.train import train
 from fgloc.types import Event, TruthEvent
-from training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from training.data import Run, make_run
-from training.evaluate import evaluate
-from training.heard import TopicTimes
-from training.rollouts import Rollout, roll_model, roll_wheels
-from training.train import train
 
 _STEPS = {"train": range(120), "validation": range(120, 150), "test": range(150, 201)}  # of the calibration
 _HORIZON_S = 1.5

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import kurtosis
 
 from benchmarks.common import Row
-from datasets import mrclam
+from fgloc.datasets import mrclam
 from fgloc.types import FloatArray
 
 _GAIN = 0.93  # of the turn command

@@ -24,11 +24,11 @@ from benchmarks.adaptive_recordings import Split
 from benchmarks.common import Row, not_run
 from benchmarks.installed_recordings import SEEDS, installed
 from benchmarks.installed_runs import kept
-from datasets.sim.camera import RenderError
-from datasets.sim.installed import INSTALLED, load_installed
-from datasets.sim.scenario import Control, Markers, Scenario, World
 from fgloc.calibration.survey import survey
 from fgloc.config import Config, load_config
+from fgloc.datasets.sim.camera import RenderError
+from fgloc.datasets.sim.installed import INSTALLED, load_installed
+from fgloc.datasets.sim.scenario import Control, Markers, Scenario, World
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match_result
 from fgloc.runner import run

@@ -22,8 +22,8 @@ from benchmarks.adaptive_runs import changed
 from benchmarks.common import Row, not_run
 from benchmarks.installed_runs import kept
 from benchmarks.installed_scores import errors
-from datasets import mrclam
 from fgloc.config import load_config
+from fgloc.datasets import mrclam
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.types import Estimate, Step, Trajectory

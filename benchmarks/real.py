@@ -1,8 +1,8 @@
 """Real recordings and the bundled sample, through the same program: ``python -m benchmarks.real``.
 
 MRCLAM 6: robot k is localized with a motion model trained on the other four and constants fitted on the other four
-(`datasets.mrclam`); shared settings (correlation time of the sightings, priors of the self-calibration) are one set for
-all five. Values are means over the robots, spreads their standard deviation.
+(`fgloc.datasets.mrclam`); shared settings (correlation time of the sightings, priors of the self-calibration) are one
+set for all five. Values are means over the robots, spreads their standard deviation.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from benchmarks import stills
 from benchmarks.common import Row, main, not_run
-from datasets import mrclam, pioneer, turtlebot3
 from fgloc import se2
 from fgloc.config import Config, load_config
+from fgloc.datasets import mrclam, pioneer, turtlebot3
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording

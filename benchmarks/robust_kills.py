@@ -128,8 +128,8 @@ def _ablation(place: Path, bag: Path) -> Writer:
 
 
 def _simulation(place: Path) -> Writer:
-    from datasets.sim.record import record
-    from datasets.sim.scenario import Scenario
+    from fgloc.datasets.sim.record import record
+    from fgloc.datasets.sim.scenario import Scenario
 
     out = place / "sim" / "out"
     scenario = Scenario(name="short", duration_s=0.5)
@@ -144,7 +144,7 @@ def _simulation(place: Path) -> Writer:
 def _training(place: Path) -> Writer:
     from tests.synthetic_robot import write_bag
 
-    from training.train import main as train
+    from fgloc.training.train import main as train
 
     out = place / "train" / "out"
     data = place / "train-data"

@@ -15,10 +15,10 @@ import numpy as np
 
 from benchmarks.common import Row, main
 from benchmarks.example_sensors import example_sensors
-from datasets.sim.record import record
-from datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc.ablation.jobs import start_at_truth
 from fgloc.config import Config, load_config
+from fgloc.datasets.sim.record import record
+from fgloc.datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc.evaluation.metrics import Metrics, compute_metrics
 from fgloc.runner import run
 

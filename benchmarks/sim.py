@@ -16,15 +16,24 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
-from datasets.bag import BagWriter
-from datasets.sim.camera import RenderError, frames, pose_at
-from datasets.sim.floor import Floor
-from datasets.sim.mjcf import camera_rotation, intrinsics
-from datasets.sim.physics import Log, Scene, base_twist, center_of_mass, make_scene, simulate, slipping, wheel_twist
-from datasets.sim.record import record
-from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
-from datasets.sim.sensors import streams
-from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
+from fgloc.datasets.bag import BagWriter
+from fgloc.datasets.sim.camera import RenderError, frames, pose_at
+from fgloc.datasets.sim.floor import Floor
+from fgloc.datasets.sim.mjcf import camera_rotation, intrinsics
+from fgloc.datasets.sim.physics import (
+    Log,
+    Scene,
+    base_twist,
+    center_of_mass,
+    make_scene,
+    simulate,
+    slipping,
+    wheel_twist,
+)
+from fgloc.datasets.sim.record import record
+from fgloc.datasets.sim.scenario import Camera, Control, Robot, Scenario, World
+from fgloc.datasets.sim.sensors import streams
+from fgloc.datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
@@ -211,7 +220,7 @@ def _round_trip(seconds: float) -> Row:
 
 
 def _can_render(scene: Scene) -> bool:
-    from datasets.sim.camera import Renderer
+    from fgloc.datasets.sim.camera import Renderer
 
     try:
         Renderer(scene).close()

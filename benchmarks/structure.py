@@ -49,6 +49,12 @@ def modules(root: Path, packages: Iterable[str] = PACKAGES) -> list[Path]:
     return [path for package in packages for path in sorted((root / package).rglob("*.py"))]
 
 
+def core_modules(root: Path) -> list[Path]:
+    """Modules of fgloc but for those of data sets and training, which are made for particular sensors."""
+    outer = (root / "fgloc" / "datasets", root / "fgloc" / "training")
+    return [path for path in modules(root, ("fgloc",)) if not any(path.is_relative_to(folder) for folder in outer)]
+
+
 def flat_files(root: Path) -> Found:
     """Python files directly in ``fgloc/``."""
     return [path.name for path in sorted((root / "fgloc").glob("*.py"))]
@@ -154,7 +160,7 @@ def sensor_leaks(root: Path) -> Found:
         folder = root / "fgloc" / "sensors"
         own = {path for home in homes for path in (folder / f"{home}.py", *(folder / home).rglob("*.py"))}
         defined = {node.name for path in own if path.is_file() for node in _public_classes(path)}
-        for path in modules(root, ("fgloc",)):
+        for path in core_modules(root):
             if path in own:
                 continue
             tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -221,7 +227,7 @@ def new_sensor_files(root: Path) -> Found | None:
     """Files that name the example of a UWB sensor, besides itself and its tests; None: there is none yet."""
     if not (root / "examples" / "uwb.py").is_file():
         return None
-    paths = [*modules(root, ("fgloc",)), root / "pyproject.toml"]
+    paths = [*core_modules(root), root / "pyproject.toml"]
     return [str(path.relative_to(root)) for path in paths if re.search(r"\buwb\b", path.read_text("utf-8"), re.I)]
 
 

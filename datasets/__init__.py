@@ -1,1 +1,1 @@
-"""Loaders of public data sets into bags, the physical simulator, and small bundled recordings."""
+"""Fronts of `fgloc.datasets`, so that ``python -m datasets.NAME`` runs from a clone; not in the wheel."""

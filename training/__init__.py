@@ -1,1 +1,1 @@
-"""Identification of the robot: data, models (torch), training, evaluation, export."""
+"""Fronts of `fgloc.training`, so that ``python -m training.NAME`` runs from a clone; not in the wheel."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -25,7 +26,7 @@ from fgloc.cli.options import (
 )
 from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
-from fgloc.errors import ConfigError, RecordingError
+from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from fgloc.types import RunResult
 
 _TOLD = 3  # judgements in the short form
-SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "installed_run" / "bag"
+SAMPLE = Path(fgloc.__file__).parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
 class Speed(StrEnum):
@@ -50,16 +51,11 @@ def demo(
     ),
 ) -> None:
     """Smooth the bundled recording and replay it online; say where the reports are."""
-    if not SAMPLE.is_dir():
-        raise RecordingError(
-            f"{SAMPLE}: the bundled recording is not here; it comes with a source checkout: clone the repository and "
-            "run `make demo` there"
-        )
     runs: list[tuple[str, Metrics]] = []
     code = 0
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
-        text = f"fgloc {command} {SAMPLE.relative_to(SAMPLE.parents[3])} --out {folder}"
+        text = shlex.join(["fgloc", command, str(SAMPLE), "--out", str(folder)])
         result, metrics = _localise(
             SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
         )

@@ -74,7 +74,8 @@ class PlanarBatch:
         scale = np.exp(np.clip(sensor[0], -_MOST_LOG_SCALE, _MOST_LOG_SCALE))
         seen = scale * self._point @ np.array([[co, so], [-so, co]]).T
         residual = np.zeros((n, 3))
-        residual[:, :2] = q + late[:, None] * flow[:, :2] - seen
+        predicted = q + late[:, None] * flow[:, :2]
+        residual[:, :2] = predicted - seen
         turn = np.zeros((n, 2, 2))  # of the point by a later stamp
         turn[:, 0, 0] = turn[:, 1, 1] = 1.0
         turn[:, 0, 1], turn[:, 1, 0] = -late * w, late * w
@@ -84,8 +85,8 @@ class PlanarBatch:
         J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
         J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
         J[:, :2] = turn @ J[:, :2]
-        H = np.zeros((n, 3, 8))
-        H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -seen, -seen[:, 1], seen[:, 0], 1.0
+        H = np.zeros((n, 3, 8))  # by scale and bearing of the predicted point: the noise of the measured one would bias
+        H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -predicted, -predicted[:, 1], predicted[:, 0], 1.0
         H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, turn @ R, self._up
         H = np.where(self._columns[:, None] >= 0, H, 0.0)
         W = self._whitening

@@ -48,9 +48,9 @@ class TopicActivity:
         end.
         """
         return tuple(
-            f"{topic} ({role}): no usable message has arrived. It is not published, all of its messages were rejected, or "
-            "(live, and when recording) the quality of service does not match: subscribe with reliability best effort and "
-            "durability volatile."
+            f"{topic} ({role}): no usable message has arrived. It is not published, all of its messages were rejected, "
+            "or (live, and when recording) the quality of service does not match: subscribe with reliability best effort "
+            "and durability volatile."
             for role, topic in self._expected.items()
             if topic in self._without
         )

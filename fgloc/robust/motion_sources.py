@@ -73,9 +73,10 @@ class MotionSources:
         """
         if step.dt <= 0.0:
             return MotionReadings()
-        wheels = self._wheels.measure(step)
-        if wheels is not None:
-            wheels = self._installed(wheels, self._wheels.derivatives(step, wheels, self.factors.installation.index))
+        reported = wheels = self._wheels.measure(step)
+        if reported is not None:
+            by = self._wheels.derivatives(step, reported, self.factors.installation.index)
+            wheels = self._installed(reported, by)
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
@@ -89,10 +90,31 @@ class MotionSources:
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
+                if reported is not None and wheels is not None:
+                    wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
         readings = MotionReadings(wheels, self._with_drift(self._measure_learned(step, velocity), step), gyro)
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
+
+    def _by_fused_turn(
+        self, step: Step, reported: MotionMeasurement, turn: Turn, known: Mapping[str, tuple[FloatArray, float]]
+    ) -> dict[str, tuple[FloatArray, float]]:
+        """Derivatives of the wheels' motion where its turn is that of wheels and gyro together.
+
+        The derivative by a scale is the motion itself. With the wheels' own noise in it, derivative and residual are
+        correlated, and the estimate of the scale is biased, the more certain the longer the run (errors in variables).
+        The gyro is the instrument, as far as it is the better of the two. Source: Fuller 1987, "Measurement Error
+        Models", section 1.4.
+        """
+        assert self.gyro is not None
+        both = reported.cov[2, 2] + turn.noise
+        weight = float(reported.cov[2, 2] / both) if both > 0.0 else 0.0
+        fused = reported.motion[2] + weight * (turn.yaw - reported.motion[2])
+        m = replace(reported, motion=with_yaw(reported.motion, fused))
+        rates = self.gyro.rates_at(step.inertial, (step.start_ns, step.stamp_ns))
+        by = self._wheels.derivatives(step, m, self.factors.installation.index, (weight, rates))
+        return {name: (by[name], assumed) for name, (_, assumed) in known.items()}
 
     def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
         """The learned motion with the drift of the gyro that it reads, where no fix observes the yaw by itself."""

@@ -54,8 +54,14 @@ class Odometer(Protocol):
         """Of the base ``(3,)`` at a time near the step's end."""
         ...
 
-    def derivatives(self, step: Step, m: MotionMeasurement, wanted: Container[str] = ()) -> dict[str, FloatArray]:
-        """Of a step's motion by what the sensor is off by."""
+    def derivatives(
+        self,
+        step: Step,
+        m: MotionMeasurement,
+        wanted: Container[str] = (),
+        rates: tuple[float, FloatArray] | None = None,
+    ) -> dict[str, FloatArray]:
+        """Of a step's motion by what the sensor is off by; weight and ``(2,)`` yaw rates at its ends of another."""
         ...
 
 

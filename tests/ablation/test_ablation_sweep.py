@@ -15,12 +15,12 @@ import psutil
 import pytest
 import yaml
 
-from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import attempts, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import ConfigError
 
 START_NS = 1_700_000_000_000_000_000

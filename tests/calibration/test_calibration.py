@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from datasets.bag import BagWriter
 from fgloc import cli, se2
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, yaml_of
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.learned.config import model_path

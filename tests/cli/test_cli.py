@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from datasets.bag import BagWriter
 from fgloc import cli, se2
+from fgloc.datasets.bag import BagWriter
 from fgloc.recording.outputs import write_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Trajectory
@@ -247,11 +247,6 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
     for mode in ("batch", "online"):
         assert {file.name for file in (tmp_path / "out" / mode).iterdir()} == FILES
         assert str(tmp_path / "out" / mode / "report.html") in stdout
-
-
-def test_demo_without_the_sample_says_where_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli.runs, "SAMPLE", tmp_path / "absent")
-    assert "clone the repository" in refused("demo", "--out", tmp_path / "out")
 
 
 def test_bundled_sample_is_localised(tmp_path):

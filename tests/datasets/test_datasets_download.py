@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets.download import Remote, fetch, unpack
+from fgloc.datasets.download import Remote, fetch, unpack
 from fgloc.errors import RecordingError
 
 _CONTENT = bytes(range(256)) * 300

@@ -11,8 +11,8 @@ import pytest
 from dataset_files import header_ns, read_back
 from real_data import real_data
 
-from datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, _span, convert
 from fgloc.config import load_config
+from fgloc.datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, _span, convert
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels.events import JointsEvent

@@ -13,11 +13,11 @@ from dataset_files import barcode, header_ns, read_back, write_mrclam
 from numpy.typing import NDArray
 from real_data import real_data
 
-from datasets import convert as shared
-from datasets import mrclam
-from datasets.mrclam import Run, calibration, convert, frames, read
-from datasets.mrclam_fit import fit_sensor, left_out, sighting_errors
 from fgloc.config import load_config
+from fgloc.datasets import convert as shared
+from fgloc.datasets import mrclam
+from fgloc.datasets.mrclam import Run, calibration, convert, frames, read
+from fgloc.datasets.mrclam_fit import fit_sensor, left_out, sighting_errors
 from fgloc.errors import RecordingError
 from fgloc.sensors.maps import load_map
 

@@ -12,9 +12,9 @@ from dataset_files import header_ns, read_back
 from real_data import real_data
 from rosbags.rosbag1 import Writer
 
-from datasets.mounting import sensor_mounting
-from datasets.pioneer import convert, date_bursts
 from fgloc.config import load_config
+from fgloc.datasets.mounting import sensor_mounting
+from fgloc.datasets.pioneer import convert, date_bursts
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording

@@ -11,9 +11,9 @@ from real_data import real_data
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
-from datasets.bag import BagWriter
-from datasets.turtlebot3 import convert
 from fgloc.config import load_config
+from fgloc.datasets.bag import BagWriter
+from fgloc.datasets.turtlebot3 import convert
 from fgloc.errors import MapError, RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from datasets.sim.floor import Floor, Patch
-from datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from datasets.sim.readings import odometry
-from datasets.sim.record import is_recorded, record
-from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from fgloc.config import load_config
+from fgloc.datasets.sim.floor import Floor, Patch
+from fgloc.datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
+from fgloc.datasets.sim.readings import odometry
+from fgloc.datasets.sim.record import is_recorded, record
+from fgloc.datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from fgloc.sensors.maps import load_map
 
 HALL = World(size_m=(20.0, 20.0))

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
-from datasets.sim.mjcf import camera_rotation, intrinsics
-from datasets.sim.physics import Log, Scene, make_scene, simulate
-from datasets.sim.scenario import Camera, Control, Scenario
+from fgloc.datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
+from fgloc.datasets.sim.mjcf import camera_rotation, intrinsics
+from fgloc.datasets.sim.physics import Log, Scene, make_scene, simulate
+from fgloc.datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector

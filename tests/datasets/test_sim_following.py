@@ -12,20 +12,20 @@ import yaml
 
 from benchmarks import follow as benchmark
 from benchmarks.follow_runs import Driven
-from datasets.bag import BagWriter
-from datasets.sim.control import Command, Driver
-from datasets.sim.following.cases import CASES, drive_of
-from datasets.sim.following.failing import FailingSensors, read_failures
-from datasets.sim.following.figures import draw_drives, table
-from datasets.sim.following.loop import PROCESSING_S, Arrivals, Drive, Written, follow
-from datasets.sim.following.path import BUNDLED, Curve, WaypointPath, load_path
-from datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
-from datasets.sim.following.results import Followed
-from datasets.sim.physics import Simulation, make_scene, simulate
-from datasets.sim.scenario import Camera, Gnss, Scenario, Uwb, World
-from datasets.sim.sensors import EPOCH_NS, stamp_ns, streams
 from fgloc import run, se2
 from fgloc.config import Config, load_config
+from fgloc.datasets.bag import BagWriter
+from fgloc.datasets.sim.control import Command, Driver
+from fgloc.datasets.sim.following.cases import CASES, drive_of
+from fgloc.datasets.sim.following.failing import FailingSensors, read_failures
+from fgloc.datasets.sim.following.figures import draw_drives, table
+from fgloc.datasets.sim.following.loop import PROCESSING_S, Arrivals, Drive, Written, follow
+from fgloc.datasets.sim.following.path import BUNDLED, Curve, WaypointPath, load_path
+from fgloc.datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
+from fgloc.datasets.sim.following.results import Followed
+from fgloc.datasets.sim.physics import Simulation, make_scene, simulate
+from fgloc.datasets.sim.scenario import Camera, Gnss, Scenario, Uwb, World
+from fgloc.datasets.sim.sensors import EPOCH_NS, stamp_ns, streams
 from fgloc.errors import ConfigError
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.gyro.events import ImuEvent

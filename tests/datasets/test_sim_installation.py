@@ -10,16 +10,16 @@ import pytest
 from rosbags.highlevel import AnyReader
 from sim_bags import messages
 
-from datasets.sim.installation import Installation
-from datasets.sim.installed import Installed, install, load_installed, survey, write_installed
-from datasets.sim.mjcf import intrinsics
-from datasets.sim.physics import base_twist, make_scene, simulate, slipping, wheel_twist
-from datasets.sim.readings import odometry
-from datasets.sim.record import is_recorded, record
-from datasets.sim.room import make_map
-from datasets.sim.scenario import Camera, Control, Robot, Scenario, World
-from datasets.sim.suite import BUNDLED, load_suite
 from fgloc.config import Config, GateConfig, load_config
+from fgloc.datasets.sim.installation import Installation
+from fgloc.datasets.sim.installed import Installed, install, load_installed, survey, write_installed
+from fgloc.datasets.sim.mjcf import intrinsics
+from fgloc.datasets.sim.physics import base_twist, make_scene, simulate, slipping, wheel_twist
+from fgloc.datasets.sim.readings import odometry
+from fgloc.datasets.sim.record import is_recorded, record
+from fgloc.datasets.sim.room import make_map
+from fgloc.datasets.sim.scenario import Camera, Control, Robot, Scenario, World
+from fgloc.datasets.sim.suite import BUNDLED, load_suite
 from fgloc.errors import ConfigError
 from fgloc.frames import rpy_matrix
 from fgloc.intake.validation import EventValidator

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from sim_bags import messages
 
-from datasets.sim.camera import Renderer, RenderError, frames, pose_at
-from datasets.sim.installation import Installation
-from datasets.sim.installed import MountedCamera, load_installed
-from datasets.sim.physics import Log, make_scene, simulate
-from datasets.sim.record import record
-from datasets.sim.scenario import Camera, Control, Scenario
+from fgloc.datasets.sim.camera import Renderer, RenderError, frames, pose_at
+from fgloc.datasets.sim.installation import Installation
+from fgloc.datasets.sim.installed import MountedCamera, load_installed
+from fgloc.datasets.sim.physics import Log, make_scene, simulate
+from fgloc.datasets.sim.record import record
+from fgloc.datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from datasets.sim.installed import install, load_installed
-from datasets.sim.room import make_map
-from datasets.sim.scenario import Scenario
-from datasets.sim.suite import BUNDLED, load_suite
 from fgloc.config import load_config
+from fgloc.datasets.sim.installed import install, load_installed
+from fgloc.datasets.sim.room import make_map
+from fgloc.datasets.sim.scenario import Scenario
+from fgloc.datasets.sim.suite import BUNDLED, load_suite
 from fgloc.sensors.maps import load_map
 
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from datasets.sim.camera import light_level
-from datasets.sim.control import Driver, make_function
-from datasets.sim.figures import draw
-from datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
-from datasets.sim.ground import make_ground
-from datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from datasets.sim.record import record
-from datasets.sim.room import make_map
-from datasets.sim.scenario import (
+from fgloc.datasets.sim.camera import light_level
+from fgloc.datasets.sim.control import Driver, make_function
+from fgloc.datasets.sim.figures import draw
+from fgloc.datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
+from fgloc.datasets.sim.ground import make_ground
+from fgloc.datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
+from fgloc.datasets.sim.record import record
+from fgloc.datasets.sim.room import make_map
+from fgloc.datasets.sim.scenario import (
     Control,
     ControlKind,
     LightStep,
@@ -27,8 +27,8 @@ from datasets.sim.scenario import (
     Scenario,
     World,
 )
-from datasets.sim.section import channel_rng
-from datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
+from fgloc.datasets.sim.section import channel_rng
+from fgloc.datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.types import FloatArray
 

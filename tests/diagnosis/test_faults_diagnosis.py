@@ -24,10 +24,10 @@ from robot_world import (
     room,
 )
 
-from datasets import mrclam, pioneer, turtlebot3
-from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
+from fgloc.datasets import mrclam, pioneer, turtlebot3
+from fgloc.datasets.bag import BagWriter
 from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.diagnosis.pool import Evidence, Pool
 from fgloc.frames import yaw_quaternion

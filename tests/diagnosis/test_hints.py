@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets.bag import BagWriter
 from fgloc.config import Config, RecordingConfig
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run

@@ -11,9 +11,9 @@ import yaml
 from test_ablation_sweep import SUITE, write_circle
 from test_graph import corner_sighting, wall_map
 
-from datasets.bag import BagWriter
 from fgloc.ablation.records import attempts, log_attempt, only_sweep, read_record, record_path
 from fgloc.config import Config, EstimatorConfig
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import OutputError
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.isam2 import IncrementalEstimator

@@ -9,8 +9,8 @@ import pytest
 from robot_world import SPEED, START_NS, TURN, World, beacons, config, truth_at
 from world_bags import write_world
 
-from datasets.bag import BagWriter
 from fgloc import se2
+from fgloc.datasets.bag import BagWriter
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.range_bearing.events import RangeBearingEvent

@@ -226,6 +226,8 @@ def test_online_with_an_installation_equals_the_batch(kind, lag_s):
 
 # --- derivatives of the motions ---------------------------------------------------------------------------------------
 
+STILL = np.zeros(3), np.zeros((3, 3))  # acceleration and covariance of an IMU that gives neither
+
 
 def turning(i: int, dt: float = 0.1, later_s: float = 0.0) -> Step:
     """Commands of a robot that speeds up into a curve, as a clock shows them that is late by ``later_s``."""
@@ -237,7 +239,7 @@ def turning(i: int, dt: float = 0.1, later_s: float = 0.0) -> Step:
         commands.append(ControlEvent(stamp, stamp, "/cmd_vel", 0.3 + 0.2 * t, 0.4 + 0.8 * t))
     kept = tuple(c for c in commands if c.stamp_ns <= end)
     imu = tuple(
-        ImuEvent(t, t, "/imu", "imu", np.array([0.0, 0.0, 0.5]), np.zeros(3), np.zeros((3, 3)))
+        ImuEvent(t, t, "/imu", "imu", np.array([0.0, 0.0, 0.4 + 0.8e-9 * (t - START_NS)]), *STILL)
         for t in range(start, end + 1, 10_000_000)
     )
     return Step(i, 0, start, end, by_class((*kept, *imu)))
@@ -273,6 +275,18 @@ def test_derivatives_of_the_wheels_are_those_of_their_model(name, gains):
     assert moved.wheels.depends_on[name][1] == pytest.approx(10 * h)
     expected = readings_with({}, **gains(10 * h)).wheels.motion
     assert moved.wheels.motion == pytest.approx(expected, abs=1e-5)
+
+
+def test_noise_of_the_wheels_turn_is_not_in_their_derivatives_where_a_gyro_measures_it():
+    """Else derivative and residual are correlated: the scale would drift away in a long run."""
+    by, noisy = ({"wheels.track": 0.0}, {"scale_omega": 1.05})
+    gyro = GyroConfig().yaw_per_sqrt_s ** 2 * 0.1
+    true, off = readings_with(by).wheels, readings_with(by, **noisy).wheels
+    share = gyro / (gyro + off.cov[2, 2])
+    assert share < 0.5
+    change = off.depends_on["wheels.track"][0][2] - true.depends_on["wheels.track"][0][2]
+    assert abs(change) < 1.05 * share * abs(off.motion[2] - true.motion[2])
+    assert abs(off.motion[2] - true.motion[2]) > 0.04 * abs(true.motion[2])
 
 
 def test_the_derivative_by_the_clock_of_the_wheels_is_that_of_other_stamps():

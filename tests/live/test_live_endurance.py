@@ -52,6 +52,29 @@ def kept(parts):
     }
 
 
+@pytest.mark.slow
+def test_what_is_found_of_the_installation_does_not_drift():
+    """Nothing is off, in 13 minutes of a circle; gyro scale and bias can't be told apart at a constant turn rate."""
+    config_, map_ = circle_config(), circle_map()
+    facts = LiveFacts(config_, None, None)
+    run = OnlineRun(config_, map_, facts)
+    for k, event in enumerate(circle(800.0)):
+        if run.parts is None:
+            facts.topic_is_used(event)
+            facts.note(event)
+            if k == 20:
+                run.build()
+            continue
+        passed = run.check(event)
+        for _ in () if passed is None else run.use(passed, False):
+            pass
+    estimator = run.parts.localizer.estimator
+    sigmas = np.sqrt(np.diag(estimator.installed.cov))
+    off = dict(zip(estimator.installation.names, estimator.installed.mean / sigmas, strict=True))
+    del off["gyro.scale"]
+    assert max(abs(x) for x in off.values()) < 3.5, off
+
+
 def test_memory_and_what_is_kept_stay_as_they_are():
     made, sizes, objects = 0, [], []
     config_, map_ = circle_config(), circle_map()

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from wire import DOMAIN, wait_until
 
 import fgloc
-from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.cli import app
 from fgloc.config import Config, load_config
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.live import LivePose

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from recording_bags import START_NS, storage_file, write_drive
 from test_cli import fgloc, write_circle
 
-from datasets.bag import BagWriter
 from fgloc.cli.terminal import say
 from fgloc.config import Config, GateConfig, RecordingConfig
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import MapError, RecordingError
 from fgloc.evaluation.style import plain_label
 from fgloc.intake.validation import EventValidator

@@ -16,8 +16,8 @@ from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from datasets.bag import BagWriter
 from fgloc.config import Config, RecordingConfig, TopicsConfig
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
 from fgloc.recording.info import format_info, inspect
 from fgloc.recording.messages import default_typestore

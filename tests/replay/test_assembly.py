@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
 
-from datasets.bag import BagWriter
 from fgloc.assembly import assemble
 from fgloc.config import Config, RecordingConfig
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensor_setup import given_pose

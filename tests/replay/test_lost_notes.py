@@ -8,9 +8,9 @@ import pytest
 from test_cli import BEACONS, START_NS, fgloc, sight, write_circle
 
 import fgloc as fgloc_package
-from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import Config, load_config
+from fgloc.datasets.bag import BagWriter
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners

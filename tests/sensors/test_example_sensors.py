@@ -15,11 +15,11 @@ import pytest
 
 from benchmarks.example_sensors import example_sensors
 from benchmarks.sensors import only
-from datasets.sim.positioning import geodetic
-from datasets.sim.record import record
-from datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc import se2
 from fgloc.config import Config, GateConfig, config_of, load_config
+from fgloc.datasets.sim.positioning import geodetic
+from fgloc.datasets.sim.record import record
+from fgloc.datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc.errors import ConfigError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.extensions import outside_sensors

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from datasets.bag import BagWriter
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config
+from fgloc.datasets.bag import BagWriter
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 

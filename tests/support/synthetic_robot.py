@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.bag import BagWriter
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.datasets.bag import BagWriter
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.training.config import DataConfig
+from fgloc.training.data import Run, make_run
+from fgloc.training.heard import TopicTimes
 from fgloc.types import ControlEvent, Event, FloatArray
-from training.config import DataConfig
-from training.data import Run, make_run
-from training.heard import TopicTimes
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND

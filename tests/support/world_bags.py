@@ -9,8 +9,8 @@ import numpy as np
 from robot_world import CAMERA, T_BASE_CAM, World
 from scipy.spatial.transform import Rotation
 
-from datasets.bag import BagWriter
 from fgloc import se2
+from fgloc.datasets.bag import BagWriter
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.range_bearing.events import RangeBearingEvent

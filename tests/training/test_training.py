@@ -18,11 +18,11 @@ from fgloc.sensors.base import MotionRole
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Input, Kind, Split
 from fgloc.sensors.learned.load import read_model
-from training import evaluate as evaluation
-from training import optimize
-from training import train as training
-from training.checkpoint import Checkpoint, Checkpoints
-from training.config import (
+from fgloc.training import evaluate as evaluation
+from fgloc.training import optimize
+from fgloc.training import train as training
+from fgloc.training.checkpoint import Checkpoint, Checkpoints
+from fgloc.training.config import (
     AdaptationConfig,
     CalibrationConfig,
     NetworkConfig,
@@ -31,12 +31,12 @@ from training.config import (
     TrainConfig,
     load_train_config,
 )
-from training.controls import controls, draw_controls
-from training.data import Run
-from training.export import card_of, tensors_of
-from training.members import new_net
-from training.models import DisplacementNet
-from training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
+from fgloc.training.controls import controls, draw_controls
+from fgloc.training.data import Run
+from fgloc.training.export import card_of, tensors_of
+from fgloc.training.members import new_net
+from fgloc.training.models import DisplacementNet
+from fgloc.training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
 
 
 @pytest.fixture(scope="module")

@@ -11,19 +11,19 @@ import torch
 from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
-from datasets.bag import BagWriter
 from fgloc import se2
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
 from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
+from fgloc.training.config import CalibrationConfig, DataConfig, OptimizationConfig
+from fgloc.training.data import Run, cut, load_run, make_run
+from fgloc.training.losses import composed_nll, end_errors, rollout_loss
+from fgloc.training.planar import integrate, relative
+from fgloc.training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 from fgloc.types import ControlEvent, Trajectory
-from training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
-from training.config import CalibrationConfig, DataConfig, OptimizationConfig
-from training.data import Run, cut, load_run, make_run
-from training.losses import composed_nll, end_errors, rollout_loss
-from training.planar import integrate, relative
-from training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 
 
 @pytest.fixture(scope="module")

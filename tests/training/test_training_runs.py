@@ -9,19 +9,19 @@ import pytest
 import yaml
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
-from datasets.bag import BagWriter
 from fgloc.config import Config
+from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.training import train as training
+from fgloc.training.config import DataConfig
+from fgloc.training.data import load_runs
+from fgloc.training.heard import TopicTimes
+from fgloc.training.rollouts import roll_wheels
 from fgloc.types import Event
-from training import train as training
-from training.config import DataConfig
-from training.data import load_runs
-from training.heard import TopicTimes
-from training.rollouts import roll_wheels
 
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
 

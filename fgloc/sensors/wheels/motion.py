@@ -145,11 +145,28 @@ class WheelMotion:
         motion, _ = self.motion_between(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
         return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
 
-    def derivatives(self, step: Step, m: MotionMeasurement, wanted: Container[str] = ()) -> dict[str, FloatArray]:
-        """Of a step's motion by what the wheels are off by; those of the clock only where they are wanted."""
+    def derivatives(
+        self,
+        step: Step,
+        m: MotionMeasurement,
+        wanted: Container[str] = (),
+        rates: tuple[float, FloatArray] | None = None,
+    ) -> dict[str, FloatArray]:
+        """Of a step's motion by what the wheels are off by.
+
+        Args:
+            step: its events.
+            m: the motion, as the wheels report it or another source of less noise.
+            wanted: those of the clock only where they are wanted.
+            rates: weight of another source and its yaw rates ``(2,)`` [rad/s] at start and end of the step.
+        """
         change = None
         if any(name in wanted for name in installation.OF_CLOCK):
             start, end = self.twist(step, step.start_ns), self.twist(step, step.stamp_ns)
+            if rates is not None:
+                weight, (first, last) = rates
+                start[2] += weight * (first - start[2])
+                end[2] += weight * (last - end[2])
             change = end - se2.adjoint(se2.inverse(m.motion)) @ start
         return installation.derivatives(m, change, self._config)
 

@@ -1,0 +1,1 @@
+"""Identification of the robot: data, models (torch), training, evaluation, export."""
