@@ -11,7 +11,7 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo follow test test-all check equal format bench clean
+.PHONY: help demo follow test test-all check equal format bench docs docs-test dist clean
 
 help:
 	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
@@ -20,14 +20,17 @@ help:
 	@echo "make test-all  all tests"
 	@echo "make check     ruff format, ruff, mypy"
 	@echo "make equal     whether the bundled samples' results are those of the committed file, bit by bit"
-	@echo "make bench     the figures of the README"
+	@echo "make dist      sdist and wheel in dist/, checked in a fresh environment outside the repository"
+	@echo "make docs      the documentation as a site, in site/"
+	@echo "make docs-test run every command and piece of code in README and docs/, and the notebooks"
+	@echo "make bench     the figures of docs/benchmarks.md"
 	@echo "make clean     remove .venv, caches, demo-out/ and follow-out/"
 
 demo: .venv/.base
 	$(BIN)/fgloc demo
 
 follow: .venv/.sim
-	$(BIN)/python -m datasets.sim follow-demo --out follow-out --jobs $(JOBS)
+	$(BIN)/fgloc sim follow-demo --out follow-out --jobs $(JOBS)
 
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
@@ -47,11 +50,27 @@ format: .venv/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+docs: .venv/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs-test: .venv/.dev
+	$(BIN)/python -m pytest -n $(JOBS) tests/docs
+
 bench: .venv/.dev
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
 
+# The wheel is checked twice: with all extras by the tests, and with nothing but what pip brings along.
+dist: .venv/.dev
+	rm -rf dist build
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python -m pytest -m slow tests/test_wheel.py
+	place=$$(mktemp -d); trap 'rm -rf "$$place"' EXIT; $(PYTHON) -m venv $$place/venv; \
+	$$place/venv/bin/python -m pip install --quiet -c constraints.txt dist/*.whl; \
+	cd $$place; venv/bin/fgloc --version; venv/bin/fgloc demo
+
 clean:
-	rm -rf .venv build demo-out follow-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf .venv build dist site demo-out follow-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || \

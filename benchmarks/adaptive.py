@@ -23,7 +23,6 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import adaptive_mrclam
 from benchmarks.adaptive_fixed import constant
@@ -32,6 +31,7 @@ from benchmarks.adaptive_runs import CASES, cell
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
 from fgloc.datasets.sim.camera import RenderError
+from fgloc.progress import counted
 from fgloc.types import FloatArray
 
 
@@ -88,7 +88,7 @@ def run_all(cases: Sequence[str], variants: Sequence[str], seeds: Sequence[int],
             for seed, floor in groups
         ]
         found: Found = {}
-        for job in tqdm(jobs, unit="recording", disable=None):
+        for job in counted(jobs, "recordings", len(jobs)):
             for key, figures in job.result().items():
                 found.setdefault(key, []).append(figures)
     return found

@@ -142,9 +142,8 @@ def _simulation(place: Path) -> Writer:
 
 
 def _training(place: Path) -> Writer:
-    from tests.synthetic_robot import write_bag
-
-    from fgloc.training.train import main as train
+    from fgloc.training.session import Told, train_models
+    from tests.support.synthetic_robot import write_bag
 
     out = place / "train" / "out"
     data = place / "train-data"
@@ -163,7 +162,6 @@ def _training(place: Path) -> Writer:
         config = place / f"train{seed}.yaml"
         changed = settings | {"optimization": {"seed": seed, "iterations": 4, "validate_every": 2, "batch": 8}}
         config.write_text(yaml.safe_dump(changed))
-        if train([str(config), "--data", str(data), "--out", str(out)]):
-            raise RuntimeError("the training was refused")
+        train_models(config, data, out, None, Told(lambda _: None, lambda _: None))
 
     return Writer("train", out, lambda: run(1), lambda: run(2))

@@ -1,7 +1,6 @@
-"""``python -m datasets.drive``: see `fgloc.datasets.drive`."""
+"""``python -m datasets.drive``: ``fgloc convert drive`` from a clone."""
 
-from fgloc.datasets.convert import command_line
-from fgloc.datasets.drive import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    command_line(main)
+    main("convert", "drive")

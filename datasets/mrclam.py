@@ -1,7 +1,6 @@
-"""``python -m datasets.mrclam``: see `fgloc.datasets.mrclam`."""
+"""``python -m datasets.mrclam``: ``fgloc convert mrclam`` from a clone."""
 
-from fgloc.datasets.convert import command_line
-from fgloc.datasets.mrclam import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    command_line(main)
+    main("convert", "mrclam")

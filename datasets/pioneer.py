@@ -1,7 +1,6 @@
-"""``python -m datasets.pioneer``: see `fgloc.datasets.pioneer`."""
+"""``python -m datasets.pioneer``: ``fgloc convert pioneer`` from a clone."""
 
-from fgloc.datasets.convert import command_line
-from fgloc.datasets.pioneer import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    command_line(main)
+    main("convert", "pioneer")

@@ -1,7 +1,6 @@
-"""``python -m datasets.turtlebot3``: see `fgloc.datasets.turtlebot3`."""
+"""``python -m datasets.turtlebot3``: ``fgloc convert turtlebot3`` from a clone."""
 
-from fgloc.datasets.convert import command_line
-from fgloc.datasets.turtlebot3 import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    command_line(main)
+    main("convert", "turtlebot3")

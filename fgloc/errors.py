@@ -15,6 +15,9 @@
 A message gives the value found, what was expected and the remedy. The command line turns these into exit code 1.
 """
 
+import traceback
+from pathlib import Path
+
 
 class FglocError(Exception):
     """Base of all errors raised on purpose."""
@@ -58,3 +61,15 @@ class WireError(FglocError):
 
 class EstimatorError(FglocError):
     """The estimator was given something that it cannot use."""
+
+
+def unexpected(error: Exception, what: str) -> FglocError:
+    """The error itself if it was raised on purpose; else one that says where in fgloc the other came from."""
+    if isinstance(error, FglocError):
+        return error
+    root = Path(__file__).parent
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if root in Path(f.filename).parents]
+    where = f" in {Path(frames[-1].filename).relative_to(root.parent)}:{frames[-1].lineno}" if frames else ""
+    failure = EstimatorError(f"{what} failed: {error!r}{where}; this is a defect of fgloc: please report it")
+    failure.__cause__ = error
+    return failure

@@ -156,7 +156,7 @@ def _result(
         wall_s=0.0,
         truth=replay.truth.trajectory(),
         landmarks=parts.landmark_map if smoothed is None else smoothed.landmarks,
-        spans=replay.spans(),
+        spans=replay.spans(estimates[0].stamp_ns),
         installation=found_values(
             parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
         ),

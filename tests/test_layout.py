@@ -5,17 +5,16 @@ import pkgutil
 import re
 import subprocess
 import sys
-from importlib.metadata import requires
+import tomllib
 from pathlib import Path
 
 import pytest
 from config_rows import rows, sections, tables
 
 import fgloc
-from fgloc.config import Config, load_config
-from fgloc.sensors.maps import load_map
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
+GENERATED = {ROOT / "docs" / "reference" / "cli.md"}  # by docs/hooks.py, when the site is built
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
 BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
 UPWARD = {
@@ -31,7 +30,8 @@ ONLY = {  # the places that may import a library
     "gtsam": {"graph"},
     "cv2": {"sensors", "datasets"},
     "matplotlib": {"evaluation", "datasets", "training"},
-    "typer": {"cli", "datasets"},
+    "typer": {"cli"},
+    "rich": {"cli"},
     "dask": {"ablation"},
     "distributed": {"ablation"},
     "cyclonedds": {"live"},
@@ -71,20 +71,20 @@ def test_imports_follow_the_layers(path):
         if top != "fgloc" or not rest or (part, name) in UPWARD:
             continue
         target = rest[0]
-        assert target != "cli" or part == "cli", f"{name} in {path}: nothing imports the command line"
+        assert target != "cli" or part in ("cli", "__main__"), f"{name} in {path}: nothing imports the command line"
         if target in OUTER:
             assert part == "cli" or target in OUTER.get(part, ()), f"{name} in {path}: training → datasets → the rest"
         if part in BASE:
             assert target in BASE, f"{name} in {path}: the foundation stands alone"
         elif part in PARTS:
             assert target in BASE | PARTS, f"{name} in {path}: a part knows nothing of the core loop"
-        elif part not in ABOVE | {*OUTER, "cli", "__init__"}:  # the package itself names its public API
+        elif part not in ABOVE | {*OUTER, "cli", "__init__", "__main__"}:  # the package itself names its public API
             assert target not in ABOVE, f"{name} in {path}: the core does not judge itself"
 
 
 def test_only_the_command_line_prints_and_exits():
     for path in MODULES:
-        if part_of(path) in ("cli", "training"):
+        if part_of(path) == "cli":
             continue
         calls = [node.func for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)]
         names = {func.id for func in calls if isinstance(func, ast.Name)}
@@ -138,22 +138,9 @@ def test_readme_names_the_packages_that_ci_installs():
 def test_links_of_the_documents_lead_somewhere():
     for page in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
-            if not target.startswith("http"):
+            generated = (page.parent / target) in GENERATED
+            if not target.startswith("http") and not generated:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
-
-
-def test_examples_of_the_documents_load(tmp_path):
-    examples = []
-    for page in (ROOT / "README.md", ROOT / "docs" / "configuration.md", ROOT / "docs" / "formats.md"):
-        examples += re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) >= 5
-    for number, text in enumerate(examples):
-        path = tmp_path / f"{number}.yaml"
-        path.write_text(text, encoding="utf-8")
-        if "landmarks:\n" in text:
-            assert load_map(path).landmarks
-        else:
-            assert load_config(path) != Config()
 
 
 def test_no_paths_of_one_machine():
@@ -166,7 +153,9 @@ def test_no_paths_of_one_machine():
 def test_constraints_pin_every_dependency():
     text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     pinned = {line.split("==")[0].lower() for line in text.splitlines() if "==" in line}
-    wanted = {re.match(r"[\w.-]+", line)[0].lower() for line in requires("fgloc")} - {"fgloc"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    wanted = {re.match(r"[\w.-]+", line)[0].lower() for line in lines} - {"fgloc"}
     assert {"gtsam", "torch", "evo", "dask"} <= wanted
     assert wanted <= pinned
     assert "+cpu" not in text  # a wheel for every machine

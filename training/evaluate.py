@@ -1,6 +1,6 @@
-"""``python -m training.evaluate``: see `fgloc.training.evaluate`."""
+"""``python -m training.evaluate``: ``fgloc evaluate-model`` from a clone."""
 
-from fgloc.training.evaluate import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main("evaluate-model")

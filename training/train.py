@@ -1,6 +1,6 @@
-"""``python -m training.train``: see `fgloc.training.train`."""
+"""``python -m training.train``: ``fgloc train`` from a clone."""
 
-from fgloc.training.train import main
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main("train")

@@ -1,6 +1,6 @@
-"""``python -m datasets.sim``: see `fgloc.datasets.sim`."""
+"""``python -m datasets.sim``: ``fgloc sim`` from a clone."""
 
-from fgloc.datasets.sim.command_line import run
+from fgloc.cli import main
 
 if __name__ == "__main__":
-    run()
+    main("sim")

@@ -48,6 +48,13 @@ _SOURCES_LEFT_OUT = (
     "evaluation/ablation_plots.py",
     "evaluation/html.py",
     "evaluation/report.py",
+    "evaluation/report_tables.py",
+    "evaluation/error_scale.py",
+    "evaluation/interactive.py",
+    "evaluation/style.py",
+    "evaluation/time_axis.py",
+    "evaluation/timeline.py",
+    "evaluation/trajectory_plot.py",
 )
 _COSTS = {"real_time_factor", "step_ms"}
 

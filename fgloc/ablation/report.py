@@ -4,23 +4,38 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from fgloc.ablation.jobs import Job, code_hash
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Suite
-from fgloc.ablation.tables import ATE, METRICS, Entry, Run, join, matrix, matrix_csv, rows, runs_csv, sentence, worst
+from fgloc.ablation.tables import (
+    ATE,
+    METRICS,
+    Entry,
+    Run,
+    join,
+    matrix,
+    matrix_csv,
+    rows,
+    runs_csv,
+    sentence,
+    worst,
+    worth,
+)
 from fgloc.config import files_of
-from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
-from fgloc.evaluation.html import page, picture, table
-from fgloc.evaluation.plots import png
+from fgloc.evaluation.ablation_plots import FEWEST_FOR_BAND, Curves, Point, Tracks, plot_severity, plot_tracks
+from fgloc.evaluation.html import embedded, page
+from fgloc.evaluation.style import png
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.outputs import sha256_of, write_json, write_text
+
+_SEVERITY = (
+    f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, of {FEWEST_FOR_BAND} runs or more; "
+    "of fewer every run is a dot."
+)
 
 
 def write_report(
@@ -45,7 +60,7 @@ def write_report(
     with atomic_folder(out, kept=("jobs", "detections")) as stage:
         write_text(stage / "matrix.csv", matrix_csv(entries))
         write_text(stage / "runs.csv", runs_csv(runs))
-        write_json(stage / "ablation.json", _as_json(runs, entries, sentences, provenance))
+        write_json(stage / "ablation.json", _as_json(runs, entries, sentences, _worths(suite, runs), provenance))
         write_text(stage / "report.html", _page(suite, runs, entries, sentences, provenance))
     return sentences
 
@@ -67,11 +82,16 @@ def _inputs(jobs: Sequence[Job]) -> dict[str, dict[str, str]]:
 
 
 def _as_json(
-    runs: Sequence[Run], entries: Sequence[Entry], sentences: Sequence[str], provenance: Mapping[str, Any]
+    runs: Sequence[Run],
+    entries: Sequence[Entry],
+    sentences: Sequence[str],
+    worths: Sequence[str],
+    provenance: Mapping[str, Any],
 ) -> dict[str, Any]:
     return {
         **provenance,
         "sentences": list(sentences),
+        "variants": list(worths),
         "matrix": [
             {
                 "failure": e.failure,
@@ -105,48 +125,45 @@ def _page(
     suite: Suite, runs: Sequence[Run], entries: Sequence[Entry], sentences: Sequence[str], provenance: Mapping[str, Any]
 ) -> str:
     bad = [run for run in runs if run.record.outcome != "done"]
-    body = [
-        f"<h1>{escape(suite.title)}</h1>",
-        f'<p class="sub"><code>{escape(str(provenance["command"]))}</code></p>',
-        f"<p>{len(runs)} runs: {len(suite.recordings)} recordings, {len(suite.variants)} variants, "
-        f"{len(suite.failures)} failures, {len(suite.seeds)} seeds; {len(bad)} without a result.</p>",
-        "<h2>What each failure costs</h2>",
-        f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in sentences)}</ul>" if sentences else "<p>None.</p>",
-    ]
-    for metric in METRICS:
-        body += [f"<h2>{escape(metric.label)}</h2>", _matrix(suite, entries, metric.key)]
-    body.append("<p class=sub>Mean ± standard deviation over recordings and seeds (number of runs).</p>")
-    curves = _curves(suite, entries)
-    if curves:
-        caption = f"{ATE.label} over severity; bands are 95 % confidence intervals of the mean over runs."
-        body += ["<h2>Severity</h2>", picture(png(plot_severity(curves, ATE.label)), "Severity", escape(caption))]
-    tracks = _tracks(suite, runs)
-    if tracks:
+    count = (
+        f"{len(runs)} runs: {len(suite.recordings)} recordings, {len(suite.variants)} variants, "
+        f"{len(suite.failures)} failures, {len(suite.seeds)} seeds; {len(bad)} without a result."
+    )
+    head = ("failure", "severity", *(v.name for v in suite.variants))
+    pictures = []
+    if curves := _curves(suite, entries):
+        pictures.append(("Severity", embedded(png(plot_severity(curves, ATE.label))), _SEVERITY))
+    if tracks := _tracks(suite, runs):
         caption = f"The run of '{suite.variants[0].name}' with the largest error: estimate over the gray truth [m]."
-        body += ["<h2>Worst cases</h2>", picture(png(plot_tracks(tracks)), "Worst cases", escape(caption))]
-    if bad:
-        content = [
-            (
-                r.cell.recording,
-                r.cell.failure,
-                r.cell.variant,
-                r.cell.seed,
-                r.record.outcome,
-                _last_line(r.record.error),
-            )
-            for r in bad
-        ]
-        head = ("recording", "failure", "variant", "seed", "outcome", "reason")
-        body += ["<h2>Without a result</h2>", table(head, content, numbers=0)]
-    text = yaml.safe_dump(dict(provenance), sort_keys=False, allow_unicode=True)
-    body += ["<h2>Provenance</h2>", f"<pre>{escape(text)}</pre>"]
-    return page(escape(suite.title), body)
+        pictures.append(("Worst cases", embedded(png(plot_tracks(tracks))), caption))
+    return page(
+        "ablation.html",
+        title=suite.title,
+        command=str(provenance["command"]),
+        counts=count,
+        costs=sentences,
+        worths=_worths(suite, runs),
+        matrices=[(metric.label, head, _matrix(suite, entries, metric.key)) for metric in METRICS],
+        pictures=pictures,
+        bad=[(*_named(r), r.record.outcome, _last_line(r.record.error)) for r in bad],
+        provenance=provenance,
+    )
 
 
-def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> str:
+def _named(run: Run) -> tuple[str, str, str, int]:
+    return run.cell.recording, run.cell.failure, run.cell.variant, run.cell.seed
+
+
+def _worths(suite: Suite, runs: Sequence[Run]) -> list[str]:
+    """A sentence for each variant but the first."""
+    told = [worth(suite, runs, variant.name) for variant in suite.variants[1:]]
+    return [text for text in told if text is not None]
+
+
+def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str, ...]]:
     units = {f.name: f.severity.unit if f.severity is not None else "" for f in suite.failures}
     texts = {(e.failure, e.severity, e.variant): e.text for e in entries if e.metric.key == key}
-    content = [
+    return [
         (
             failure,
             "" if severity is None else f"{severity:g} {units[failure]}".rstrip(),
@@ -154,7 +171,6 @@ def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> str:
         )
         for failure, severity in rows(suite)
     ]
-    return table(("failure", "severity", *(v.name for v in suite.variants)), content, numbers=len(suite.variants))
 
 
 def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
@@ -166,14 +182,9 @@ def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
         for e in entries:
             mean = e.mean
             if (e.failure, e.metric) == (failure.name, ATE) and mean is not None and e.severity is not None:
-                points.setdefault(e.variant, []).append(Point(e.severity, mean, e.interval))
+                points.setdefault(e.variant, []).append(Point(e.severity, mean, e.interval, e.values))
         if points:
-            unit = (
-                f"{failure.severity.field} [{failure.severity.unit}]"
-                if failure.severity.unit
-                else failure.severity.field
-            )
-            plots.append(Curves(failure.name, unit, points))
+            plots.append(Curves(failure.name, failure.severity.axis, points))
     return plots
 
 

@@ -17,6 +17,8 @@ from fgloc.recording.files import find_beside
 from fgloc.replay.options import RunMode
 
 _MOST_RUNS = 1_000_000
+_WHEN = {"when.burst_s": "duration", "when.share": "share of the messages"}
+_UNITS = {"s", "ms", "m", "mm", "rad", "deg", "px", "ticks", "hz"}
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Severity = Annotated[float, Field(ge=-1e6, le=1e6)]
 
@@ -48,6 +50,22 @@ class Severity(Section):
     field: str = Field(description="of the chain's first failure; a dot leads into 'when', such as when.burst_s")
     values: tuple[_Severity, ...] = Field(min_length=1)
     unit: str = ""
+    label: str = Field("", description="of the axis; empty: made of the field's name")
+
+    @property
+    def axis(self) -> str:
+        """What is varied, in words, with its unit."""
+        name = self.label or _words(self.field)
+        return f"{name} [{self.unit}]" if self.unit else name
+
+
+def _words(field: str) -> str:
+    """A name such as ``distance_m`` in words: without its unit."""
+    if field in _WHEN:
+        return _WHEN[field]
+    name = field.rpartition(".")[2]
+    stem, _, unit = name.rpartition("_")
+    return (stem if stem and unit in _UNITS else name).replace("_", " ")
 
 
 class FailureEntry(Section):

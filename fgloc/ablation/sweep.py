@@ -149,7 +149,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"{error.name} is not installed, and many runs at once need it: "
-            f"{sys.executable} -m pip install 'dask[distributed]'"
+            f"{sys.executable} -m pip install 'fgloc[sweep]'"
         ) from error
     settings = {
         "distributed.scheduler.worker-saturation": 1.0,

@@ -155,6 +155,39 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     return f"{name}{at}: {change} over {len(pairs)} run{'s' if len(pairs) > 1 else ''}{spread}{lost}."
 
 
+def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
+    """What a variant changes against the first one, where that is most: the same recordings, failures and seeds.
+
+    Returns:
+        A sentence; None if no run of both gave a figure.
+    """
+    first = suite.variants[0].name
+    found = []
+    for failure, severity in rows(suite):
+        theirs = {(r.cell.recording, r.cell.seed): ATE.of(r.record) for r in select(runs, failure, severity, variant)}
+        pairs = [
+            (ours, other)
+            for r in select(runs, failure, severity, first)
+            if (ours := ATE.of(r.record)) is not None
+            and (other := theirs.get((r.cell.recording, r.cell.seed))) is not None
+        ]
+        if pairs:
+            ours, other = np.mean(pairs, axis=0).tolist()
+            found.append((other / max(ours, 1e-9), failure, severity, ours, other, len(pairs)))
+    if not found:
+        return None
+    plain = next((f for f in found if f[1] == NOTHING), None)
+    ratio, failure, severity, ours, other, n = max(found, key=lambda f: f[0])
+    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
+    at = "" if severity is None else f" at {severity:g} {units.get(failure, '')}".rstrip()
+    under = "without failure" if failure == NOTHING else f"under '{failure}'{at}"
+    text = f"'{variant}': mean error {other:.3g} mm instead of {ours:.3g} mm of '{first}' {under} "
+    text += f"({ratio:.2g} times, {n} run{'s' if n > 1 else ''})"
+    if plain is not None and failure != NOTHING:
+        text += f"; without failure {plain[4]:.3g} instead of {plain[3]:.3g} mm"
+    return f"{text}."
+
+
 def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
     """The run of the first variant with the largest error; None if none has a track."""
     variant = suite.variants[0].name

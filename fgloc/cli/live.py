@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.cli.extras import need
 from fgloc.cli.options import Bag, ModelOption, configured
-from fgloc.cli.terminal import columns, run_bar, say
+from fgloc.cli.progress import run_bar
+from fgloc.cli.terminal import columns, say
 from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,6 +54,9 @@ def live(
     view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
 ) -> None:
     """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
+    need("live", "fgloc live")
+    if view:
+        need("view", "fgloc live --view")
     # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
     from fgloc.live.wire.node import Node
     from fgloc.live.wire.participant import Participant
@@ -84,6 +89,7 @@ def play(
     network: NetworkOption = False,
 ) -> None:
     """Publish a recording on ROS 2's wire with its recorded timing, and /clock."""
+    need("live", "fgloc play")
     from fgloc.live.wire.participant import Participant
     from fgloc.live.wire.play import Player
 
@@ -119,9 +125,7 @@ def _interrupted() -> Iterator[threading.Event]:
 
 
 def _tell(sentence: str) -> None:
-    from tqdm import tqdm
-
-    tqdm.write(sentence, file=sys.stdout)
+    say(sentence)
     sys.stdout.flush()
 
 
@@ -154,12 +158,16 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 @contextmanager
 def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     """The pose, on a terminal."""
-    from tqdm import tqdm
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
 
-    with tqdm(bar_format="{desc}", disable=None, file=sys.stderr, leave=False) as bar:
-        if bar.disable:
-            yield
-            return
+    on_screen = sys.stdout.isatty()  # then what is printed goes above the line
+    console = Console(stderr=True)
+    with Live(Text(), console=console, auto_refresh=False, transient=True, redirect_stdout=on_screen) as line:
         ended = threading.Event()
 
         def show() -> None:
@@ -168,7 +176,8 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
                 if pose is not None:
                     x, y, yaw = pose.pose
                     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-                    bar.set_description_str(f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m")
+                    text = f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+                    line.update(Text(text), refresh=True)
 
         showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)
         showing.start()

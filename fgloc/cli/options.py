@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
@@ -39,10 +39,32 @@ McapOption = Annotated[
     Path | None,
     typer.Option("--mcap", metavar="FILE", dir_okay=False, help="also write the run as a bag of standard messages"),
 ]
+FigureFormat = Literal["png", "svg", "pdf"]
+FiguresOption = Annotated[
+    str | None,
+    typer.Option(
+        "--figures",
+        metavar="png,svg,pdf",
+        help="also write every figure, sized for print, in one or more of these formats",
+    ),
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="processes; default: one per core")]
 SchedulerOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="a running Dask scheduler, instead of local processes")
 ]
+
+
+def figure_formats(text: str | None) -> list[FigureFormat]:
+    """The formats that ``--figures`` names.
+
+    Raises:
+        typer.BadParameter: one of them is unknown.
+    """
+    known = get_args(FigureFormat)
+    named = [name.strip() for name in (text or "").split(",") if name.strip()]
+    if wrong := [name for name in named if name not in known]:
+        raise typer.BadParameter(f"{wrong[0]!r} is not one of {', '.join(known)}", param_hint="--figures")
+    return [form for form in known if form in named]
 
 
 def configured(bag: Path | None, config_file: Path | None, model: Path | None) -> Config:

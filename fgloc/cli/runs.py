@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +16,8 @@ from fgloc.cli.options import (
     Bag,
     Bags,
     ConfigOption,
+    FigureFormat,
+    FiguresOption,
     MapOption,
     McapOption,
     ModelOption,
@@ -23,9 +26,22 @@ from fgloc.cli.options import (
     SchedulerOption,
     WorkersOption,
     configured,
+    figure_formats,
 )
+from fgloc.cli.progress import run_bar
+from fgloc.cli.remarks import remarks
 from fgloc.cli.sweeps import smooth_many
-from fgloc.cli.terminal import columns, exit_code, exit_unless_trusted, number, run_bar, say, typed
+from fgloc.cli.terminal import (
+    exit_code,
+    exit_unless_trusted,
+    next_step,
+    number,
+    say,
+    say_remark,
+    say_table,
+    shown_path,
+    typed,
+)
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
@@ -56,13 +72,13 @@ def demo(
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = shlex.join(["fgloc", command, str(SAMPLE), "--out", str(folder)])
-        result, metrics = _localise(
-            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online", text
+        result = _localise(
+            SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online"
         )
-        runs.append((mode, metrics))
+        runs.append((mode, _write(result, SAMPLE, folder, text)))
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
-    say(columns(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs]))
+    say_table(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs])
     say("")
     for mode, _ in runs:
         say(f"{mode:<8}{out / mode / 'report.html'}")
@@ -80,16 +96,18 @@ def smooth(
     scheduler: SchedulerOption = None,
     rrd: RrdOption = None,
     mcap: McapOption = None,
+    figures: FiguresOption = None,
 ) -> None:
     """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
     if len(bags) > 1:
-        if rrd is not None or mcap is not None:
-            raise ConfigError("--rrd, --mcap: expected one bag; give each its own command")
+        if rrd is not None or mcap is not None or figures:
+            raise ConfigError("--rrd, --mcap, --figures: expected one bag; give each its own command")
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
-    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "batch", typed())
-    _finish(result, metrics, out, rrd, mcap)
+    forms = figure_formats(figures)
+    result = _localise(bag, map_file, configured(bag, config, model), out, "batch")
+    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
 def online(
@@ -101,11 +119,13 @@ def online(
     speed: Annotated[Speed, typer.Option(help="1: in real time; max: as fast as possible")] = Speed.MAX,
     rrd: RrdOption = None,
     mcap: McapOption = None,
+    figures: FiguresOption = None,
 ) -> None:
     """Replay the recording as on a live robot; each pose depends only on what came before."""
+    forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    result, metrics = _localise(bag, map_file, configured(bag, config, model), out, "online", typed(), pace)
-    _finish(result, metrics, out, rrd, mcap)
+    result = _localise(bag, map_file, configured(bag, config, model), out, "online", pace)
+    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
 def calibrate(
@@ -127,8 +147,11 @@ def calibrate(
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
     rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
-    say(columns(("setting", "given", "found"), rows))
+    say_table(("setting", "given", "found"), rows)
     say(f"configuration: {out}")
+    paths = " ".join(shown_path(bag) for bag in bags)
+    next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
+    next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")
 
 
 def _localise(
@@ -137,23 +160,27 @@ def _localise(
     config: Config,
     out: Path,
     mode: Literal["batch", "online"],
-    command: str,
     pace: float | None = None,
-) -> tuple[RunResult, Metrics]:
-    """Run one recording and write its results."""
+) -> RunResult:
+    """Run one recording, once it is certain that the results can be written."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.evaluation.report import write_results
     from fgloc.recording.files import find_beside
-    from fgloc.recording.outputs import sha256_of
     from fgloc.runner import run
     from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
-    config = resolved(config, map_path)
     with run_bar(mode) as progress:
-        result = run(bag, map_path, config, mode, progress, pace=pace)
-    return result, write_results(result, result.config or config, out, command, sha256_of(bag))
+        return run(bag, map_path, resolved(config, map_path), mode, progress, pace=pace)
+
+
+def _write(result: RunResult, bag: Path, out: Path, command: str, figures: Sequence[FigureFormat] = ()) -> Metrics:
+    """Write the results of a run."""
+    from fgloc.config import Config
+    from fgloc.evaluation.report import write_results
+    from fgloc.recording.outputs import sha256_of
+
+    return write_results(result, result.config or Config(), out, command, sha256_of(bag), figures)
 
 
 def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mcap: Path | None) -> None:
@@ -167,14 +194,11 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
-    for mistake in result.mistakes:
-        say(f"mistake: {mistake}")
-    say(columns(None, rows))
+    for remark in remarks(result, metrics):
+        say_remark(*remark)
+    say_table(None, rows)
     for judgement in gravest(metrics.judgements, _TOLD):
         say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
-    for note in result.notes:
-        if note not in result.mistakes:
-            say(f"note: {note}")
     exit_unless_trusted(result)
 
 

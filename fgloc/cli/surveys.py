@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
-from fgloc.cli.terminal import columns, exit_unless_trusted, run_bar, say
+from fgloc.cli.progress import run_bar
+from fgloc.cli.terminal import exit_unless_trusted, next_step, say, say_table, shown_path
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
 
@@ -64,6 +65,12 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
+    paths = " ".join(shown_path(bag) for bag in bags)
+    configuration = "" if config is None else f" --config {shown_path(config)}"
+    next_step(
+        f"fgloc calibrate {paths} --map {shown_path(out)}{configuration} --out calibrated.yaml",
+        "find what wheels, camera and clocks are off by",
+    )
 
 
 def _of_points(bag: Path, out: Path, settings: Config) -> None:
@@ -88,7 +95,7 @@ def _tell(found: Survey, out: Path) -> None:
         cov = found.landmarks.landmarks[i].cov
         sigma = np.sqrt(np.diag(np.eye(6) if cov is None else cov))
         rows.append((str(i), str(views), f"{1e3 * sigma[:3].max():.1f} mm", f"{np.degrees(sigma[3:].max()):.2f} deg"))
-    say(columns(("marker", "views", "position", "direction"), rows))
+    say_table(("marker", "views", "position", "direction"), rows)
     for i, why in found.left_out.items():
         say(f"left out: marker {i}: {why}")
     for note in found.notes:

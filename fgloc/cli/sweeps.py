@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgloc.cli.extras import need
 from fgloc.cli.options import Out, SchedulerOption, WorkersOption, configured
-from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, columns, jobs_bar, number, say, typed
+from fgloc.cli.progress import jobs_bar
+from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, kept_on_interrupt, number, say, say_table, typed
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
@@ -30,11 +32,13 @@ def ablate(
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
 
+    need("sweep", "fgloc ablate")
     check_out(out)
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
+    kept = f"finished runs are kept in {out}; the same command goes on with the others"
     with only_sweep(out):
-        with jobs_bar("runs", len(jobs)) as show:
+        with kept_on_interrupt(kept), jobs_bar("runs") as show:
             records = sweep(jobs, out, workers, scheduler, retry, show)
         sentences = write_report(plan, jobs, records, out, typed())
     for sentence in sentences:
@@ -59,15 +63,17 @@ def smooth_many(
     from fgloc.ablation.records import only_sweep
     from fgloc.ablation.sweep import sweep
 
+    need("sweep", "fgloc smooth of several bags")
     check_out(out)
     if config_file is not None:
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
-    with only_sweep(out), jobs_bar("bags", len(plan.jobs)) as show:
+    kept = f"finished bags are kept in {out}; the same command goes on with the others"
+    with kept_on_interrupt(kept), only_sweep(out), jobs_bar("bags") as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
-    say(columns(head, [_row(name, by_name.get(name)) for name in plan.names]))
+    say_table(head, [_row(name, by_name.get(name)) for name in plan.names])
     errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
     for name in plan.names:
         if name in errors:

@@ -1,26 +1,31 @@
-"""What the commands say: tables, progress bars, exit codes."""
+"""What the commands say: sentences, tables, exit codes."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 if TYPE_CHECKING:
-    from fgloc.replay.options import Progress
     from fgloc.types import RunResult
 
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
+EXIT_INTERRUPTED = 130
 
 
 def say(text: str, err: bool = False, nl: bool = True) -> None:
     """Print. Control characters, which names in a recording may hold to command the terminal, are shown as escapes."""
-    typer.echo("".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text), err=err, nl=nl)
+    typer.echo(_plain(text), err=err, nl=nl)
+
+
+def _plain(text: str) -> str:
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
 
 
 def _escaped(c: str) -> str:
@@ -53,33 +58,63 @@ def exit_unless_trusted(result: RunResult) -> None:
 
 
 @contextmanager
-def run_bar(label: str) -> Iterator[Progress]:
-    """Seconds of one recording: a bar on a terminal, nothing on a pipe."""
-    from tqdm import tqdm
-
-    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}]"
-    with tqdm(desc=label, total=1.0, disable=None, bar_format=form, file=sys.stderr, leave=False) as bar:
-
-        def show(done_s: float, length_s: float) -> None:
-            if not bar.disable:
-                bar.total = length_s
-                bar.update(done_s - bar.n)
-
-        yield show
+def kept_on_interrupt(kept: str = "of this result nothing was written; an earlier one is as it was") -> Iterator[None]:
+    """Say on Ctrl-C what there is, and end with the code that shells give to it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted: {kept}", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-@contextmanager
-def jobs_bar(label: str, count: int) -> Iterator[Callable[[int, int], None]]:
-    """Jobs of a sweep, with an estimate of the time left: a bar on a terminal, nothing on a pipe."""
-    from tqdm import tqdm
+def group(about: str) -> typer.Typer:
+    """Commands below a name."""
+    return typer.Typer(help=about, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-    with tqdm(desc=label, total=count, disable=None, file=sys.stderr, leave=False) as bar:
 
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
+def warn(text: str) -> None:
+    """What the user should act on, on stderr: in red on a terminal."""
+    say_remark("warning", text, err=True)
 
-        yield show
+
+def say_remark(kind: str, text: str, err: bool = False) -> None:
+    """A sentence under its kind; on a terminal all but notes are red."""
+    head, stream = f"{kind}:", sys.stderr if err else sys.stdout
+    if kind != "note" and stream.isatty():
+        head = typer.style(head, fg=typer.colors.RED, bold=True)
+    typer.echo(f"{head} {_plain(text)}", err=err)
+
+
+def next_step(command: str, why: str) -> None:
+    """The command that a user is likely to want next."""
+    say(f"next: {command}    # {why}")
+
+
+def shown_path(path: Path) -> str:
+    """A path as it is typed in a shell."""
+    return shlex.quote(str(path))
+
+
+def say_table(head: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
+    """Print a table: drawn on a terminal, plain columns on a pipe."""
+    if not sys.stdout.isatty() or not rows:
+        say(columns(head, rows))
+        return
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD if head else None, show_header=head is not None, pad_edge=False)
+    for name, cells in zip(head or ("",) * len(rows[0]), zip(*rows, strict=True), strict=True):
+        table.add_column(Text(name), justify="right" if head and _are_figures(cells) else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(_plain(cell)) for cell in row))
+    Console(highlight=False).print(table)
+
+
+def _are_figures(cells: Sequence[str]) -> bool:
+    return all(cell[:1].isdigit() or cell[:1] in "-+±" for cell in cells)
 
 
 def number(value: float | None, form: str) -> str:
@@ -88,8 +123,15 @@ def number(value: float | None, form: str) -> str:
 
 
 def columns(head: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
-    """A plain table: the first column to the left, the others to the right; without a head all to the left."""
+    """A plain table: figures to the right, all else to the left."""
     lines = [head, *rows] if head else list(rows)
+    if not lines:
+        return ""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    pad = str.rjust if head else str.ljust
-    return "\n".join("  ".join([line[0].ljust(widths[0]), *map(pad, line[1:], widths[1:])]).rstrip() for line in lines)
+    right = [bool(head) and len(rows) > 0 and _are_figures([row[i] for row in rows]) for i in range(len(widths))]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(w) if r else cell.ljust(w) for cell, w, r in zip(line, widths, right, strict=True)
+        ).rstrip()
+        for line in lines
+    )

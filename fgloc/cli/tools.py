@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from fgloc.cli.options import Bag, ConfigOption, MapOption, configured
-from fgloc.cli.terminal import columns, say
+from fgloc.cli.terminal import say, say_table
 
 
 class Align(StrEnum):
@@ -55,4 +55,4 @@ def evaluate(
         ("RPE per metre, position", "-" if relative is None else f"{relative.translation_m:.6f} m"),
         ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
     ]
-    say(columns(None, rows))
+    say_table(None, rows)

@@ -1,4 +1,4 @@
-"""What the converters share: a bag that appears whole, robot.yaml, reading of tables, and the command line."""
+"""What the converters share: a bag that appears whole, robot.yaml, reading of tables."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 import yaml
 from numpy.typing import ArrayLike
-from tqdm import tqdm
 
 from fgloc.config import load_config
 from fgloc.datasets.bag import BagWriter
-from fgloc.errors import FglocError, RecordingError
+from fgloc.errors import RecordingError
+from fgloc.progress import counted
 from fgloc.recording.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 
@@ -51,7 +50,7 @@ def new_bag(out: Path, storage: str) -> Iterator[BagWriter]:
 def write_merged(*streams: Iterable[Message], total: int | None = None) -> None:
     """Write messages in the order in which they were received; each stream is already in order."""
     merged = heapq.merge(*streams, key=itemgetter(0))
-    for _, write in tqdm(merged, total=total, unit="msg", disable=None, leave=False):
+    for _, write in counted(merged, "converting", total, "messages"):
         write()
 
 
@@ -91,14 +90,3 @@ def read_table(path: Path, columns: int, *, delimiter: str | None = None, header
 def nanoseconds(seconds: ArrayLike) -> IntArray:
     """Integer nanoseconds of float seconds since 1970, which are good to a microsecond."""
     return np.asarray(np.round(np.asarray(seconds, dtype=float) * 1e6), dtype=np.int64) * 1000
-
-
-def command_line(main: Callable[..., None]) -> None:
-    """Run a converter's command line: an error made on purpose ends it with one line and exit code 1."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(main)
-    try:
-        app()
-    except (FglocError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise SystemExit(1) from error

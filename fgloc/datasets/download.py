@@ -14,9 +14,8 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 from urllib.parse import urlsplit
 
-from tqdm import tqdm
-
 from fgloc.errors import RecordingError
+from fgloc.progress import counted
 
 _TIMEOUT_S = 60.0
 _BLOCK = 1 << 20
@@ -106,14 +105,14 @@ def _receive(remote: Remote, file: BinaryIO) -> None:
     with urllib.request.urlopen(remote.url, timeout=_TIMEOUT_S) as answer:
         length = answer.headers.get("Content-Length")
         promised = int(length) if length is not None and length.isdigit() else remote.size
-        with tqdm(total=promised, unit="B", unit_scale=True, desc=remote.name, disable=None) as bar:
-            while block := answer.read(_BLOCK):
-                received += len(block)
-                if received > (remote.size or _LIMIT):
-                    raise RecordingError(f"{remote.url}: more than the expected {remote.size or _LIMIT} bytes; refused")
-                digest.update(block)
-                file.write(block)
-                bar.update(len(block))
+        for block in counted(
+            iter(lambda: answer.read(_BLOCK), b""), remote.name, promised and promised / _BLOCK, "MiB"
+        ):
+            received += len(block)
+            if received > (remote.size or _LIMIT):
+                raise RecordingError(f"{remote.url}: more than the expected {remote.size or _LIMIT} bytes; refused")
+            digest.update(block)
+            file.write(block)
     expected = remote.size if remote.size is not None else promised
     if expected is not None and received != expected:
         raise RecordingError(f"{remote.url}: {received} bytes came, expected {expected}; try again, or give --url")

@@ -1,6 +1,6 @@
 """DRIVE (Norlab): a skid-steered Husky in 603 windows of 2 s, with wheel speeds (commanded, measured), gyro, ICP pose.
 
-    python -m datasets.drive test_husky_windows.csv --windows 0-399 --out DIR
+    fgloc convert drive test_husky_windows.csv --windows 0-399 --out DIR
 
 writes ``bag/`` (``/cmd_vel``, ``/joint_states``, ``/imu``, ``/truth``), ``robot.yaml`` and ``windows.csv`` (window,
 calibration step, steady, start). The file has no clock: window w starts at 10⁹ + 100 w seconds, so each window is a
@@ -29,16 +29,14 @@ import io
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from scipy.spatial.transform import Rotation
 
 from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.convert import Message, new_bag, read_table, write_merged, write_robot
-from fgloc.datasets.download import Remote, fetch
-from fgloc.errors import RecordingError
+from fgloc.errors import ConfigError, RecordingError
 from fgloc.recording.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 
@@ -209,32 +207,11 @@ def _list_windows(table: dict[str, FloatArray], stamps: IntArray) -> str:
     return text.getvalue()
 
 
-def _span(text: str | None) -> range | None:
+def span(text: str | None) -> range | None:
     """Numbers of ``a-b``, both included, or of one number alone."""
     if text is None:
         return None
     first, _, last = text.partition("-")
     if not (first.isdigit() and (last or first).isdigit()):
-        raise typer.BadParameter(f"{text!r}: expected a span such as 0-399")
+        raise ConfigError(f"{text!r}: expected a span such as 0-399")
     return range(int(first), int(last or first) + 1)
-
-
-def main(
-    source: Annotated[Path | None, typer.Argument(help="the CSV file of the windows")] = None,
-    out: Annotated[Path, typer.Option(help="folder for bag/, robot.yaml and windows.csv")] = Path("drive"),
-    windows: Annotated[str | None, typer.Option(help="windows wanted, as 0-399")] = None,
-    calibration: Annotated[str | None, typer.Option(help="calibration steps wanted, as 0-133")] = None,
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3")] = "mcap",
-    download: Annotated[Path | None, typer.Option(help="fetch --url into this folder first")] = None,
-    url: Annotated[str | None, typer.Option(help="address of the CSV file")] = None,
-) -> None:
-    """Convert the windows of DRIVE's Husky."""
-    if download is not None:
-        if url is None:
-            raise typer.BadParameter(
-                "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
-            )
-        source = fetch(Remote(url), download)
-    if source is None:
-        raise typer.BadParameter("give the CSV file, or --download FOLDER --url ADDRESS")
-    typer.echo(f"{convert(source, out, storage, _span(windows), _span(calibration))} and {out / 'robot.yaml'} written")

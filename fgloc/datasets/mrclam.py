@@ -1,6 +1,6 @@
 """UTIAS MRCLAM: five iRobot Creates, commanded velocities, range and bearing to 15 surveyed barcodes, Vicon truth.
 
-    python -m datasets.mrclam SRC --robot 3 --out DIR
+    fgloc convert mrclam SRC --robot 3 --out DIR
 
 writes ``bag/`` (``/cmd_vel``, ``/landmarks``, ``/truth``), ``map.yaml`` and ``robot.yaml``. Nothing is corrected in the
 bag: what the files say is what it says. Sightings of the other robots (subjects 1 to 5) and of barcodes that no subject
@@ -24,10 +24,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.convert import (
@@ -132,7 +131,7 @@ def convert(source: Path, robot: int, out: Path, storage: str = "mcap") -> Path:
     Raises:
         RecordingError: see `read`.
     """
-    _write(read(source, robot), robot, out, storage)
+    write(read(source, robot), robot, out, storage)
     return out / "bag"
 
 
@@ -180,7 +179,8 @@ def robot_settings(c: Calibration) -> dict[str, Any]:
     }
 
 
-def _write(run: Run, robot: int, out: Path, storage: str) -> None:
+def write(run: Run, robot: int, out: Path, storage: str) -> None:
+    """Write what was read of a robot: ``bag/``, ``map.yaml``, ``robot.yaml``."""
     with new_bag(out, storage) as bag:
         groups = list(frames(run))
         total = len(run.commands_ns) + len(groups) + len(run.truth_ns)
@@ -220,7 +220,7 @@ def _rows_in_time(path: Path, columns: int) -> FloatArray:
     return np.asarray(table[np.argsort(table[:, 0], kind="stable")])
 
 
-def _download(folder: Path, dataset: int) -> Path:
+def download(folder: Path, dataset: int) -> Path:
     """Fetch and unpack one of the nine datasets; the folder that holds its files."""
     archive = fetch(Remote(_URL.format(dataset)), folder)
     unpacked = unpack(archive, folder / f"MRCLAM{dataset}")
@@ -228,35 +228,3 @@ def _download(folder: Path, dataset: int) -> Path:
     if not found:
         raise RecordingError(f"{archive}: holds no Barcodes.dat; it is not an MRCLAM dataset")
     return found[0].parent
-
-
-def main(
-    source: Annotated[Path | None, typer.Argument(help="folder of the unpacked set")] = None,
-    out: Annotated[Path, typer.Option(help="folder for bag/, map.yaml and robot.yaml")] = Path("mrclam"),
-    robot: Annotated[int | None, typer.Option(min=1, max=5, help="all five into OUT/robotN if omitted")] = None,
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3")] = "mcap",
-    download: Annotated[Path | None, typer.Option(help="fetch the set from its owner into this folder first")] = None,
-    dataset: Annotated[int, typer.Option(min=1, max=9, help="which one to download")] = 6,
-    fit: Annotated[bool, typer.Option(help="refit the leave-one-out constants and print them")] = False,
-) -> None:
-    """Convert the UTIAS MRCLAM set to standard bags."""
-    if download is not None:
-        source = _download(download, dataset)
-    if source is None:
-        raise typer.BadParameter("give the folder of the unpacked set, or --download FOLDER")
-    if fit:
-        from fgloc.datasets.mrclam_fit import left_out
-
-        fitted = left_out({k: read(source, k) for k in ROBOTS})
-        for name in Calibration.__dataclass_fields__:
-            typer.echo(f'    "{name}": ({", ".join(f"{getattr(fitted[k], name):g}" for k in ROBOTS)}),')
-        return
-    for k in ROBOTS if robot is None else (robot,):
-        run = read(source, k)
-        folder = out / f"robot{k}" if robot is None else out
-        _write(run, k, folder, storage)
-        typer.echo(
-            f"{folder / 'bag'}: {len(run.commands_ns)} commands, {len(run.sightings_ns)} sightings of landmarks, "
-            f"{len(run.truth_ns)} true poses; left out: {run.robots_left_out} sightings of robots, "
-            f"{run.unknown_left_out} of no known barcode"
-        )

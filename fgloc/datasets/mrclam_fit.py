@@ -1,4 +1,4 @@
-"""Constants of MRCLAM's robots, each robot's from the other robots only: ``python -m datasets.mrclam SRC --fit``.
+"""Constants of MRCLAM's robots, each robot's from the other robots only: ``fgloc convert mrclam SRC --fit``.
 
 The response to commands and the sightings' constants are fitted for each robot against its truth, on the error of
 2 s of driving and on the error of each sighting, with a Cauchy loss. Robot k's row holds the *median* over the other

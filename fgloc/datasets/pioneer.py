@@ -1,6 +1,6 @@
 """Pioneer with ArUco markers: the ROS 1 bags ``duarte.bag`` and ``pinto1.bag``, with odometry and motion capture.
 
-    python -m datasets.pioneer duarte.bag --out DIR
+    fgloc convert pioneer duarte.bag --out DIR
 
 writes ``bag/`` and ``robot.yaml``; where the markers are is not known, so there is no map. Topics keep their names, and
 ``robot.yaml`` fits the original bag as well as the converted one. What the converter sets right in the bag:
@@ -25,15 +25,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from fgloc.config import RecordingConfig, TopicsConfig
 from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.convert import Message, new_bag, write_merged, write_robot
-from fgloc.datasets.download import Remote, fetch
+from fgloc.datasets.download import Remote
 from fgloc.datasets.mounting import Body, Mounting, body_mounting, sensor_mounting
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
@@ -50,7 +49,7 @@ _TOPICS = {
 _CAPTURE_RATE_HZ = 120.0
 _BURST_GAP_NS = 20_000_000
 _SITE = "https://raw.githubusercontent.com/DuarteCorreia96/SistemasAut/"
-_REMOTES = {
+REMOTES = {
     "duarte": Remote(_SITE + "1b912ca883695b422496bcc36a5a75f7e74b5fbe/bags/duarte.bag", size=1_286_347),
     "pinto1": Remote(_SITE + "1acb2e0a06edc42df13b3da49a28810cc937a067/bags/pinto1.bag", size=1_293_615),
 }
@@ -196,20 +195,3 @@ def _planar(events: Sequence[OdometryEvent] | Sequence[TruthEvent]) -> FloatArra
 
 def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
-
-
-def main(
-    source: Annotated[Path | None, typer.Argument(help="duarte.bag or pinto1.bag")] = None,
-    out: Annotated[Path, typer.Option(help="folder for bag/ and robot.yaml")] = Path("pioneer"),
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3")] = "mcap",
-    download: Annotated[Path | None, typer.Option(help="fetch the bag from its owner into this folder first")] = None,
-    name: Annotated[str, typer.Option(help="which one to download: duarte or pinto1")] = "duarte",
-) -> None:
-    """Convert a bag of the Pioneer with ArUco markers."""
-    if download is not None:
-        if name not in _REMOTES:
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(_REMOTES)}")
-        source = fetch(_REMOTES[name], download)
-    if source is None:
-        raise typer.BadParameter("give the bag, or --download FOLDER")
-    typer.echo(f"{convert(source, out, storage)} and {out / 'robot.yaml'} written")

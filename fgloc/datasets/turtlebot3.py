@@ -1,6 +1,6 @@
 """TurtleBot3 Burger with AprilTag ranges and bearings: rosbag2 recordings of November 2025.
 
-    python -m datasets.turtlebot3 rosbag2_2025_11_25-15_11_34 --out DIR
+    fgloc convert turtlebot3 rosbag2_2025_11_25-15_11_34 --out DIR
 
 copies every message whose type is known, byte for byte, into ``bag/`` (``/camera/landmarks`` becomes ``/landmarks``),
 and writes ``robot.yaml``; with a list of landmarks, ``map.yaml`` too. Messages of packages without a definition are
@@ -24,14 +24,11 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from fgloc.config import RecordingConfig
 from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.convert import Message, new_bag, write_merged, write_robot
-from fgloc.datasets.download import Remote, fetch, unpack
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import Recording
 from fgloc.sensors.maps import load_map, write_map
@@ -66,7 +63,7 @@ def convert(source: Path, out: Path, storage: str = "mcap", landmarks: Path | No
         RecordingError: the recording cannot be read.
         MapError: the list of landmarks cannot be used.
     """
-    return _convert(source, out, storage, landmarks)[0]
+    return convert_and_tell(source, out, storage, landmarks)[0]
 
 
 def robot_settings(topics: set[str]) -> dict[str, Any]:
@@ -96,7 +93,9 @@ def robot_settings(topics: set[str]) -> dict[str, Any]:
     }
 
 
-def _convert(source: Path, out: Path, storage: str, landmarks: Path | None) -> tuple[Path, Counter[str], list[str]]:
+def convert_and_tell(
+    source: Path, out: Path, storage: str, landmarks: Path | None
+) -> tuple[Path, Counter[str], list[str]]:
     """As `convert`; also what was left out, by topic and type, and notes on the map."""
     beside = source.parent / _MAP_FILE
     if landmarks is None and source.name == _MAPPED_BAG and beside.is_file():
@@ -123,30 +122,3 @@ def _copies(bag: BagWriter, recording: Recording, topics: set[str], dropped: Cou
         name = _RENAMED.get(topic, topic)
         topics.add(name)
         yield received_ns, partial(bag.copy, name, message_type, raw, received_ns)
-
-
-def main(
-    source: Annotated[Path | None, typer.Argument(help="rosbag2 folder")] = None,
-    out: Annotated[Path, typer.Option(help="folder for bag/, map.yaml and robot.yaml")] = Path("turtlebot3"),
-    landmarks: Annotated[Path | None, typer.Option(help="list of landmarks, if it is not beside the bag")] = None,
-    storage: Annotated[str, typer.Option(help="mcap or sqlite3")] = "mcap",
-    download: Annotated[Path | None, typer.Option(help="fetch --url into this folder first")] = None,
-    url: Annotated[str | None, typer.Option(help="address of the recording's .db3, .mcap or .zip")] = None,
-) -> None:
-    """Convert a recording of the TurtleBot3 with AprilTags."""
-    if download is not None:
-        if url is None:
-            raise typer.BadParameter("the owner's address is not known; give it with --url")
-        source = fetch(Remote(url), download)
-        if source.suffix == ".zip":
-            source = unpack(source, download / source.stem)
-            found = sorted(source.rglob("metadata.yaml"))
-            source = found[0].parent if found else source
-    if source is None:
-        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS")
-    bag, dropped, notes = _convert(source, out, storage, landmarks)
-    typer.echo(f"{bag} and {out / 'robot.yaml'} written")
-    for what, count in dropped.items():
-        typer.echo(f"left out, no definition: {count} of {what}")
-    for note in notes:
-        typer.echo(note)

@@ -79,6 +79,7 @@ class Judgement(BaseModel):
     """One thing that was judged to be wrong.
 
     Attributes:
+        number: in the report's table and in the column ``judgement`` of ``steps.csv``, from 1.
         kind: of the judgement.
         subject: what it is about: a source, a landmark, the pose.
         what: subject and kind in words.
@@ -93,6 +94,7 @@ class Judgement(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
+    number: int = 0
     kind: Kind
     subject: str
     what: str
@@ -118,7 +120,15 @@ class Judgement(BaseModel):
 
 def judgements(result: RunResult) -> tuple[Judgement, ...]:
     """Everything that a run judged to be wrong: of the whole run first, then by time."""
-    return (*_of_setup(result), *episodes(result.decisions, result.trajectory))
+    found = (*_of_setup(result), *episodes(result.decisions, result.trajectory))
+    return tuple(j.model_copy(update={"number": i}) for i, j in enumerate(found, start=1))
+
+
+def numbered(result: RunResult) -> dict[Decision, int]:
+    """Number of the judgement that a row of ``steps.csv`` belongs to, for those that belong to one."""
+    before = sum(1 for _ in _of_setup(result))
+    told = _episodes(result.decisions, result.trajectory)
+    return {d: before + i for i, (_, rows) in enumerate(told, start=1) for d in rows}
 
 
 def gravest(found: Iterable[Judgement], count: int) -> list[Judgement]:
@@ -131,27 +141,26 @@ def gravest(found: Iterable[Judgement], count: int) -> list[Judgement]:
 
 
 def episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[Judgement]:
-    """Judgements that rows of ``steps.csv`` make, by time.
+    """Judgements that rows of ``steps.csv`` make, by time; the trajectory tells what an episode did to the pose."""
+    return [judgement for judgement, _ in _episodes(decisions, trajectory)]
 
-    Args:
-        decisions: the rows.
-        trajectory: of the run, for what an episode did to the pose.
-    """
-    grouped = _grouped(decisions)
+
+def _episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[tuple[Judgement, list[Decision]]]:
+    """Judgements by time, each with the rows that it is made of."""
     start_ns = int(trajectory.stamps_ns[0])
     found, outliers = [], []
-    for (kind, subject), rows in grouped.items():
+    for (kind, subject), rows in _grouped(decisions).items():
         for episode in _cut(rows, joined=kind in _LASTING):
             if kind == "rejected" and len(episode) <= _FEW:
                 outliers += episode
             else:
-                found.append(_judgement(kind, subject, episode, trajectory, start_ns))
+                found.append((_judgement(kind, subject, episode, trajectory, start_ns), episode))
     if outliers:
         outliers.sort(key=lambda d: d.stamp_ns)
         seen = sum(math.isfinite(d.nis) and d.landmark_id >= 0 for d in decisions)
         made = _judgement("outlier", "", outliers, trajectory, start_ns)
-        found.append(made.model_copy(update={"evidence": f"{made.evidence}, of {seen}"}))
-    return sorted(found, key=lambda j: (j.from_s or 0.0, GRAVITY[j.kind]))
+        found.append((made.model_copy(update={"evidence": f"{made.evidence}, of {seen}"}), outliers))
+    return sorted(found, key=lambda j: (j[0].from_s or 0.0, GRAVITY[j[0].kind]))
 
 
 def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
@@ -284,4 +293,4 @@ def _of_setup(result: RunResult) -> Iterator[Judgement]:
             )
 
 
-__all__ = ["GRAVITY", "Judgement", "Kind", "episodes", "gravest", "judgements"]
+__all__ = ["GRAVITY", "Judgement", "Kind", "episodes", "gravest", "judgements", "numbered"]

@@ -1,12 +1,14 @@
-"""What the pictures of a run share: colors (those of Okabe and Ito), modes, axes."""
+"""What the pictures of a run share: size, colors (those of Okabe and Ito), modes, axes."""
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,16 +23,43 @@ MODE_LOOKS = {
     Mode.DEAD_RECKONING: (ORANGE, "dead reckoning", "//"),
     Mode.LOST: (RED, "lost", "xx"),
 }
-WIDTH = 9.0  # inches
+WIDTH = 7.16  # inches: a page's text in two columns, as IEEE has it
+DPI = 150
+SMALL = 7.0  # points: of ticks and labels in a plot
+NORMAL = 8.0  # points: of axes and legends
 _LONGEST_LABEL = 60
 GAP_S = 1.0  # a line is not drawn across a longer silence
-TEXT: dict[str, Any] = {"fontsize": 9, "color": "#222222"}
+TEXT: dict[str, Any] = {"fontsize": SMALL, "color": "#222222"}
+Format = Literal["png", "svg", "pdf"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+_UNDATED: dict[Format, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+# Text stays text in SVG and PDF; the ids of an SVG do not depend on chance.
+_FILES: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "fgloc", "pdf.fonttype": 42}
 
 
-def plain_label(text: str) -> str:
-    """A name from a recording or a suite as a label: no formula, no control characters, not too long."""
+def image_of(figure: Figure, form: Format) -> bytes:
+    """A figure as a file, the same bytes for the same figure."""
+    buffer = io.BytesIO()
+    with rc_context(_FILES):
+        figure.savefig(buffer, format=form, metadata=_UNDATED[form])
+    return buffer.getvalue()
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as PNG."""
+    return image_of(figure, "png")
+
+
+def plain_label(text: str, longest: int = _LONGEST_LABEL) -> str:
+    """A name from a recording or a suite as a label: no formula, no control characters, long ones cut in the middle."""
     shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-    shown = shown if len(shown) <= _LONGEST_LABEL else shown[: _LONGEST_LABEL - 1] + "…"
+    if len(shown) > longest:
+        head = longest // 2
+        shown = f"{shown[:head]}…{shown[head + 1 - longest :]}"
     return shown.replace("$", r"\$")
 
 
@@ -73,8 +102,8 @@ def mode_handles(result: RunResult) -> list[Artist]:
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above the plots."""
-    columns = math.ceil(len(handles) / math.ceil(len(handles) / 6))
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
+    columns = math.ceil(len(handles) / math.ceil(len(handles) / 4))
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=NORMAL)
 
 
 def tidy(axes: Axes) -> None:
@@ -82,4 +111,4 @@ def tidy(axes: Axes) -> None:
     axes.grid(color="#e5e5e5", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=SMALL)

@@ -92,8 +92,17 @@ def sentences(error: ValidationError, model: type[BaseModel]) -> list[str]:
             hint = f"; did you mean '{near[0]}'?" if near else ""
             found.append(f"{where}: unknown key{hint} (got {short(e['input'])})")
         else:
-            found.append(f"{where}: {e['msg']} (got {short(e['input'])})")
+            found.append(f"{where}: {_complaint(e['msg'], e['type'], e['input'])}")
     return found
+
+
+def _complaint(text: str, kind: str, value: object) -> str:
+    """What is wrong with a value, in the words of this program where it is not the model's own."""
+    if kind == "missing":
+        return "is missing"
+    text = text.removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    text = text.replace("Input should be", "expected").replace("a valid ", "a ")
+    return text if kind == "value_error" and isinstance(value, dict) else f"{text} (got {short(value)})"
 
 
 def short(value: object) -> str:

@@ -45,7 +45,6 @@ class Smoothed:
     poses: FloatArray  # (n, 3)
     covs: FloatArray  # (n, 3, 3) right perturbation (body frame)
     landmarks: Mapping[int, Landmark]  # those that were variables
-    factors: int  # held by the last graph
     error: float  # its GTSAM error
 
 
@@ -182,7 +181,6 @@ class BatchSmoother:
             poses=self.poses(),
             covs=np.array(covs),
             landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
-            factors=self._graph.size(),
             error=self._graph.error(self._values),
         )
 

@@ -49,8 +49,8 @@ class TopicActivity:
         """
         return tuple(
             f"{topic} ({role}): no usable message has arrived. It is not published, all of its messages were rejected, "
-            "or (live, and when recording) the quality of service does not match: subscribe with reliability best "
-            "effort and durability volatile."
+            "or (live, and when recording) the quality of service does not match: subscribe with reliability "
+            "best effort and durability volatile."
             for role, topic in self._expected.items()
             if topic in self._without
         )

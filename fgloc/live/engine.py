@@ -8,7 +8,7 @@ from collections import Counter, deque
 from collections.abc import Iterable
 
 from fgloc.config import LiveConfig
-from fgloc.errors import EstimatorError, FglocError
+from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
@@ -143,8 +143,7 @@ class Engine:
                 self._use_line()
                 self._report(self._run.finish())
         except Exception as error:  # raised again by the next call from outside
-            failure = error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")
-            failure.__cause__ = error.__cause__ if failure is error else error
+            failure = unexpected(error, "the live run")
             with self.changed:
                 self._failed = failure
                 self._working = False

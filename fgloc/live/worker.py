@@ -14,7 +14,7 @@ from itertools import groupby
 from multiprocessing.connection import Connection
 from typing import Any
 
-from fgloc.errors import EstimatorError, FglocError
+from fgloc.errors import FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.estimation import Estimation
@@ -57,7 +57,7 @@ class _Worker:
         except (EOFError, OSError):
             os._exit(1)
         except Exception as error:
-            self._tell("failed", _told(error))  # the settings cannot be used
+            self._tell("failed", unexpected(error, "the live run"))  # the settings cannot be used
 
     def _use(self, estimation: Estimation, pool: ThreadPoolExecutor, batch: Iterable[Any]) -> None:
         """In order."""
@@ -78,13 +78,9 @@ class _Worker:
             if method == "close":
                 result = estimation.status()
         except Exception as error:
-            result = _told(error)
+            result = unexpected(error, "the live run")
         self._tell("answer", number, result)
 
     def _tell(self, *message: Any) -> None:
         with self._sending:
             self._connection.send(message)
-
-
-def _told(error: Exception) -> FglocError:
-    return error if isinstance(error, FglocError) else EstimatorError(f"the live run failed: {error!r}")

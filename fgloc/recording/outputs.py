@@ -35,6 +35,7 @@ _STEP_COLUMNS = (
     "reason",
     "threshold",
     "shift_m",
+    "judgement",
 )
 
 
@@ -113,18 +114,25 @@ def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
             rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[_UPPER])))
 
 
-def write_steps_csv(path: Path, decisions: Iterable[Decision]) -> None:
+def write_steps_csv(path: Path, decisions: Iterable[Decision], judged: Mapping[Decision, int] | None = None) -> None:
     """Write one row per decision: what was measured, how well it fitted, its weight, and why.
+
+    Args:
+        path: the file.
+        decisions: the rows.
+        judged: the number of the judgement that a row belongs to, where it belongs to one.
 
     Raises:
         OutputError: the file cannot be written.
     """
+    numbers = judged or {}
     with atomic_file(path) as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(_STEP_COLUMNS)
         for d in decisions:
             fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
-            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason, *_shown(d)))
+            last = (d.reason, *_shown(d), numbers.get(d, ""))
+            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, *last))
 
 
 def _check_finite(path: Path, trajectory: Trajectory) -> None:

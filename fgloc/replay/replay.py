@@ -93,9 +93,9 @@ class Replay:
         total.update(self._image_rejections)
         return total
 
-    def spans(self) -> dict[str, TopicTimes]:
-        """When messages of each topic arrived, from the first estimate on."""
-        return self.activity.spans(self.estimates[0].stamp_ns if self.estimates else 0)
+    def spans(self, origin_ns: int = 0) -> dict[str, TopicTimes]:
+        """When each topic had messages, in seconds from a time."""
+        return self.activity.spans(origin_ns)
 
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()

@@ -57,7 +57,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
-    notes.append(f"Batch: {len(estimates)} keyframes, {result.factors} factors, error {result.error:.1f}.")
+    notes.append(f"Batch: {len(estimates)} keyframes, cost {result.error:.1f}.")
     return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
 
 

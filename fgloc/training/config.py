@@ -158,7 +158,10 @@ class TrainConfig(Section):
     @model_validator(mode="after")
     def _one_split(self) -> TrainConfig:
         if self.leave_one_out == (self.split is not None):
-            raise ValueError("give either leave_one_out: true or a split")
+            raise ValueError(
+                "give either leave_one_out: true or a split by recording, such as split: {train: [a, b], validation: "
+                "[c], test: [d]}; `fgloc train --init BAG... --out FILE` writes one"
+            )
         if unknown := set(self.truth) - set(self.recordings):
             raise ValueError(f"truth is given for {sorted(unknown)}, recordings are {sorted(self.recordings)}")
         if self.leave_one_out and len(self.recordings) < 3:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
+from fgloc.progress import end, tell
 from fgloc.training.checkpoint import Checkpoint, Curve
 
 _MOST_GRADIENT = 5.0  # norm above which the gradient is clipped
@@ -43,19 +43,19 @@ def descend(
     """
     descent = _Descent(plan, module, seed)
     first = descent.resume(checkpoint.load())
-    bar = tqdm(total=plan.iterations, initial=first - 1, desc=plan.name, disable=None, leave=False)
+    detail = ""
     for i in range(first, plan.iterations + 1):
         descent.step(loss_of_batch)
-        bar.update()
+        tell(plan.name, i, plan.iterations, "iterations", detail)
         if i % plan.validate_every and i < plan.iterations:
             continue
         if score is not None:
             descent.judge(i, score())
-            bar.set_postfix(validation=f"{descent.curve.scores[-1][1]:.3f}")
+            detail = f"validation {descent.curve.scores[-1][1]:.4g}"
         checkpoint.save(descent.state(plan.iterations if descent.is_tired else i))
         if descent.is_tired:
             break
-    bar.close()
+    end(plan.name)
     if score is not None:
         module.load_state_dict(descent.best_state)
     return descent.curve

@@ -1,4 +1,4 @@
-"""``python -m training.evaluate MODEL BAG...``: free rollouts against the truth.
+"""Free rollouts against the truth: ``fgloc evaluate-model MODEL BAG...``.
 
 Drift is the summed end error over the summed distance of all windows; ATE and yaw MAE (paper eq. 11, 12) are means over
 the windows' poses; NIS/3 and coverage say whether the composed covariance holds: the share of errors inside the
@@ -8,16 +8,14 @@ Windows start every second.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2, norm
 
-from fgloc.errors import FglocError
+from fgloc.recording.outputs import write_text
 from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.load import load_model
 from fgloc.training.calibrate import nis
@@ -125,7 +123,8 @@ def _coverage(values: FloatArray) -> tuple[float, float, float]:
     return one, two, three
 
 
-def _table(rows: list[tuple[str, Figures]]) -> str:
+def table(rows: list[tuple[str, Figures]]) -> str:
+    """The figures of each source and horizon as text."""
     lines = [
         f"{'source':<20}{'s':>4}{'n':>6}{'drift %':>9}{'ATE m':>8}{'yaw MAE':>9}{'yaw end':>9}{'NIS/3':>7}  1/2/3σ"
     ]
@@ -147,34 +146,32 @@ def _runs(card: ModelCard, bags: list[Path]) -> list[Run]:
     return [run for bag in bags for run in load_runs(bag, bag.name, card.dt_s, data).values()]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m training.evaluate", description=__doc__.splitlines()[0])
-    parser.add_argument("model", type=Path)
-    parser.add_argument("bags", type=Path, nargs="+")
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="draw tracks, growth of errors and calibration here")
-    parser.add_argument(
-        "--against", type=Path, action="append", default=[], metavar="MODEL", help="another model, for comparison"
-    )
-    options = parser.parse_args(arguments)
-    models = {"model": options.model} | {path.stem: path for path in options.against}
-    try:
-        found = sources(models, _runs(load_model(options.model).card, options.bags))
-        rows = [(name, figures) for name, rollouts in found.items() for figures in growth(rollouts)]
-    except FglocError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(_table(rows))
-    if options.json is not None:
-        options.json.write_text(json.dumps([{"source": name, **asdict(f)} for name, f in rows], indent=1) + "\n")
-    if options.plots is not None:
-        draw_tracks(options.plots / "tracks.png", found["model"])
-        draw_growth(options.plots / "growth.png", rows)
-        curves = {
-            figures.horizon_s: calibration_curve(found["model"], figures.horizon_s, _SHARES)
-            for name, figures in rows
-            if name == "model" and figures.coverage is not None
-        }
-        draw_calibration(options.plots / "calibration.png", _SHARES, curves)
-    return 0
+def write_json(path: Path, rows: list[tuple[str, Figures]]) -> None:
+    """Write the figures of each source and horizon."""
+    write_text(path, json.dumps([{"source": name, **asdict(f)} for name, f in rows], indent=1) + "\n")
+
+
+def draw(folder: Path, found: dict[str, list[Rollout]], rows: list[tuple[str, Figures]]) -> None:
+    """Draw tracks, growth of errors and calibration of the first model."""
+    draw_tracks(folder / "tracks.png", found["model"])
+    draw_growth(folder / "growth.png", rows)
+    curves = {
+        figures.horizon_s: calibration_curve(found["model"], figures.horizon_s, _SHARES)
+        for name, figures in rows
+        if name == "model" and figures.coverage is not None
+    }
+    draw_calibration(folder / "calibration.png", _SHARES, curves)
+
+
+def compare(
+    model: Path, bags: list[Path], against: list[Path]
+) -> tuple[dict[str, list[Rollout]], list[tuple[str, Figures]]]:
+    """Free rollouts of a model, of what it is compared with, and of the wheels; and their figures by horizon.
+
+    Raises:
+        ModelError: a model cannot be read.
+        RecordingError: a recording cannot be used.
+    """
+    models = {"model": model} | {path.stem: path for path in against}
+    found = sources(models, _runs(load_model(model).card, bags))
+    return found, [(name, figures) for name, rollouts in found.items() for figures in growth(rollouts)]

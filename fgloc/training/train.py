@@ -1,4 +1,4 @@
-"""``python -m training.train CONFIG --data DIR --out DIR``: identify a robot from its recordings.
+"""Identify a robot from its recordings: ``fgloc train CONFIG --data DIR --out DIR``.
 
 Read from top to bottom: fit the known kinematics, train the mean on rolled-out trajectories with early stopping on
 validation recordings, train the variance with the mean frozen, calibrate it on the validation recordings, export.
@@ -7,29 +7,21 @@ A run that was killed goes on from its last checkpoint when the same command is 
 
 from __future__ import annotations
 
-import argparse
-import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-try:
-    import torch
-except ModuleNotFoundError as missing:
-    raise SystemExit("error: torch is not installed; pip install 'fgloc[train]'") from missing
-from tqdm import tqdm
-
-from fgloc.errors import ConfigError, FglocError
-from fgloc.files.atomic import atomic_folder, check_out
+from fgloc.errors import ConfigError
 from fgloc.sensors.learned.card import ModelCard, Split
 from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
 from fgloc.training.adapt import adapted
 from fgloc.training.calibrate import fit_joint, fit_noise, fit_variance, noise_covs
 from fgloc.training.checkpoint import Checkpoints, Curve
-from fgloc.training.config import CalibrationConfig, TrainConfig, load_train_config
-from fgloc.training.controls import controls, draw_controls
-from fgloc.training.data import Run, load_runs
+from fgloc.training.config import CalibrationConfig, TrainConfig
+from fgloc.training.curves import warnings_of
+from fgloc.training.data import Run
 from fgloc.training.evaluate import STEP_S, card_figures
 from fgloc.training.export import card_of, tensors_of
 from fgloc.training.members import train_member
@@ -46,15 +38,27 @@ def train(
     path: Path,
     made_by: str,
     checkpoints: Checkpoints = _NOTHING_KEPT,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> ModelCard:
     """Train one model, calibrate it on its validation recordings, write it, and the curves of its losses beside it.
 
     Without validation recordings the training runs its full length and the covariance stays uncalibrated.
+
+    Args:
+        config: what is trained, and how.
+        split: which recordings train, validate, test.
+        runs: by name.
+        path: file of the model.
+        made_by: kept in the model's card.
+        checkpoints: what an interrupted training goes on from.
+        warn: told where the validation got worse.
     """
     validation = [runs[name] for name in split.validation]
     tensors, card, curves = train_uncalibrated(config, split, runs, path, made_by, checkpoints)
     if curves:
         draw_losses(path.with_name(f"{path.stem}.losses.png"), curves)
+        for text in warnings_of(curves):
+            warn(f"{path.stem}: {text}")
     if not validation:
         return card
     held_out = held_out_rollouts(path, card, validation)
@@ -96,7 +100,7 @@ def train_uncalibrated(
     config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str, checkpoints: Checkpoints
 ) -> tuple[Tensors, ModelCard, dict[str, Curve]]:
     """Train all members and write them with a card that knows no calibration yet."""
-    nets, curves = [], {}
+    nets, curves = [], dict[str, Curve]()
     for member in range(config.network.members):
         net, found = train_member(config, split, runs, member, checkpoints)
         nets.append(net)
@@ -159,13 +163,13 @@ def leave_one_out(names: list[str]) -> list[Split]:
     return splits
 
 
-def _from_all(
+def train_on_all(
     config: TrainConfig,
     runs: dict[str, Run],
     folds: list[ModelCard],
     path: Path,
     made_by: str,
-    checkpoints: Checkpoints,
+    checkpoints: Checkpoints = _NOTHING_KEPT,
 ) -> ModelCard:
     """A model from every recording, calibrated and judged by the models that left one out."""
     split = Split(train=tuple(runs), validation=())
@@ -187,81 +191,3 @@ def _from_all(
 
 def _mean(dumps: list[dict[str, object]]) -> dict[str, object]:
     return {key: np.mean([d[key] for d in dumps], axis=0).tolist() for key in dumps[0]}  # type: ignore[arg-type]
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m training.train", description=__doc__.splitlines()[0])
-    parser.add_argument("config", type=Path)
-    parser.add_argument("--data", type=Path, default=Path(), help="folder that the recordings' paths are relative to")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the models")
-    parser.add_argument(
-        "--from",
-        dest="start",
-        type=Path,
-        metavar="MODEL",
-        help="adapt this model to the robot of the split's training recordings, a minute of which will do",
-    )
-    options = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
-    try:
-        config = load_train_config(options.config)
-        check_out(options.out)
-        made_by = f"python -m training.train {options.config.as_posix()}; {config.model_dump_json()}"
-        smoothed = {name: options.data / folder for name, folder in config.truth.items()}
-        parts = {
-            name: load_runs(options.data / bag, name, config.network.dt_s, config.data, smoothed.get(name))
-            for name, bag in tqdm(config.recordings.items(), desc="reading", disable=None, leave=False)
-        }
-        runs = {name: run for part in parts.values() for name, run in part.items()}
-        if config.split is not None:
-            config = config.model_copy(update={"split": _in_parts(config.split, parts)})
-        checkpoints = Checkpoints(options.out / ".checkpoints")
-        with atomic_folder(options.out, own=("*.safetensors", "*.png", ".checkpoints")) as stage:
-            if options.start is not None:
-                path = stage / "model.safetensors"
-                _report(path.stem, adapt(options.start, config, runs, path, f"{made_by}; from {options.start.name}"))
-            else:
-                _train_all(config, runs, stage, made_by, checkpoints)
-    except FglocError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _train_all(config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints) -> None:
-    """The model of the configuration's split, or one for each recording left out, and one of all."""
-    trained = list(runs) if config.split is None else config.split.train
-    _report_controls([runs[name] for name in trained], config, out)
-    if config.split is not None:
-        path = out / "model.safetensors"
-        _report(path.stem, train(config, config.split, runs, path, made_by, checkpoints))
-        return
-    folds = []
-    for split in leave_one_out(list(runs)):
-        path = out / f"without_{split.test[0]}.safetensors"
-        folds.append(train(config, split, runs, path, made_by, checkpoints))
-        _report(path.stem, folds[-1])
-    _report("all", _from_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints))
-
-
-def _report_controls(training: list[Run], config: TrainConfig, out: Path) -> None:
-    found = controls(training, config.limits)
-    draw_controls(out / "controls.png", found)
-    for missing in found.missing():
-        print(f"warning: the recordings hold too little of {missing}", file=sys.stderr)
-
-
-def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
-    """The split of recordings as one of the runs that they are made of."""
-
-    def names(recordings: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(name for recording in recordings for name in parts[recording])
-
-    return Split(train=names(split.train), validation=names(split.validation), test=names(split.test))
-
-
-def _report(name: str, card: ModelCard) -> None:
-    figures = ", ".join(f"{k} {v:g}" for k, v in card.figures.items() if k.startswith(("drift", "nis")))
-    print(f"{name}: {figures}", flush=True)

@@ -15,10 +15,11 @@ from fgloc import cli
 from fgloc.ablation.failures import AnyFailure
 from fgloc.ablation.jobs import Job, execute, make_jobs
 from fgloc.ablation.records import Cost, Record
-from fgloc.ablation.report import write_report
+from fgloc.ablation.report import _curves, write_report
 from fgloc.ablation.suite import Cell, Suite, expand, load_suite
-from fgloc.ablation.tables import ATE, join, matrix, rows, sentence, worst
+from fgloc.ablation.tables import ATE, join, matrix, rows, sentence, worst, worth
 from fgloc.config import Config
+from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 SUITE = Suite.model_validate(
@@ -102,6 +103,30 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     assert blind.startswith("Blind at 2 s: the mean error of 'full' rises from 10 to 150 mm over 2 runs")
     assert "1 of 3 runs gave no figure" in blind
     assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they show nothing about it."
+
+
+def test_a_variant_is_compared_where_it_matters_most(bag):
+    runs = join(*made(bag))
+    told = worth(SUITE, runs, "bare")
+    assert told == "'bare': mean error 500 mm instead of 10 mm of 'full' without failure (50 times, 1 run)."
+    told = worth(SUITE, [run for run in runs if run.cell.failure == "blind" or run.cell.variant == "bare"], "bare")
+    assert told.startswith(
+        "'bare': mean error 500 mm instead of 30 mm of 'full' under 'blind' at 1 s (17 times, 3 runs)"
+    )
+
+
+def test_few_runs_are_drawn_one_by_one_and_axes_speak(bag):
+    entries = matrix(SUITE, join(*made(bag)))
+    (curves,) = _curves(SUITE, entries)
+    assert curves.unit == "duration [s]"
+    axes = plot_severity([curves], ATE.label).axes[0]
+    assert not axes.collections  # of three runs no band
+    assert sum(len(line.get_xdata()) for line in axes.lines if line.get_marker() == ".") == 3 + 2 + 3 + 3
+    many = Point(1.0, 3.0, (2.0, 4.0), (2.0, 2.5, 3.0, 3.5, 4.0))
+    axes = plot_severity([Curves("x", "y", {"full": [many, many]})], ATE.label).axes[0]
+    assert len(axes.collections) == 1
+    figure = plot_tracks([Tracks("x", [(0, 0), (1, 1)], [(0, 0), (1, 0)])])
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["estimate", "truth", "start"]
 
 
 def test_worst_case_is_the_largest_error(bag):

@@ -254,4 +254,4 @@ def test_error_names_the_extra_and_the_scheduler(folder, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("ConfigError")
-    assert f"{sys.executable} -m pip install 'dask[distributed]'" in done.stdout
+    assert f"{sys.executable} -m pip install 'fgloc[sweep]'" in done.stdout

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import fgloc
 
 from fgloc import cli, se2
 from fgloc.datasets.bag import BagWriter
@@ -61,14 +61,6 @@ def sight(rng, pose, i):
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     return write_circle(tmp_path_factory.mktemp("circle"))
-
-
-def fgloc(*arguments):
-    """Exit code, stdout and stderr of one command; an exception that leaves it fails the test."""
-    done = CliRunner().invoke(cli.app, [str(a) for a in arguments])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    return done.exit_code, done.stdout, done.stderr
 
 
 def refused(*arguments):

@@ -12,7 +12,7 @@ from dataset_files import header_ns, read_back
 from real_data import real_data
 
 from fgloc.config import load_config
-from fgloc.datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, _span, convert
+from fgloc.datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, convert, span
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels.events import JointsEvent
@@ -104,10 +104,10 @@ def test_selection_keeps_each_windows_time(tmp_path: Path) -> None:
     assert int(rows[0]["start_ns"]) == times[0]
 
 
-def test_spans() -> None:
-    assert _span("3-5") == range(3, 6)
-    assert _span("7") == range(7, 8)
-    assert _span(None) is None
+def testspans() -> None:
+    assert span("3-5") == range(3, 6)
+    assert span("7") == range(7, 8)
+    assert span(None) is None
 
 
 @pytest.mark.parametrize(

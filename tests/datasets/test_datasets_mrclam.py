@@ -13,9 +13,10 @@ from dataset_files import barcode, header_ns, read_back, write_mrclam
 from numpy.typing import NDArray
 from real_data import real_data
 
+from fgloc import cli
 from fgloc.config import load_config
-from fgloc.datasets import convert as shared
 from fgloc.datasets import mrclam
+from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.mrclam import Run, calibration, convert, frames, read
 from fgloc.datasets.mrclam_fit import fit_sensor, left_out, sighting_errors
 from fgloc.errors import RecordingError
@@ -97,7 +98,7 @@ def test_fault_71_a_failed_conversion_keeps_the_old_bag(
     def full_disk(*args: object, **kwargs: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(shared.BagWriter, "truth", full_disk)
+    monkeypatch.setattr(BagWriter, "truth", full_disk)
     with pytest.raises(OSError, match="No space"):
         convert(source, 1, tmp_path / "out")
     assert len(read_back(bag)[0]["/truth"]) == 100
@@ -142,9 +143,9 @@ def test_command_line(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(*arguments: str) -> int:
-        monkeypatch.setattr(sys, "argv", ["mrclam", *arguments])
+        monkeypatch.setattr(sys, "argv", ["mrclam.py", *arguments])
         with pytest.raises(SystemExit) as caught:
-            shared.command_line(mrclam.main)
+            cli.main("convert", "mrclam")
         return int(caught.value.code or 0)
 
     assert run(str(source), "--out", str(tmp_path / "all")) == 0

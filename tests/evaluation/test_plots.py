@@ -1,11 +1,8 @@
-"""Pictures and the report: drawn for every shape of run, complete, and the same twice."""
+"""Pictures: drawn for every shape of run; large sigmas, LOST stretches and jumps of the clock hide nothing."""
 
-import base64
 import io
-import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import matplotlib.image
@@ -15,62 +12,25 @@ from matplotlib.colors import to_rgba
 from run_results import figure_eight
 
 from fgloc.config import Config
-from fgloc.errors import OutputError
-from fgloc.evaluation import plots, report, style, timeline
-from fgloc.evaluation.metrics import compute_metrics, match_result
+from fgloc.evaluation import style, timeline
+from fgloc.evaluation.metrics import match_result
+from fgloc.evaluation.plots import plot_error
+from fgloc.evaluation.time_axis import TimeAxis
 from fgloc.evaluation.timeline import plot_timeline
-from fgloc.recording.outputs import read_tum
+from fgloc.evaluation.trajectory_plot import plot_trajectory
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
-from fgloc.types import Decision, Mode, Trajectory
+from fgloc.types import Decision, Landmark, LandmarkMap, Mode, TopicTimes, Trajectory
 
-FILES = {
-    "trajectory.tum",
-    "covariance.csv",
-    "steps.csv",
-    "metrics.json",
-    "config.json",
-    "trajectory.png",
-    "timeline.png",
-    "report.html",
-}
-KEYS = [
-    "duration_s",
-    "keyframes",
-    "first_pose_s",
-    "ate_mean_m",
-    "ate_rmse_m",
-    "yaw_mae_deg",
-    "end_error_m",
-    "drift_percent",
-    "nees_over_3",
-    "coverage",
-    "real_time_factor",
-    "step_ms",
-    "factors",
-    "rejections",
-    "installation",
-    "mistakes",
-    "judgements",
-]
 CONFIG = Config()
-COMMAND = 'fgloc smooth "first <run>" --out out'
 
 
 def all_modes(n=300):
     return [Mode.OK] * 100 + [Mode.DEAD_RECKONING] * 100 + [Mode.LOST] * (n - 200)
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    out = tmp_path_factory.mktemp("results")
-    result = figure_eight(modes=all_modes())
-    report.write_results(result, CONFIG, out, COMMAND, "c0ffee")
-    return result, out
-
-
 def pixels(figure):
-    return matplotlib.image.imread(io.BytesIO(plots.png(figure)))
+    return matplotlib.image.imread(io.BytesIO(style.png(figure)))
 
 
 @pytest.mark.parametrize(
@@ -91,51 +51,152 @@ def test_every_picture_is_drawn(change):
         result = replace(result, modes=(Mode.OK,))
     matched = match_result(result, CONFIG)
     for figure in (
-        plots.plot_trajectory(result, matched),
-        plots.plot_error(result, matched),
+        plot_trajectory(result, matched),
+        plot_error(result, matched),
         plot_timeline(result, matched),
     ):
         image = pixels(figure)
-        assert image.shape[1] == 990
+        assert image.shape[1] == 1074
         assert image.shape[0] > 150
         assert np.ptp(image[..., :3]) > 0.5
 
 
 def test_trajectory_axes_are_equal_and_show_everything():
     result = figure_eight()
-    axes = plots.plot_trajectory(result, match_result(result, CONFIG)).axes[0]
+    axes = plot_trajectory(result, match_result(result, CONFIG)).axes[0]
     assert axes.get_aspect() == 1.0
     for x, y in [(4.0, 0.0), (0.0, 2.6), *result.trajectory.poses[:, :2].tolist()]:
         assert axes.get_xlim()[0] < x < axes.get_xlim()[1]
         assert axes.get_ylim()[0] < y < axes.get_ylim()[1]
-    assert {text.get_text() for text in axes.texts} == {"0", "7"}
+    told = [text.get_text() for text in axes.texts]
+    assert told[-2:] == ["0", "7"]
+    assert all(0.0 < float(text) < 30.0 for text in told[:-2])  # times along the way
+    assert len(told) > 5
+
+
+def ellipses(covariance):
+    """The collections of 3σ ellipses of a run whose position has this covariance everywhere."""
+    cov = np.eye(3) * 0.01
+    cov[:2, :2] = covariance
+    base = figure_eight()
+    result = replace(base, trajectory=replace(base.trajectory, covs=np.repeat(cov[None], 300, axis=0)))
+    return [c for c in plot_trajectory(result, None).axes[0].collections if hasattr(c, "get_widths")]
 
 
 def test_ellipses_are_three_sigma():
-    """Turned by 30°, σ 0.2 m along and 0.05 m across: full axes 1.2 m and 0.3 m."""
+    """Turned by 30°, σ 0.06 m along and 0.02 m across: full axes 0.36 m and 0.12 m."""
     c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
-    cov = np.eye(3) * 0.01
-    cov[:2, :2] = np.array([[c, -s], [s, c]]) @ np.diag([0.04, 0.0025]) @ np.array([[c, s], [-s, c]])
+    turn = np.array([[c, -s], [s, c]])
+    (small,) = ellipses(turn @ np.diag([0.0036, 0.0004]) @ turn.T)
+    np.testing.assert_allclose(small.get_widths(), 0.36)
+    np.testing.assert_allclose(small.get_heights(), 0.12)
+    np.testing.assert_allclose(np.mod(small.get_angles(), 180), 30)
+    assert 20 < len(small.get_offsets()) <= 61
+
+
+def test_large_ellipses_cover_nothing():
+    (large,) = ellipses(np.eye(2))  # 6 m across, in a picture of 7 m
+    assert len(large.get_facecolor()) == 0
+    assert len(large.get_offsets()) <= 8
+    assert ellipses(np.eye(2) * 25.0) == []
+
+
+def test_the_landmarks_of_an_estimated_map_have_their_sigmas():
+    cov = np.diag([0.04, 0.01])
+    landmarks = LandmarkMap({3: Landmark(3, np.array([1.0, 2.0, 0.0]), np.eye(3), 0.0, cov)})
+    figure = plot_trajectory(replace(figure_eight(), landmarks=landmarks), None)
+    *_, around = [c for c in figure.axes[0].collections if hasattr(c, "get_widths")]
+    assert around.get_offsets().tolist() == [[1.0, 2.0]]
+    assert sorted((around.get_widths()[0], around.get_heights()[0])) == pytest.approx([0.6, 1.2])
+    assert {"landmark (id)", "3σ of a landmark"} <= legend_of(figure)
+
+
+def legend_of(figure):
+    return {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+
+
+def test_legends_name_what_is_drawn_and_nothing_else():
+    result = figure_eight()
+    matched = match_result(result, CONFIG)
+    assert {"marker (id)", "landmark (id)", "truth", "distance from the truth"} <= legend_of(
+        plot_trajectory(result, matched)
+    )
+    assert {"true error", "sighting rejected", "left out, rejected", "1σ"} <= legend_of(plot_timeline(result, matched))
+    plain = replace(result, truth=None, decisions=())
+    told = legend_of(plot_trajectory(plain, None)) | legend_of(plot_error(plain, None))
+    told |= legend_of(plot_timeline(plain, None))
+    assert not [text for text in told if re.search("tru|error|reject", text)]
+
+
+def test_a_relocated_robot_is_not_joined_by_a_line():
     base = figure_eight()
-    result = replace(base, trajectory=replace(base.trajectory, covs=np.repeat(cov[None], 300, axis=0)))
-    (ellipses,) = [c for c in plots.plot_trajectory(result, None).axes[0].collections if hasattr(c, "get_widths")]
-    np.testing.assert_allclose(ellipses.get_widths(), 1.2)
-    np.testing.assert_allclose(ellipses.get_heights(), 0.3)
-    np.testing.assert_allclose(np.mod(ellipses.get_angles(), 180), 30)
-    assert 20 < len(ellipses.get_offsets()) <= 61
+    there = Decision(150, int(base.trajectory.stamps_ns[150]), "place", -1, 9.0, 81.0, 3, 1.0, "jump")
+    axes = plot_trajectory(replace(base, decisions=(*base.decisions, there)), None).axes[0]
+    assert np.flatnonzero(np.isnan(axes.lines[0].get_xdata())).tolist() == [150]
+
+
+def test_lost_stretches_flatten_no_axis():
+    base = figure_eight(modes=all_modes())
+    covs = base.trajectory.covs.copy()
+    covs[200:] = np.eye(3) * 400.0
+    result = replace(base, trajectory=replace(base.trajectory, covs=covs))
+    axes = plot_error(result, None).axes[0]
+    to_axes = axes.transData + axes.transAxes.inverted()
+    usual, lost = (to_axes.transform((0.0, y))[1] - 0.5 for y in (0.3, 60.0))  # m above the middle
+    assert usual > 0.1
+    assert lost < 0.5
+    assert [text.get_text() for text in axes.texts] == ["logarithmic beyond 0.2 m"]
+
+
+def test_a_jump_of_the_clock_leaves_no_empty_panels():
+    base = figure_eight()
+    stamps = base.trajectory.stamps_ns.copy()
+    stamps[150:] += 3600 * 10**9
+    spans = {"/odom": TopicTimes(np.r_[np.arange(-2.0, 15.0, 0.05), np.arange(3615.0, 3630.0, 0.05)], 640, 1, 3600.0)}
+    result = replace(base, trajectory=replace(base.trajectory, stamps_ns=stamps), spans=spans, truth=None)
+    axis = TimeAxis.of(result)
+    ((start, end),) = axis.cuts
+    assert (start, end) == pytest.approx((14.9, 3615.0))
+    assert 30.0 < axis.length < 36.0
+    for figure in (plot_error(result, None), plot_timeline(result), plot_trajectory(result, None)):
+        axes = figure.axes[-1]
+        figure.canvas.draw()
+        places = axes.transAxes.inverted().transform(axes.transData.transform([(14.9, 1.0), (3615.0, 1.0)]))[:, 0]
+        assert 0.4 < places[0] < places[1] < 0.6
+        ticks = [t for t in axes.get_xticks() if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]]
+        assert min(ticks) <= 0.0
+        assert max(ticks) > 3615.0
+    np.testing.assert_allclose(axis.place(np.array([-2.0, 0.0, 14.9])), [-2.0, 0.0, 14.9], atol=1e-9)
+
+
+def test_messages_before_the_first_pose_are_in_the_picture():
+    base = figure_eight()
+    late = {"/odom": TopicTimes(np.arange(-9.0, 29.9, 0.05), 780, 1, 0.05)}
+    axes = panel(plot_timeline(replace(base, spans=late)), "messages received")
+    assert axes.get_xlim()[0] < -9.0
+    (bars,) = axes.collections[0].get_paths()
+    assert bars.vertices[:, 0].min() == pytest.approx(-9.0)
+
+
+@pytest.mark.parametrize("form", style.FORMATS)
+def test_figures_are_the_same_twice_in_every_format(form):
+    result = figure_eight()
+    once, again = (style.image_of(plot_error(result, None), form) for _ in range(2))
+    assert once == again
+    assert once[:5] == {"png": b"\x89PNG\r", "svg": b"<?xml", "pdf": b"%PDF-"}[form]
 
 
 def test_error_is_not_drawn_where_there_is_no_truth():
     result = figure_eight()
     matched = match_result(result, CONFIG)
-    x, y = plots.plot_error(result, matched).axes[0].lines[-2].get_data()
+    x, y = plot_error(result, matched).axes[0].lines[-2].get_data()
     assert np.isnan(y).sum() == 1  # the line breaks once, over the ten silent seconds
     assert len(x) == len(matched.stamps_ns) + 1
 
 
 def panel(figure, label):
-    """The axes of a panel by its label."""
-    return next(axes for axes in figure.axes if axes.get_ylabel().replace("\n", " ").startswith(label))
+    """The axes of a panel by its title."""
+    return next(axes for axes in figure.axes if axes.get_title(loc="left").startswith(label))
 
 
 def names(axes):
@@ -144,10 +205,10 @@ def names(axes):
 
 def test_timeline_shows_silence_and_every_flag():
     figure = plot_timeline(figure_eight())
-    assert names(panel(figure, "received")) == ["/odom (600)", "/camera (200)"]
-    assert [len(bars.get_paths()) for bars in panel(figure, "received").collections] == [1, 2]
-    assert names(panel(figure, "flags")) == ["corners: gate (30)"]
-    assert len(panel(figure, "flags").collections[0].get_paths()) == 30
+    assert names(panel(figure, "messages received")) == ["/odom (600)", "/camera (200)"]
+    assert [len(bars.get_paths()) for bars in panel(figure, "messages received").collections] == [1, 2]
+    assert names(panel(figure, "reasons")) == ["corners: gate (30)"]
+    assert len(panel(figure, "reasons").collections[0].get_paths()) == 30
 
 
 def test_timeline_draws_each_source_at_its_weight_as_last_judged():
@@ -163,17 +224,17 @@ def test_timeline_draws_each_source_at_its_weight_as_last_judged():
     assert off == list(range(50, 60))
     heights = np.array([bar.get_height() for bar in inflated])
     np.testing.assert_allclose(heights[:100] / heights[100:200], 0.25)
-    assert "wheels: slip (10)" in names(panel(figure, "flags"))
+    assert "wheels: slip (10)" in names(panel(figure, "reasons"))
 
 
 def test_timeline_shows_the_fit_of_every_sighting_and_who_was_refused():
     base = figure_eight()
     fine = tuple(Decision(k, int(base.trajectory.stamps_ns[k]), "corners", 5, 2.0, 4.0, 8, 1.0, "") for k in range(9))
     figure = plot_timeline(replace(base, decisions=(*base.decisions, *fine)))
-    believed, refused = panel(figure, "NIS").lines[:2]
+    believed, refused = panel(figure, "fit of").lines[:2]
     np.testing.assert_allclose(believed.get_ydata(), 0.5)
     np.testing.assert_allclose(refused.get_ydata(), 81.0 / 8.0)
-    assert names(panel(figure, "landmark")) == ["0", "1", "2", "5"]
+    assert names(panel(figure, "sightings of")) == ["0", "1", "2", "5"]
 
 
 def test_timeline_shows_the_true_error_within_its_bounds_and_the_true_slip():
@@ -201,127 +262,3 @@ def test_the_simulators_slip_is_read_from_the_recording():
         counts[name] = np.sum(spans[:, 1] - spans[:, 0]) * 1e-9
     assert counts["first_run"] < 1.0
     assert counts["patches_run"] > 5.0
-
-
-def test_all_files_are_written(written):
-    _, out = written
-    assert {file.name for file in out.iterdir()} == FILES
-
-
-def test_metrics_json_has_the_keys_of_the_contract(written):
-    result, out = written
-    content = json.loads((out / "metrics.json").read_text())
-    assert list(content) == KEYS
-    assert content["keyframes"] == 300
-    assert content["duration_s"] == pytest.approx(29.9)
-    assert content["real_time_factor"] == pytest.approx(2.99)
-    assert 0.5 < content["nees_over_3"] < 1.5
-    assert list(content["coverage"]) == ["1", "2", "3"]
-    assert list(content["step_ms"]) == ["median", "p95", "p99", "max"]
-    assert content["rejections"] == result.rejections
-    assert content["factors"] == result.counts
-
-
-def test_truth_based_metrics_are_null_without_truth(tmp_path):
-    report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
-    content = json.loads((tmp_path / "metrics.json").read_text())
-    assert list(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == KEYS[3:10]
-
-
-def test_truth_of_another_time_counts_as_none(tmp_path):
-    result = figure_eight()
-    result = replace(result, truth=Trajectory(result.truth.stamps_ns + 10**12, result.truth.poses))
-    assert compute_metrics(result, CONFIG).ate_mean_m is None
-    report.write_results(result, CONFIG, tmp_path, COMMAND)
-    assert "nothing to compare with" in (tmp_path / "report.html").read_text()
-
-
-def test_configured_alignment_is_applied():
-    result = figure_eight()
-    moved = replace(result, truth=Trajectory(result.truth.stamps_ns, result.truth.poses + np.array([5.0, 0, 0])))
-    aligned = Config.model_validate({"truth": {"align": "se2"}})
-    assert compute_metrics(moved, CONFIG).ate_mean_m > 4.0
-    assert compute_metrics(moved, aligned).ate_mean_m == pytest.approx(compute_metrics(result, aligned).ate_mean_m)
-
-
-def test_written_trajectory_is_the_runs(written):
-    result, out = written
-    back = read_tum(out / "trajectory.tum")
-    assert back.stamps_ns.tolist() == result.trajectory.stamps_ns.tolist()
-    np.testing.assert_allclose(back.poses, result.trajectory.poses, atol=3e-9)
-
-
-def test_config_json_says_where_the_result_is_from(written):
-    _, out = written
-    content = json.loads((out / "config.json").read_text())
-    assert content["command"] == COMMAND
-    assert content["input"] == {"path": "first_run", "sha256": "c0ffee"}
-    assert set(content["versions"]) == {"python", "fgloc", "gtsam", "numpy", "opencv-contrib-python-headless"}
-    assert Config.model_validate(content["config"]) == CONFIG
-
-
-class _Page(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open, self.links, self.images = [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        attributes = dict(attrs)
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-        if tag == "img":
-            self.images.append(attributes["src"])
-        self.links += [attributes[name] for name in ("href", "src") if name in attributes and tag != "img"]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def test_report_is_complete_by_itself(written):
-    _, out = written
-    text = (out / "report.html").read_text()
-    page = _Page()
-    page.feed(text)
-    assert page.open == []
-    assert page.links == []
-    assert not re.search(r"url\(|@import|<script", text)
-    assert len(page.images) == 3
-    data = base64.b64decode(page.images[0].removeprefix("data:image/png;base64,"))
-    assert data == (out / "trajectory.png").read_bytes()
-
-
-def test_report_tells_all_and_escapes(written):
-    _, out = written
-    text = (out / "report.html").read_text()
-    for expected in (
-        "fgloc smooth &quot;first &lt;run&gt;&quot; --out out",
-        "odometry&#x27;s &lt;twist&gt; is zero",
-        "odometry.duplicate_stamp",
-        "LOST 33.3 %",
-        "do not use these stretches",
-        "matched at 200 of 300 keyframes",
-        "c0ffee",
-    ):
-        assert expected in text
-
-
-def test_results_are_the_same_twice(written, tmp_path):
-    result, out = written
-    report.write_results(result, CONFIG, tmp_path, COMMAND, "c0ffee")
-    for name in FILES:
-        assert (tmp_path / name).read_bytes() == (out / name).read_bytes(), name
-
-
-def test_fault_71_failing_run_keeps_the_old_results(written, tmp_path, monkeypatch):
-    result, _ = written
-    report.write_results(result, CONFIG, tmp_path, "the old command", "c0ffee")
-    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-
-    def full(path, text):
-        raise OutputError(f"{path}: disk full")
-
-    monkeypatch.setattr(report, "write_text", full)  # the report is the last file
-    with pytest.raises(OutputError):
-        report.write_results(replace(result, wall_s=1.0), CONFIG, tmp_path, "the new command", "beef")
-    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

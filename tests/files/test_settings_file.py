@@ -64,7 +64,7 @@ def test_every_default_is_within_its_bounds():
     [
         ("wheels:\n  track: 0.3\n  trak: 0.4\n", r"robot.yaml:3: wheels.trak: unknown key; did you mean 'track'\?"),
         ("gyro: {}\nwheel: {track: 0.3}\n", r"robot.yaml:2: wheel: unknown key; did you mean 'wheels'\?"),
-        ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: Input should be 'auto', 'twist'"),
+        ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: expected 'auto', 'twist'"),
         ("wheels:\n  noise:\n    x_per_sqrt_mm: 1\n", r"robot.yaml:3: wheels.noise.x_per_sqrt_mm.*'x_per_sqrt_m'\?"),
         ("gate:\n\n  max_speed: fast\n", r"robot.yaml:3: gate.max_speed: .*number.*got 'fast'"),
         ("a: 1\na: 2\n", r"robot.yaml:2: key 'a' is given twice"),

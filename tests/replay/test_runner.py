@@ -132,6 +132,18 @@ def test_a_paced_replay_takes_its_time(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["online", "batch"])
+def test_times_of_messages_count_from_the_first_pose_of_the_result(tmp_path, mode):
+    """Also where that is not the pose that the replay found first, as its time came again."""
+    second = World(beacons(), seed=1, seconds=5.0, start_ns=START_NS - 2 * 10**9, start_s=9.0)
+    bag = write_world(tmp_path, World(beacons(), seconds=3.0), second)
+    result = run(bag, tmp_path / "map.yaml", config(), mode)
+    first_pose = int(result.trajectory.stamps_ns[0])
+    assert first_pose < START_NS - 10**9
+    for span in result.spans.values():
+        assert first_pose + round(1e9 * span.times.min()) == pytest.approx(second.start_ns, abs=2e8)
+
+
+@pytest.mark.parametrize("mode", ["online", "batch"])
 def test_fault_15_a_bag_whose_clock_is_set_back_still_gives_a_trajectory_in_order_of_time(tmp_path, mode):
     """The stamps of the second drive come again: of two poses at one time the later word holds."""
     first = World(beacons(), seconds=6.0)

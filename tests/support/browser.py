@@ -23,13 +23,14 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 class Browser:
     """A page in headless Chromium, rendered in software; whatever it asks other machines for is in `asked`."""
 
-    def __init__(self, folder, url):
+    def __init__(self, folder, url, height=800, dark=False):
         if CHROMIUM is None:
             pytest.skip("no Chromium")
         self._websockets = pytest.importorskip("websockets")
         self.asked = set()
         options = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        options += ["--window-size=1200,800", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
+        options += [f"--window-size=1200,{height}", f"--blink-settings=preferredColorScheme={0 if dark else 1}"]
+        options += ["--remote-debugging-port=0", f"--user-data-dir={folder}"]
         with (folder / "log").open("w") as log:
             self._process = subprocess.Popen([CHROMIUM, *options, url], stdout=log, stderr=log, start_new_session=True)
         self._folder = folder
@@ -46,8 +47,16 @@ class Browser:
         """The first picture ``(h, w, 3)`` that is good, or the last one."""
         return asyncio.run(asyncio.wait_for(self._screenshot(good, timeout_s), timeout_s + 30.0))
 
-    async def _screenshot(self, good, timeout_s):
-        deadline = time.monotonic() + timeout_s
+    def run(self, script, timeout_s=30.0):
+        """The value of a script's last expression."""
+        return asyncio.run(asyncio.wait_for(self._run(script, timeout_s), timeout_s))
+
+    async def _run(self, script, timeout_s):
+        async with self._connected(time.monotonic() + timeout_s) as socket:
+            return (await self._call(socket, 1, "Runtime.evaluate", expression=script))["result"]["value"]
+
+    @contextlib.asynccontextmanager
+    async def _connected(self, deadline):
         ports = self._folder / "DevToolsActivePort"
         while not ports.exists() and time.monotonic() < deadline:
             await asyncio.sleep(0.1)
@@ -55,6 +64,11 @@ class Browser:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
             page = next(p for p in json.load(answer) if p["type"] == "page")
         async with self._websockets.connect(page["webSocketDebuggerUrl"], max_size=None) as socket:
+            yield socket
+
+    async def _screenshot(self, good, timeout_s):
+        deadline = time.monotonic() + timeout_s
+        async with self._connected(deadline) as socket:
             await self._call(socket, 1, "Network.enable")
             number = 2
             while True:
@@ -71,6 +85,8 @@ class Browser:
         while True:
             answer = json.loads(await socket.recv())
             if answer.get("method") == "Network.responseReceived":
-                self.asked.add(answer["params"]["response"]["url"].split("/")[2])
+                scheme, _, rest = answer["params"]["response"]["url"].partition("://")
+                if scheme in ("http", "https"):
+                    self.asked.add(rest.split("/")[0])
             if answer.get("id") == number:
                 return answer["result"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_line import fgloc
 from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
@@ -277,7 +278,7 @@ def test_damaged_checkpoint_is_named(tmp_path: Path) -> None:
         Checkpoint(tmp_path / "c.pt").load()
 
 
-def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_lines(tmp_path: Path) -> None:
     for seed in range(3):
         write_bag(tmp_path / f"run{seed}" / "bag", seed, 45.0)
     config = tiny_config("displacement", ["run0", "run1", "run2"])
@@ -287,26 +288,28 @@ def test_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     settings["recordings"] = {f"run{i}": f"run{i}/bag" for i in range(3)}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
     arguments = [str(tmp_path / "config.yaml"), "--data", str(tmp_path), "--out", str(tmp_path / "models")]
-    assert training.main(arguments) == 0
+    code, _, err = fgloc("train", *arguments)
+    assert code == 0
     made = sorted(p.name for p in (tmp_path / "models").iterdir())
     names = ("all", *(f"without_run{i}" for i in range(3)))
     assert made == sorted(["controls.png", *(f"{n}.{end}" for n in names for end in ("safetensors", "losses.png"))])
-    assert "hold too little of v from 0.38 to 0.5 m/s: 0.0 s, want 5 s" in capsys.readouterr().err
+    assert "hold too little of v from 0.38 to 0.5 m/s: 0.0 s, want 5 s" in err
     from_all = load_model(tmp_path / "models" / "all.safetensors").card
     assert from_all.split.train == ("run0", "run1", "run2")
     assert from_all.joint is not None
     assert from_all.figures
-    capsys.readouterr()
     report = tmp_path / "figures.json"
     model = tmp_path / "models" / "without_run2.safetensors"
     others = ["--against", str(tmp_path / "models" / "all.safetensors"), "--plots", str(tmp_path / "plots")]
-    assert evaluation.main([str(model), str(tmp_path / "run2" / "bag"), "--json", str(report), *others]) == 0
+    code, out, _ = fgloc("evaluate-model", model, tmp_path / "run2" / "bag", "--json", report, *others)
+    assert code == 0
     assert sorted(p.name for p in (tmp_path / "plots").iterdir()) == ["calibration.png", "growth.png", "tracks.png"]
-    assert "calibrated commands" in capsys.readouterr().out
+    assert "calibrated commands" in out
     rows = json.loads(report.read_text())
     assert {row["source"] for row in rows} == {"commands", "calibrated commands", "model", "all"}
-    assert evaluation.main([str(tmp_path / "config.yaml"), str(tmp_path / "run2" / "bag")]) == 1
-    assert "not a sound safetensors file" in capsys.readouterr().err
+    code, _, err = fgloc("evaluate-model", tmp_path / "config.yaml", tmp_path / "run2" / "bag")
+    assert code == 1
+    assert "not a sound safetensors file" in err
 
 
 def test_model_is_adapted_to_another_robot_from_a_minute(runs: dict[str, Run], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import fgloc
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
 from fgloc.config import Config
@@ -16,7 +17,6 @@ from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.training import train as training
 from fgloc.training.config import DataConfig
 from fgloc.training.data import load_runs
 from fgloc.training.heard import TopicTimes
@@ -80,7 +80,7 @@ def test_windows_of_two_seconds_train_a_model(tmp_path: Path) -> None:
     )  # fmt: skip
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(settings))
     arguments = [str(tmp_path / "c.yaml"), "--data", str(tmp_path), "--out", str(tmp_path / "models")]
-    assert training.main(arguments) == 0
+    assert fgloc("train", *arguments)[0] == 0
     card = load_model(tmp_path / "models" / "model.safetensors").card
     assert card.split.test == ("test.0", "test.1", "test.2", "test.3")
     assert len(card.split.train) == 12

@@ -57,7 +57,7 @@ def draw(run: Path, out: Path) -> list[Path]:
         RecordingError: the folder is not a recorded run.
     """
     if not (run / "scenario.yaml").is_file():
-        raise RecordingError(f"{run}: no scenario.yaml; give a folder that `python -m datasets.sim record` has made")
+        raise RecordingError(f"{run}: no scenario.yaml; give a folder that `fgloc sim record` has made")
     described = yaml.safe_load((run / "scenario.yaml").read_text(encoding="utf-8"))
     scenario, seed = Scenario.model_validate(described["scenario"]), int(described["seed"])
     channels = _read(run / "bag")

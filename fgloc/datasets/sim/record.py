@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import yaml
-from tqdm import tqdm
 
 from fgloc.datasets.bag import BagWriter
 from fgloc.datasets.convert import write_robot
@@ -21,13 +20,14 @@ from fgloc.datasets.sim.positioning import gnss_settings, uwb_settings
 from fgloc.datasets.sim.scenario import Scenario
 from fgloc.datasets.sim.sensors import streams
 from fgloc.files.atomic import atomic_folder
+from fgloc.progress import counted
 from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # a folder that holds it is complete
 RUN_FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
 
 
-def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progress: bool = False) -> Path:
+def record(scenario: Scenario, seed: int, out: Path, camera: bool = True) -> Path:
     """Record one run into ``out``: ``bag/``, ``map.yaml``, ``robot.yaml``, ``installed.yaml``, ``scenario.yaml``.
 
     Nothing appears in ``out`` before the run is complete; an earlier recording there is replaced.
@@ -37,7 +37,6 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
         seed: what is drawn; the same seed and versions give the same messages.
         out: folder.
         camera: render images (if the scenario has a camera); without, no OpenGL is needed.
-        progress: show a bar on a terminal.
 
     Returns:
         The bag's folder.
@@ -51,7 +50,7 @@ def record(scenario: Scenario, seed: int, out: Path, camera: bool = True, progre
     with atomic_folder(out, own=RUN_FILES) as stage:
         with BagWriter(stage / "bag", compress=True) as bag:
             merged = heapq.merge(*streams(scene, log, bag, "images" if camera else "nothing"), key=itemgetter(0))
-            for _, write in tqdm(merged, unit="msg", disable=None if progress else True, leave=False):
+            for _, write in counted(merged, "recording", unit="messages"):
                 write()
         write_beside(stage, scene, scenario, camera)
     return out / "bag"

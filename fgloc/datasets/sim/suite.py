@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
-from tqdm import tqdm
 
 from fgloc.datasets.sim.physics import SimulationError
 from fgloc.datasets.sim.record import is_recorded, record
@@ -20,6 +19,7 @@ from fgloc.datasets.sim.scenario import Control, Scenario
 from fgloc.datasets.sim.section import Section
 from fgloc.errors import ConfigError, FglocError
 from fgloc.files.settings_file import Settings
+from fgloc.progress import counted
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
 
@@ -112,19 +112,15 @@ def record_suite(
     left = [job for job in todo if not is_recorded(job.scenario, job.seed, out / job.folder, camera)]
     failed: list[str] = []
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's: one core for each worker
-    with (
-        tqdm(total=len(todo), initial=len(todo) - len(left), unit="run", disable=None) as bar,
-        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool,
-    ):
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
         futures = {pool.submit(record, j.scenario, j.seed, out / j.folder, camera): j for j in left}
-        for future in as_completed(futures):
+        for future in counted(as_completed(futures), "recording", len(left), "runs"):
             folder = futures[future].folder
             try:
                 future.result()
                 said(folder)
             except FglocError as error:
                 failed.append(f"  {folder}: {error}")
-            bar.update()
     if failed:
         raise SimulationError(f"{len(failed)} of {len(left)} runs failed:\n" + "\n".join(failed))
     return len(left)
@@ -153,3 +149,10 @@ def load_suite(path: Path) -> Suite:
     if "entries" in settings.content:
         return settings.validated(Suite)
     return Suite(entries=(Entry(scenario=settings.validated(Scenario)),))
+
+
+def find_scenario(what: str) -> Scenario:
+    """A scenario of the bundled suite by name, or of a YAML file."""
+    if Path(what).suffix in (".yaml", ".yml"):
+        return load_suite(Path(what)).entries[0].scenario
+    return load_suite(BUNDLED).find(what)

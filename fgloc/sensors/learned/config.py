@@ -39,7 +39,7 @@ class MotionConfig(Section):
 
     model: Annotated[Path | None, BeforeValidator(model_path)] = Field(
         None,
-        description="a .safetensors file that python -m training.train wrote, or a shipped one: shipped:sim/diff_drive",
+        description="a .safetensors file that fgloc train wrote, or a shipped one: shipped:sim/diff_drive",
     )
     use: bool = True
     scale: float = Field(1.0, ge=0.01, le=100, description="this robot's distance over the model's")

@@ -24,7 +24,7 @@ from fgloc.sensors.learned.velocity import NaiveModel, VelocityModel
 
 _CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _MAX_BYTES = 64 << 20
-_REMEDY = "export it again with python -m training.train"
+_REMEDY = "export it again with fgloc train"
 Tensors = dict[str, NDArray[np.float32]]
 
 

@@ -1,0 +1,232 @@
+"""What a new user meets: help, version, missing extras, progress on a pipe, Ctrl-C, the first steps with a robot."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import yaml
+from command_line import fgloc
+from test_cli import write_circle
+
+from fgloc import progress
+from fgloc.cli import extras
+from fgloc.cli.progress import LINE_S, Lines
+from fgloc.cli.remarks import remarks
+from fgloc.config import Config, load_config
+from fgloc.datasets.bag import BagWriter
+from fgloc.evaluation.metrics import compute_metrics
+from fgloc.runner import run
+from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.training.config import load_train_config
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return write_circle(tmp_path_factory.mktemp("circle"), seconds=5.0)
+
+
+# --- help and version -------------------------------------------------------------------------------------------------
+
+
+def test_python_dash_m_and_version():
+    done = subprocess.run([sys.executable, "-m", "fgloc", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"fgloc {version('fgloc')}\n")
+
+
+@pytest.mark.parametrize("command", [(), ("train",), ("sim",), ("sim", "record"), ("convert", "mrclam"), ("init",)])
+def test_short_help(command):
+    code, out, _ = fgloc(*command, "-h")
+    assert code == 0
+    assert "Usage: " in out
+
+
+def test_completion_is_offered():
+    assert "--install-completion" in fgloc("--help")[1]
+
+
+# --- extras -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("extra", "command"),
+    [
+        ("train", ("train", "c.yaml", "--out", "models")),
+        ("sim", ("sim", "record", "calibrated", "--out", "run")),
+        ("sweep", ("ablate", "suite.yaml", "--out", "swept")),
+        ("live", ("live",)),
+        ("live", ("play", "bag")),
+        ("view", ("live", "--view")),
+    ],
+)
+def test_a_missing_extra_is_named_with_its_remedy(extra, command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    there = extras.find_spec
+    absent = extras._NEEDED[extra]
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else there(name))
+    code, out, err = fgloc(*command)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert f"-m pip install 'fgloc[{extra}]'" in err
+    assert all(name in err for name in absent)
+    assert not list(tmp_path.iterdir())
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_pipe_gets_a_line_every_ten_seconds_with_the_time_left():
+    now, lines = [0.0], []
+    listener = Lines(lines.append, lambda: now[0])
+    with progress.told_to(listener):
+        for done in range(61):
+            now[0] = 0.5 * done
+            progress.tell("batch", done, 60.0, "s")
+        progress.end("batch")
+    assert lines == ["batch: 20 of 60 s (33 %), 20 s left", "batch: 40 of 60 s (67 %), 10 s left"]
+    assert LINE_S == 10.0
+
+
+def test_the_time_left_of_resumed_work_is_of_what_was_done_now():
+    now, lines = [0.0], []
+    with progress.told_to(Lines(lines.append, lambda: now[0])):
+        progress.tell("mean", 900, 1000, "iterations")
+        now[0] = 10.0
+        progress.tell("mean", 950, 1000, "iterations", "validation 3.2")
+    assert lines == ["mean: 950 of 1000 iterations (95 %), validation 3.2, 10 s left"]
+
+
+def test_nobody_listens_by_default_and_counting_ends():
+    told = []
+    assert list(progress.counted("abc", "letters", 3)) == ["a", "b", "c"]
+    with progress.told_to(told.append):
+        list(progress.counted("abc", "letters", 3))
+    assert [a.done for a in told] == [1, 2, 3, 0]
+    assert told[-1].ended
+
+
+def test_ctrl_c_says_what_is_kept(bag, tmp_path, monkeypatch):
+    calls = []
+
+    def interrupt(listener, advance):
+        calls.append(advance)
+        if len(calls) == 20:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Lines, "__call__", interrupt)
+    code, out, err = fgloc("online", bag, "--out", tmp_path / "out")
+    assert (code, out) == (130, "")
+    assert err == "interrupted: of this result nothing was written; an earlier one is as it was\n"
+    assert 0.0 < calls[19].done < 5.0
+    assert not (tmp_path / "out").exists()
+
+
+# --- remarks ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_gravest_remark_comes_first(bag):
+    result = run(bag, bag.parent / "map.yaml", Config(), "online")
+    assert result.truth is not None
+    metrics = compute_metrics(result, Config())
+    assert {r.kind for r in remarks(result, metrics)} <= {"note"}
+    worse = metrics.model_copy(update={"nees_over_3": 9.0, "rejections": {"image.dark": 40, "odometry.order": 2}})
+    noted = replace(
+        result, notes=("Nothing special.", "Set gate.max_speed.", "The truth is in another frame than the map."),
+        mistakes=("The camera is upside down.",),
+    )  # fmt: skip
+    said = remarks(noted, worse)
+    assert [r.kind for r in said] == ["mistake", "warning", "warning", "warning", "note", "note"]
+    assert "errors are 3.0 times" in said[1].text
+    assert "40 messages of image were dropped (image.dark 40)" in said[2].text
+    assert "another frame" in said[3].text
+    assert [r.text for r in said[4:]] == ["Set gate.max_speed.", "Nothing special."]
+
+
+# --- a robot of one's own ---------------------------------------------------------------------------------------------
+
+RADIUS, TRACK = 0.08, 0.4
+
+
+def write_robot(path, seconds=8.0, truth=False):
+    """A robot with wheels and odometry that turns to and fro; its wheels' names are its own."""
+    with BagWriter(path) as bag:
+        pose, angles = np.zeros(3), np.zeros(2)
+        for k in range(round(seconds * 50)):
+            stamp = START_NS + k * 20_000_000
+            v, omega = 0.4, 0.5 * np.sin(0.02 * k)
+            pose = pose + 0.02 * np.array([v * np.cos(pose[2]), v * np.sin(pose[2]), omega])
+            angles = angles + 0.02 * np.array([v - omega * TRACK / 2, v + omega * TRACK / 2]) / RADIUS
+            bag.odometry("/odom", stamp, pose, (v, omega))
+            bag.joints("/joint_states", stamp, ("arm", "wheel_left", "wheel_right"), [0.0, *angles])
+            bag.command("/cmd_vel", stamp, v, omega)
+            if truth:
+                half = pose[2] / 2
+                bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, np.sin(half), np.cos(half)))
+    return path
+
+
+def test_init_finds_topics_wheels_and_says_what_is_missing(tmp_path):
+    bag = write_robot(tmp_path / "bags" / "run1")
+    file = tmp_path / "bags" / "robot.yaml"
+    code, out, err = fgloc("init", bag, "--out", file)
+    assert code == 0
+    config = load_config(file)
+    assert config.recording.topics.odometry == "/odom"
+    assert config.recording.topics.command == "/cmd_vel"
+    assert config.recording.topics.truth is None
+    assert isinstance(config.wheels, WheelsConfig)
+    assert (config.wheels.left_joint, config.wheels.right_joint) == ("wheel_left", "wheel_right")
+    assert config.wheels.left_radius == pytest.approx(RADIUS, rel=0.01)
+    assert config.wheels.track == pytest.approx(TRACK, rel=0.01)
+    assert "warning: no truth" in err
+    assert "nothing bounds the drift" in err
+    assert f"next: fgloc map {bag}" in out
+    before = file.read_text()
+    assert "# sightings:  # not found" in before
+    code, _, err = fgloc("init", bag, "--out", file)
+    assert (code, file.read_text()) == (1, before)
+    assert "--force" in err
+    assert fgloc("init", bag, "--out", file, "--force")[0] == 0
+
+
+def test_a_training_configuration_is_split_by_recording(tmp_path):
+    bags = [write_robot(tmp_path / "bags" / f"run{i}", truth=True) for i in range(4)]
+    file = tmp_path / "train.yaml"
+    code, out, err = fgloc("train", "--init", *bags, "--out", file)
+    assert code == 0
+    config = load_train_config(file)
+    assert config.split is not None
+    assert config.split.train == ("run0", "run1")
+    assert (config.split.validation, config.split.test) == (("run2",), ("run3",))
+    assert (tmp_path / config.recordings["run3"]).resolve() == bags[3].resolve()
+    assert config.limits is not None
+    assert config.limits.v_mps == pytest.approx(0.4)
+    assert "0.5 min of driving in all" in err
+    assert f"next: fgloc train {file} --out models" in out
+
+
+def test_without_truth_the_smoothed_runs_are_the_truth(tmp_path):
+    bags = [write_robot(tmp_path / f"run{i}", seconds=2.0) for i in range(3)]
+    file = tmp_path / "train.yaml"
+    assert fgloc("train", "--init", *bags, "--out", file)[0] == 0
+    content = yaml.safe_load(file.read_text())
+    assert content["truth"] == {f"run{i}": f"smoothed/run{i}" for i in range(3)}
+
+
+def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_path):
+    bag = write_robot(tmp_path / "run", seconds=2.0)
+    code, _, err = fgloc("train", "--init", bag, "--out", tmp_path / "train.yaml")
+    assert code == 1
+    assert "expected three or more" in err
+    code, _, err = fgloc("train", bag, bag, "--out", tmp_path / "models")
+    assert code == 1
+    assert "expected one training configuration" in err
+    silent = write_circle(tmp_path, seconds=2.0)
+    code, _, err = fgloc("train", "--init", bag, silent, "--out", tmp_path / "train.yaml")
+    assert code == 1
+    assert "no commands" in err
+    assert not (tmp_path / "train.yaml").exists()

@@ -1,0 +1,240 @@
+"""The files of a run and its report: complete, escaped, the same twice, and nothing is asked of a network."""
+
+import base64
+import csv
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import Browser
+from run_results import figure_eight
+
+from fgloc.config import Config
+from fgloc.errors import OutputError
+from fgloc.evaluation import report
+from fgloc.evaluation.html import plotly
+from fgloc.evaluation.metrics import compute_metrics
+from fgloc.recording.outputs import read_tum
+from fgloc.types import Mode, Trajectory
+
+FILES = {
+    "trajectory.tum",
+    "covariance.csv",
+    "steps.csv",
+    "metrics.json",
+    "config.json",
+    "trajectory.png",
+    "timeline.png",
+    "report.html",
+}
+KEYS = [
+    "duration_s",
+    "keyframes",
+    "first_pose_s",
+    "ate_mean_m",
+    "ate_rmse_m",
+    "yaw_mae_deg",
+    "end_error_m",
+    "drift_percent",
+    "nees_over_3",
+    "coverage",
+    "real_time_factor",
+    "step_ms",
+    "factors",
+    "rejections",
+    "installation",
+    "mistakes",
+    "judgements",
+]
+CONFIG = Config()
+COMMAND = 'fgloc smooth "first <run>" --out out'
+
+
+def all_modes(n=300):
+    return [Mode.OK] * 100 + [Mode.DEAD_RECKONING] * 100 + [Mode.LOST] * (n - 200)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    out = tmp_path_factory.mktemp("results")
+    result = figure_eight(modes=all_modes())
+    report.write_results(result, CONFIG, out, COMMAND, "c0ffee")
+    return result, out
+
+
+def test_all_files_are_written(written):
+    _, out = written
+    assert {file.name for file in out.iterdir()} == FILES
+
+
+def test_metrics_json_has_the_keys_of_the_contract(written):
+    result, out = written
+    content = json.loads((out / "metrics.json").read_text())
+    assert list(content) == KEYS
+    assert content["keyframes"] == 300
+    assert content["duration_s"] == pytest.approx(29.9)
+    assert content["real_time_factor"] == pytest.approx(2.99)
+    assert 0.5 < content["nees_over_3"] < 1.5
+    assert list(content["coverage"]) == ["1", "2", "3"]
+    assert list(content["step_ms"]) == ["median", "p95", "p99", "max"]
+    assert content["rejections"] == result.rejections
+    assert content["factors"] == result.counts
+
+
+def test_truth_based_metrics_are_null_without_truth(tmp_path):
+    report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
+    content = json.loads((tmp_path / "metrics.json").read_text())
+    assert list(content) == KEYS
+    assert [key for key in KEYS if content[key] is None] == KEYS[3:10]
+
+
+def test_truth_of_another_time_counts_as_none(tmp_path):
+    result = figure_eight()
+    result = replace(result, truth=Trajectory(result.truth.stamps_ns + 10**12, result.truth.poses))
+    assert compute_metrics(result, CONFIG).ate_mean_m is None
+    report.write_results(result, CONFIG, tmp_path, COMMAND)
+    assert "nothing to compare with" in (tmp_path / "report.html").read_text()
+
+
+def test_configured_alignment_is_applied():
+    result = figure_eight()
+    moved = replace(result, truth=Trajectory(result.truth.stamps_ns, result.truth.poses + np.array([5.0, 0, 0])))
+    aligned = Config.model_validate({"truth": {"align": "se2"}})
+    assert compute_metrics(moved, CONFIG).ate_mean_m > 4.0
+    assert compute_metrics(moved, aligned).ate_mean_m == pytest.approx(compute_metrics(result, aligned).ate_mean_m)
+
+
+def test_written_trajectory_is_the_runs(written):
+    result, out = written
+    back = read_tum(out / "trajectory.tum")
+    assert back.stamps_ns.tolist() == result.trajectory.stamps_ns.tolist()
+    np.testing.assert_allclose(back.poses, result.trajectory.poses, atol=3e-9)
+
+
+def test_config_json_says_where_the_result_is_from(written):
+    _, out = written
+    content = json.loads((out / "config.json").read_text())
+    assert content["command"] == COMMAND
+    assert content["input"] == {"path": "first_run", "sha256": "c0ffee"}
+    assert set(content["versions"]) == {"python", "fgloc", "gtsam", "numpy", "opencv-contrib-python-headless"}
+    assert Config.model_validate(content["config"]) == CONFIG
+
+
+class _Page(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.open, self.links, self.images = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        if tag == "img":
+            self.images.append(attributes["src"])
+        self.links += [attributes[name] for name in ("href", "src") if name in attributes and tag != "img"]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_report_is_complete_by_itself(written):
+    _, out = written
+    text = (out / "report.html").read_text()
+    page = _Page()
+    page.feed(text)
+    assert page.open == []
+    assert page.links == []
+    assert text.count("<script") == 3  # the data, Plotly, and what draws with it
+    own = text.replace(str(plotly()), "")
+    assert not re.search(r"url\(|@import|https?://", own)
+    assert len(page.images) == 3
+    data = base64.b64decode(page.images[0].removeprefix("data:image/png;base64,"))
+    assert data == (out / "trajectory.png").read_bytes()
+
+
+def test_without_truth_the_report_has_no_word_of_it(tmp_path):
+    report.write_results(figure_eight(truth=False), CONFIG, tmp_path, "fgloc smooth bag --out out")
+    text = (tmp_path / "report.html").read_text()
+    shown = re.sub(r"<(script|style|pre).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)
+    assert not re.search(r"\btru(e|th)\b|\berrors?\b", shown.replace("reference", ""))
+    assert "the 3σ bands are the estimate&#39;s own" in shown
+
+
+def test_rows_of_steps_csv_name_their_judgement(written):
+    _, out = written
+    judged = json.loads((out / "metrics.json").read_text())["judgements"]
+    assert [j["number"] for j in judged] == list(range(1, len(judged) + 1))
+    with (out / "steps.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for j in judged:
+        own = [row for row in rows if row["judgement"] == str(j["number"])]
+        assert len(own) == j["rows"] > 0
+        assert {int(row["step"]) for row in own} <= set(range(j["from_step"], j["to_step"] + 1))
+    assert all(row["judgement"] == "" for row in rows if row["kind"] == "wheels")
+
+
+def test_figures_are_written_in_the_formats_asked_for(tmp_path):
+    result = figure_eight()
+    report.write_results(result, CONFIG, tmp_path, COMMAND, figures=("svg",))
+    names = {file.name for file in tmp_path.iterdir()}
+    assert names == FILES | {f"{n}.svg" for n in ("trajectory", "error", "timeline")}
+    assert "position" in (tmp_path / "trajectory.svg").read_text()  # text stays text
+    report.write_results(result, CONFIG, tmp_path, COMMAND)
+    assert {file.name for file in tmp_path.iterdir()} == FILES
+
+
+def colored(picture):
+    """Share of pixels that are neither grey nor white."""
+    return float((np.ptp(picture.astype(int), axis=2) > 60).mean())
+
+
+@pytest.mark.parametrize("theme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_the_report_in_a_browser_draws_its_plots_and_asks_for_nothing(written, tmp_path, theme):
+    _, out = written
+    with Browser(tmp_path, (out / "report.html").as_uri(), height=2600, dark=theme == "dark") as browser:
+        picture = browser.screenshot(lambda p: colored(p) > 0.01, 60.0)
+        plots = browser.run("document.querySelectorAll('.plot:not([hidden]) .main-svg').length")
+        closed = browser.run("document.querySelectorAll('details.static:not([open])').length")
+    assert (plots > 0, closed) == (True, 2)
+    assert colored(picture) > 0.01
+    assert (np.median(picture) > 200) == (theme == "light")
+    assert not browser.asked
+
+
+def test_report_tells_all_and_escapes(written):
+    _, out = written
+    text = (out / "report.html").read_text()
+    for expected in (
+        "fgloc smooth &#34;first &lt;run&gt;&#34; --out out",
+        "odometry&#39;s &lt;twist&gt; is zero",
+        "odometry.duplicate_stamp",
+        "LOST 33.3 %",
+        "do not use these stretches",
+        "matched at 200 of 300 keyframes",
+        "c0ffee",
+    ):
+        assert expected in text
+
+
+def test_results_are_the_same_twice(written, tmp_path):
+    result, out = written
+    report.write_results(result, CONFIG, tmp_path, COMMAND, "c0ffee")
+    for name in FILES:
+        assert (tmp_path / name).read_bytes() == (out / name).read_bytes(), name
+
+
+def test_fault_71_failing_run_keeps_the_old_results(written, tmp_path, monkeypatch):
+    result, _ = written
+    report.write_results(result, CONFIG, tmp_path, "the old command", "c0ffee")
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def full(path, text):
+        raise OutputError(f"{path}: disk full")
+
+    monkeypatch.setattr(report, "write_text", full)  # the report is the last file
+    with pytest.raises(OutputError):
+        report.write_results(replace(result, wall_s=1.0), CONFIG, tmp_path, "the new command", "beef")
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
