@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fgloc.config import Config, Role
 from fgloc.frames import BASE_NAMES
@@ -13,14 +12,11 @@ from fgloc.recording.files import find_beside
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
-from fgloc.types import Event
-
-if TYPE_CHECKING:
-    from fgloc.sensors.wheels.geometry import WheelGeometry, WheelPair
+from fgloc.sensors.roles import SettingsDraft
 
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
-    "command": "what the robot is told; learned motion reads it",
+    "command": "commanded velocities; learned motion reads them",
     "joints": "angles of the wheels",
     "imu": "gyro: yaw rate",
     "image": "the camera; markers are found in it",
@@ -49,9 +45,7 @@ class FirstSettings:
 class _Seen:
     info: RecordingInfo
     frames: tuple[str, ...]
-    joints: tuple[str, ...]
-    pair: WheelPair | None
-    geometry: WheelGeometry | None
+    odometer: SettingsDraft
     dictionary: str | None
     has_map: bool
 
@@ -68,43 +62,26 @@ def first_settings(bag: Path) -> FirstSettings:
         f"# Robot of {bag.name}. What is commented out has to be filled in or is the default.",
         "# All keys: docs/configuration.md. `fgloc info BAG --config robot.yaml` checks it.",
         *_recording(seen, missing),
-        *_wheels(seen, missing),
+        *seen.odometer.lines(missing),
         *_markers(seen, missing),
         "",
         "# Learned motion: once trained (fgloc train --init BAG... --out train.yaml), or of a robot of this kind.",
         "# motion:",
         "#   model: models/model.safetensors",
     ]
-    lacking = ("nothing tells", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
+    lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
     return FirstSettings("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
 
 
 def _look(bag: Path) -> _Seen:
-    from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
-    from fgloc.sensors.wheels.geometry import fit_geometry, wheel_pair
-
-    config = Config()
-    joints: list[JointsEvent] = []
-    odometry: list[OdometryEvent] = []
-
-    def watch(event: Event) -> None:
-        if isinstance(event, JointsEvent):
-            joints.append(event)
-        elif isinstance(event, OdometryEvent):
-            odometry.append(event)
-
+    config, odometer = Config(), registry.odometer().draft()
     with Recording(bag, config.recording) as recording:
-        info = inspect_recording(recording, config, watch)
-        names = tuple(dict.fromkeys(name for event in joints[:100] for name in event.names))
-        pair = wheel_pair(names)
-        told = pair is not None and len(odometry) > 0
+        info = inspect_recording(recording, config, odometer.add)
         return _Seen(
             info,
             tuple(name for name in BASE_NAMES if name in recording.frames),
-            names,
-            pair,
-            fit_geometry(pair, joints, odometry) if told and pair is not None else None,
+            odometer,
             registry.raw_landmarks().fitting_dictionary(recording) if "image" in info.roles else None,
             find_beside(bag, "map.yaml") is not None,
         )
@@ -133,41 +110,6 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
             "errors in the reports"
         )
-
-
-def _wheels(seen: _Seen, missing: list[str]) -> Iterator[str]:
-    if not seen.joints:
-        return
-    yield ""
-    yield f"# Joints in the recording: {', '.join(seen.joints)}."
-    pair, geometry = seen.pair, seen.geometry
-    if pair is None:
-        missing.append(
-            f"which joints are the wheels: {', '.join(seen.joints)}; give wheels.left_joint and wheels.right_joint, "
-            "their radii and the track"
-        )
-    if geometry is None:
-        if pair is not None:
-            missing.append("radii and track of the wheels: measure them (wheels.left_radius, right_radius, track)")
-        yield "# Fill in to use the angles of the wheels, which are better than the driver's odometry:"
-        yield "# wheels:"
-        yield "#   source: ticks"
-        yield f"#   left_joint: {pair.left if pair else ''}"
-        yield f"#   right_joint: {pair.right if pair else ''}"
-        yield "#   left_radius:   # m"
-        yield "#   right_radius:  # m"
-        yield "#   track:         # m, between the wheels' contact points"
-        return
-    assert pair is not None
-    yield "# Radius and track are those with which the driver made its odometry; measure them all the same."
-    yield "wheels:"
-    yield "  source: ticks"
-    yield f"  left_joint: {pair.left}"
-    yield f"  right_joint: {pair.right}"
-    yield f"  left_radius: {geometry.radius_m:.4g}  # m"
-    yield f"  right_radius: {geometry.radius_m:.4g}"
-    yield f"  track: {geometry.track_m:.4g}  # m, between the wheels' contact points"
-    yield "  # scale_sigma: 0.01  # how far the radii may be off; fgloc calibrate finds by how much they are"
 
 
 def _markers(seen: _Seen, missing: list[str]) -> Iterator[str]:

@@ -78,13 +78,7 @@ def write_results(
         CovarianceError: a covariance is not positive definite.
     """
     metrics, matched = compute_metrics(result, config), match_result(result, config)
-    source = None if result.source is None else str(result.source)
-    provenance = {
-        "command": command,
-        "input": {"path": source, "sha256": input_hash},
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
-        "config": config.model_dump(mode="json"),
-    }
+    provenance = _provenance(result, config, command, input_hash)
     drawn = {
         "trajectory": plot_trajectory(result, matched),
         "error": plot_error(result, matched),
@@ -107,6 +101,16 @@ def write_results(
                 write_map(result.found.landmarks, stage / "map.yaml")
         write_text(stage / "report.html", render(result, metrics, matched, images, provenance))
     return metrics
+
+
+def _provenance(result: RunResult, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
+    """What ``config.json`` holds."""
+    return {
+        "command": command,
+        "input": {"path": None if result.source is None else str(result.source), "sha256": input_hash},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "config": config.model_dump(mode="json"),
+    }
 
 
 def installation_yaml(found: InstallationFound, config: Config, folder: Path, command: str) -> str:
