@@ -182,7 +182,7 @@ def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
     at = "" if severity is None else f" at {severity:g} {units.get(failure, '')}".rstrip()
     under = "without failure" if failure == NOTHING else f"under '{failure}'{at}"
     text = f"'{variant}': mean error {other:.3g} mm instead of {ours:.3g} mm of '{first}' {under} "
-    text += f"({ratio:.2g} times, {n} run{'s' if n > 1 else ''})"
+    text += f"({ratio:.1f} times, {n} run{'s' if n > 1 else ''})"
     if plain is not None and failure != NOTHING:
         text += f"; without failure {plain[4]:.3g} instead of {plain[3]:.3g} mm"
     return f"{text}."

@@ -12,7 +12,8 @@ from fgloc.recording.files import find_beside
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
-from fgloc.sensors.roles import SettingsDraft
+from fgloc.sensors.first_settings import FirstLook, FirstSection
+from fgloc.types import Event
 
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
@@ -27,7 +28,7 @@ _MEANINGS: dict[Role, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class FirstSettings:
+class RobotFile:
     """What `first_settings` found.
 
     Attributes:
@@ -45,12 +46,10 @@ class FirstSettings:
 class _Seen:
     info: RecordingInfo
     frames: tuple[str, ...]
-    odometer: SettingsDraft
-    dictionary: str | None
-    has_map: bool
+    sections: tuple[FirstSection, ...]
 
 
-def first_settings(bag: Path) -> FirstSettings:
+def first_settings(bag: Path) -> RobotFile:
     """Read a recording through and write down what it tells of the robot.
 
     Raises:
@@ -62,8 +61,11 @@ def first_settings(bag: Path) -> FirstSettings:
         f"# Robot of {bag.name}. What is commented out has to be filled in or is the default.",
         "# All keys: docs/configuration.md. `fgloc info BAG --config robot.yaml` checks it.",
         *_recording(seen, missing),
-        *seen.odometer.lines(missing),
-        *_markers(seen, missing),
+    ]
+    for section in seen.sections:
+        lines += ["", *section.lines] if section.lines else []
+        missing += section.missing
+    lines += [
         "",
         "# Learned motion: once trained (fgloc train --init BAG... --out train.yaml), or of a robot of this kind.",
         "# motion:",
@@ -71,20 +73,23 @@ def first_settings(bag: Path) -> FirstSettings:
     ]
     lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
-    return FirstSettings("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
+    return RobotFile("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
 
 
 def _look(bag: Path) -> _Seen:
-    config, odometer = Config(), registry.odometer().draft()
+    config = Config()
+    wanted = registry.first_settings()
+    events: dict[type[Event], list[Event]] = {kind: [] for of in wanted for kind in of.events}
+
+    def watch(event: Event) -> None:
+        if type(event) in events:
+            events[type(event)].append(event)
+
     with Recording(bag, config.recording) as recording:
-        info = inspect_recording(recording, config, odometer.add)
-        return _Seen(
-            info,
-            tuple(name for name in BASE_NAMES if name in recording.frames),
-            odometer,
-            registry.raw_landmarks().fitting_dictionary(recording) if "image" in info.roles else None,
-            find_beside(bag, "map.yaml") is not None,
-        )
+        info = inspect_recording(recording, config, watch)
+        look = FirstLook(info.roles, events, recording, find_beside(bag, "map.yaml") is not None)
+        frames = tuple(name for name in BASE_NAMES if name in recording.frames)
+        return _Seen(info, frames, tuple(of.section(look) for of in wanted))
 
 
 def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
@@ -110,27 +115,3 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
             "errors in the reports"
         )
-
-
-def _markers(seen: _Seen, missing: list[str]) -> Iterator[str]:
-    if "image" not in seen.info.roles:
-        return
-    yield ""
-    yield "markers:"
-    if seen.dictionary is not None:
-        yield f"  dictionary: {seen.dictionary}  # what is seen in the images fits it"
-    else:
-        missing.append("the dictionary of the markers: no marker was found in the images (markers.dictionary)")
-        yield "  # dictionary: DICT_4X4_50"
-    if seen.has_map:
-        yield "  # default_size_m:  # the map beside the bag has the sizes"
-    else:
-        missing.append(
-            "the size of the markers: measure the side of the black square and give it (markers.default_size_m)"
-        )
-        yield "  # default_size_m: 0.16  # side of the black square; every distance follows from it"
-    yield "  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes"
-    if "camera_info" not in seen.info.roles:
-        yield ""
-        yield "# The recording has no CameraInfo:"
-        yield "# camera: {file: camera.yaml}  # as camera_calibration writes it"

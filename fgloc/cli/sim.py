@@ -85,10 +85,9 @@ def follow_path(
     corners: Corners = False,
 ) -> None:
     """Let the robot drive itself along waypoints, guided by a pose that is estimated while it drives."""
-    from fgloc.datasets.sim.following.cases import what_is_seen
     from fgloc.datasets.sim.following.failing import read_failures
     from fgloc.datasets.sim.following.figures import draw_drives, table
-    from fgloc.datasets.sim.following.loop import Drive, follow
+    from fgloc.datasets.sim.following.loop import Drive, follow, seen_by
     from fgloc.datasets.sim.following.path import load_path
     from fgloc.datasets.sim.following.poses import POSES
     from fgloc.datasets.sim.suite import find_scenario
@@ -99,7 +98,7 @@ def follow_path(
         raise ConfigError(f"pose '{pose}' is not known; expected one of {', '.join(POSES)}")
     drive = Drive(
         find_scenario(scenario), load_path(path), known[pose], seed, read_failures(failure or []),
-        what_is_seen(corners),
+        seen_by(corners),
     )  # fmt: skip
     done = {drive.path.name: (drive, follow(drive, out))}
     draw_drives(done, out / "following.png", close=False)
@@ -113,11 +112,11 @@ def follow_demo(
     corners: Corners = False,
 ) -> None:
     """Six drives: flat, on ice, with sensors that fail; a picture and a table."""
-    from fgloc.datasets.sim.following.cases import what_is_seen
     from fgloc.datasets.sim.following.demo import PICTURE, demonstrate
+    from fgloc.datasets.sim.following.loop import seen_by
 
     check_out(out)
-    say(demonstrate(out, jobs_, what_is_seen(corners)))
+    say(demonstrate(out, jobs_, seen_by(corners)))
     say(f"\n{out / PICTURE}")
 
 

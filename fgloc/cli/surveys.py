@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -67,10 +66,10 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
-    _suggest_calibration(bags, out, config)
+    _tell_next(bags, out, config)
 
 
-def _suggest_calibration(bags: Sequence[Path], out: Path, config: Path | None) -> None:
+def _tell_next(bags: list[Path], out: Path, config: Path | None) -> None:
     paths = " ".join(shown_path(bag) for bag in bags)
     configuration = "" if config is None else f" --config {shown_path(config)}"
     next_step(

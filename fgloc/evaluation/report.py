@@ -8,6 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from fgloc.calibration.settings import with_settings
 from fgloc.config import Config, yaml_of
 from fgloc.evaluation.html import embedded, page, plotly, script_data
@@ -79,14 +81,9 @@ def write_results(
     """
     metrics, matched = compute_metrics(result, config), match_result(result, config)
     provenance = _provenance(result, config, command, input_hash)
-    drawn = {
-        "trajectory": plot_trajectory(result, matched),
-        "error": plot_error(result, matched),
-        "timeline": plot_timeline(result, matched, _slips(result, config)),
-    }
+    drawn = _drawn(result, matched, config)
     images = {f"{name}.png": png(figure) for name, figure in drawn.items()}
-    wanted = {f"{name}.{form}": (name, form) for form in figures for name in drawn}
-    files = {file: images.get(file) or image_of(drawn[name], form) for file, (name, form) in wanted.items()}
+    files = {f"{name}.{form}": image_of(figure, form) for form in figures for name, figure in drawn.items()}
     with atomic_folder(out, own=FILES) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)
         write_covariance_csv(stage / "covariance.csv", result.trajectory)
@@ -104,12 +101,22 @@ def write_results(
 
 
 def _provenance(result: RunResult, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
-    """What ``config.json`` holds."""
+    """What ``config.json`` holds: how the result came about."""
+    source = None if result.source is None else str(result.source)
     return {
         "command": command,
-        "input": {"path": None if result.source is None else str(result.source), "sha256": input_hash},
+        "input": {"path": source, "sha256": input_hash},
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
         "config": config.model_dump(mode="json"),
+    }
+
+
+def _drawn(result: RunResult, matched: Matched | None, config: Config) -> dict[str, Figure]:
+    """The figures of a run by name."""
+    return {
+        "trajectory": plot_trajectory(result, matched),
+        "error": plot_error(result, matched),
+        "timeline": plot_timeline(result, matched, _slips(result, config)),
     }
 
 

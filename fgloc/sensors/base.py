@@ -14,6 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
 
 from fgloc.sensors.field_checks import FieldChecks
+from fgloc.sensors.first_settings import FirstSettings
 from fgloc.sensors.topic_checks import Collector, TimingOnly
 from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement, Setting
 
@@ -200,6 +201,7 @@ class BuiltIn:
             sees no landmarks.
         measured: classes of measurements that have its name in ``steps.csv``.
         joined: makes its events count on across a piece of the recording that was cut out; None: they count nothing.
+        first_settings: what ``fgloc init`` writes of it; None: nothing.
     """
 
     name: str
@@ -215,6 +217,7 @@ class BuiltIn:
     joined: Callable[[], Joined] | None = None
     measures: Callable[[Any], Callable[[Any], Iterator[LandmarkSighting]]] | None = None
     measured: tuple[type[LandmarkSighting], ...] = ()
+    first_settings: FirstSettings | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

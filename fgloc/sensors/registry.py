@@ -21,6 +21,7 @@ from fgloc.sensors.base import (
     Stream,
 )
 from fgloc.sensors.command_input import CommandInput
+from fgloc.sensors.first_settings import FirstSettings
 from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.gyro.input import GyroInput
 from fgloc.sensors.learned.config import MotionConfig
@@ -210,6 +211,11 @@ def channels() -> Mapping[str, Channel]:
 def _channels() -> dict[str, Channel]:
     offered = [channel for sensor in built_in() for channel in sensor.channels]
     return {channel.name: channel for channel in sorted(offered, key=lambda channel: channel.rank)}
+
+
+def first_settings() -> tuple[FirstSettings, ...]:
+    """What the sensors write into the first settings of an unknown robot."""
+    return tuple(sensor.first_settings for sensor in built_in() if sensor.first_settings is not None)
 
 
 def detected_kinds() -> tuple[str, ...]:

@@ -5,14 +5,14 @@ There is one sensor for each role. Other modules ask the registry for the role, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fgloc.sensors.base import MotionInstallation, MotionRole, RawMistake
 from fgloc.sensors.noise_density import NoiseDensity
-from fgloc.types import Event, FloatArray, LandmarkMap
+from fgloc.types import FloatArray, LandmarkMap
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -71,18 +71,6 @@ class SetupMistake:
     source: str
 
 
-class SettingsDraft(Protocol):
-    """A sensor's section of a first ``robot.yaml``."""
-
-    def add(self, event: Event) -> None:
-        """Take in one event of a recording."""
-        ...
-
-    def lines(self, missing: list[str]) -> Iterator[str]:
-        """Of ``robot.yaml``; sentences on what it lacks are added to ``missing``."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class OdometerRole:
     """Measures every step; what others are compared to.
@@ -95,7 +83,6 @@ class OdometerRole:
             several are to be tried, those for control inputs in its place.
         distance_gain: the setting that sightings determine wherever the robot moves.
         correct: the sentence and the values that undo a mistake.
-        draft: its section of a first ``robot.yaml``.
     """
 
     kind: ClassVar[MotionRole] = MotionRole.ODOMETER
@@ -105,7 +92,6 @@ class OdometerRole:
     freed: Callable[[Config], tuple[Config, ...]]
     distance_gain: str
     correct: Callable[[SetupMistake, Config], RawMistake]
-    draft: Callable[[], SettingsDraft]
 
 
 @dataclass(frozen=True, slots=True)

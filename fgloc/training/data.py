@@ -51,13 +51,13 @@ class Run:
     @property
     def times(self) -> FloatArray:
         """``(n,)`` s since the origin."""
-        return np.arange(len(self.poses)) * self.dt_s
+        return np.asarray(np.arange(len(self.poses)) * self.dt_s, dtype=float)
 
     def starts(self, steps: int, stride: int = 1) -> NDArray[np.int64]:
         """Indices from which ``steps`` steps are valid throughout."""
         broken = np.concatenate([[0], np.cumsum(~self.valid)])
         k = np.arange(0, len(self.poses) - steps, stride)
-        return k[broken[k + steps + 1] == broken[k]]
+        return np.asarray(k[broken[k + steps + 1] == broken[k]], dtype=np.int64)
 
 
 def load_run(
@@ -129,7 +129,10 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
     sensed: list[Event] = []
     with open_recording(path, settings.recording) as recording:
         for event in recording.events():
-            (truth if isinstance(event, TruthEvent) else sensed).append(event)
+            if isinstance(event, TruthEvent):
+                truth.append(event)
+            else:
+                sensed.append(event)
         up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
@@ -167,8 +170,8 @@ def make_run(
             f"{name}: commands and truth overlap for {max(0.0, (last - first) * 1e-9):.1f} s; expected at least "
             f"{config.shortest_s:g} s; check the stamps with `fgloc info`"
         )
-    t_truth = (truth_ns - first) * 1e-9
-    times = np.arange(n) * dt_s
+    t_truth = np.asarray((truth_ns - first) * 1e-9, dtype=float)
+    times = np.asarray(np.arange(n) * dt_s, dtype=float)
     poses, velocities = _smooth(t_truth, truth, times, config.smoothing_s)
     return Run(
         name=name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,8 @@ from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Step
+
+_E = TypeVar("_E", bound=Event)
 
 _STEP_NS = 200_000_000  # of the gyro's filter
 _BLIND_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
@@ -151,5 +154,5 @@ def _yaw_at(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: int) -> floa
     return float(poses[k, 2] + share * math.remainder(poses[k + 1, 2] - poses[k, 2], math.tau))
 
 
-def _all(buffer: EventBuffer[Event]) -> tuple[Event, ...]:  # type: ignore[type-var]
+def _all(buffer: EventBuffer[_E]) -> tuple[_E, ...]:
     return buffer.window(buffer.stamps[0], buffer.stamps[-1]) if buffer.stamps else ()

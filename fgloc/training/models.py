@@ -51,6 +51,10 @@ def mlp(widths: list[int]) -> nn.Sequential:
 class DisplacementNet(nn.Module):
     """Residual twist on the best known kinematics; log-variances from a network of their own (gru: a layer)."""
 
+    mean: Tensor
+    std: Tensor
+    scale: Tensor
+
     def __init__(
         self, config: NetworkConfig, kinematics: Kinematics, wheel_kinematics: Kinematics, runs: list[Run]
     ) -> None:
@@ -211,6 +215,10 @@ class VelocityNet(nn.Module):
     Of a ``lag`` model there is no network, of an ``arx`` model it is one linear layer, and in the ``rate`` form no lag:
     the network is the acceleration.
     """
+
+    mean: Tensor
+    std: Tensor
+    scale: Tensor
 
     def __init__(self, config: NetworkConfig, kinematics: Kinematics, lag: Lag | None, runs: list[Run]) -> None:
         """Take the normalization from the training runs."""

@@ -108,10 +108,10 @@ def test_sentences_say_the_cost_and_its_limits(bag):
 def test_a_variant_is_compared_where_it_matters_most(bag):
     runs = join(*made(bag))
     told = worth(SUITE, runs, "bare")
-    assert told == "'bare': mean error 500 mm instead of 10 mm of 'full' without failure (50 times, 1 run)."
+    assert told == "'bare': mean error 500 mm instead of 10 mm of 'full' without failure (50.0 times, 1 run)."
     told = worth(SUITE, [run for run in runs if run.cell.failure == "blind" or run.cell.variant == "bare"], "bare")
     assert told.startswith(
-        "'bare': mean error 500 mm instead of 30 mm of 'full' under 'blind' at 1 s (17 times, 3 runs)"
+        "'bare': mean error 500 mm instead of 30 mm of 'full' under 'blind' at 1 s (16.7 times, 3 runs)"
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fgloc.sensors.base import BuiltIn, Stream
 from fgloc.sensors.markers import messages, validation
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.sensors.markers.first_settings import FIRST_SETTINGS
 from fgloc.sensors.markers.role import ROLE
 from fgloc.sensors.topic_checks import RawChecks, SightingsChecks
 from fgloc.types import LandmarkSighting, PixelMeasurement
@@ -31,6 +32,7 @@ def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSigh
 
 MARKERS = BuiltIn(
     name="corners",
+    first_settings=FIRST_SETTINGS,
     streams=(
         Stream(
             "image",

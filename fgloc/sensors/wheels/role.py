@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fgloc.sensors.base import RawMistake
-from fgloc.sensors.roles import OdometerErrors, OdometerRole, SettingsDraft, SetupMistake, with_values
+from fgloc.sensors.roles import OdometerErrors, OdometerRole, SetupMistake, with_values
 from fgloc.sensors.wheels.installation import INSTALLATION
 
 if TYPE_CHECKING:
@@ -44,12 +44,6 @@ def _correct(mistake: SetupMistake, config: Config) -> RawMistake:
     return correct(mistake, config)
 
 
-def _draft() -> SettingsDraft:
-    from fgloc.sensors.wheels.draft import WheelsDraft
-
-    return WheelsDraft()
-
-
 ROLE = OdometerRole(
     installation=INSTALLATION,
     build=_build,
@@ -57,5 +51,4 @@ ROLE = OdometerRole(
     freed=_freed,
     distance_gain="wheels.scale_v",
     correct=_correct,
-    draft=_draft,
 )

@@ -10,6 +10,7 @@ from fgloc.sensors.wheels import messages, validation
 from fgloc.sensors.wheels.channels import CHANNELS
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.findings import OdometryChecks
+from fgloc.sensors.wheels.first_settings import FIRST_SETTINGS
 from fgloc.sensors.wheels.role import ROLE
 from fgloc.types import Event
 
@@ -55,6 +56,7 @@ def _joined() -> Joined:
 
 WHEELS = BuiltIn(
     name="wheels",
+    first_settings=FIRST_SETTINGS,
     streams=(
         Stream(
             "odometry",

@@ -58,11 +58,6 @@ CASES: dict[str, Case] = {
 }  # fmt: skip
 
 
-def what_is_seen(corners_only: bool) -> Sees:
-    """What the camera of a drive sends: corners of markers, which need no rendering, or images."""
-    return "corners" if corners_only else "images"
-
-
 def drive_of(name: str, pose: PoseName, seed: int, sees: Sees = "images") -> Drive:
     """A drive of a case: as installed by a careful person, and with no error besides.
 

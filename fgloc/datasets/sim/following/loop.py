@@ -51,6 +51,11 @@ ROLES: dict[str, Role] = {
 }
 
 
+def seen_by(corners: bool) -> Sees:
+    """What the camera sends: corners of markers, or images."""
+    return "corners" if corners else "images"
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
     """What is to be driven.
