@@ -1,4 +1,4 @@
-"""What poses are carried on from: a keyframe's estimate, and the motion sources as they were then."""
+"""What poses are propagated from: a keyframe's estimate, and the motion sources as they were then."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MotionParts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
-    """A keyframe to carry on from. Can be pickled."""
+    """A keyframe to propagate from. Can be pickled."""
 
     segment: int
     stamp_ns: int
