@@ -39,6 +39,7 @@ SENSORS = {  # name -> where it lives in fgloc/sensors, its section of the confi
     "gnss": (("gnss",), "gnss", ()),
 }
 _LISTS = ("SensorSections", "SensorInput", "built_in")  # of the registry: sections, methods of `Live`, sensors
+_GENERATED = "reference/"  # pages that docs/hooks.py makes when the site is built
 _CITED = re.compile(r"(?<![\w/.*<-])(?:\.\./)*[\w][\w./-]*\.(?:md|py)\b(?!\w)")
 
 Found = list[str]
@@ -189,7 +190,7 @@ def _names_of(tree: ast.Module, classes: Iterable[str], sensor: str, section: st
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and node.id in classes:
             named.add(node.id)
-        elif isinstance(node, ast.Attribute) and re.search(rf"config\.{section}$", ast.unparse(node)):
+        elif isinstance(node, ast.Attribute) and re.search(rf"(config|settings)\.{section}$", ast.unparse(node)):
             named.add(f"config.{section}")
         elif isinstance(node, ast.Constant) and re.fullmatch(rf"{sensor}(\.\w+)?", str(node.value)):
             named.add(repr(node.value))
@@ -205,7 +206,7 @@ def cited_missing(root: Path) -> Found:
         text = path.read_text(encoding="utf-8")
         for cited in _CITED.findall("\n".join(prose(text)) if path.suffix == ".py" else text):
             name = cited.removeprefix("./").replace("../", "")
-            if not any(file == name or file.endswith(f"/{name}") for file in files):
+            if not any(file == name or file.endswith(f"/{name}") for file in files) and not name.startswith(_GENERATED):
                 found.append(f"{path.relative_to(root)} cites {cited}")
     return sorted(set(found))
 

@@ -125,7 +125,7 @@ class KeyframesConfig(Section):
 
 
 class MapConfig(Section):
-    """How well the landmarks of the map were surveyed, where the map does not say it of each."""
+    """How well the landmarks of the map were surveyed, where the map does not give it of each."""
 
     position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
     rotation_sigma_rad: float = Field(
@@ -167,7 +167,7 @@ class Distrust(Section):
 
 
 class WeightsConfig(Section):
-    """How the weights of motion and landmark factors follow what the sources say of one another."""
+    """How the weights of motion and landmark factors follow how the sources differ."""
 
     adaptive: bool = Field(True, description="false: covariances stay as they were made; sightings are still gated")
     distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")

@@ -67,7 +67,7 @@ class Localizer:
         since_fix_s = self.tracking.since_fix_s
         self.tracking.advance_time(step.dt)
         self._initialization.prepare(step)
-        # 1. Measure: one call per sensor; a silent sensor yields nothing
+        # 1. Measure: one call per sensor; a sensor without data yields nothing
         with self.stopwatch("motion"):
             readings = self.motion.read(step, since_fix_s)
         with self.stopwatch("sightings"):
@@ -115,16 +115,16 @@ class Localizer:
         """
         self._initialization.restart_at(pose)
 
-    def finish(self, blind: bool = False) -> list[Estimate]:
-        """The run is over: if its first pose was never found, start from the likeliest place.
+    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
+        """The run is over: if its first pose was never found, start from the most probable place.
 
         Args:
-            blind: no sensor was there that could have seen a landmark: then the map's origin is as likely as any place.
+            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
 
         Returns:
             The estimates of its steps; none if there is nothing to make up for.
         """
-        return self._initialization.finish(blind)
+        return self._initialization.finish(no_landmark_sensor)
 
     @property
     def rejections(self) -> Counter[str]:

@@ -125,7 +125,7 @@ def _replayed(
     replay = Replay(parts, recording, memory, progress, options)
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:
-        replay.make_up(parts.localizer.finish(replay.blind))
+        replay.make_up(parts.localizer.finish(replay.no_landmark_sensor))
     if memory is not None:
         memory.save()
     return replay

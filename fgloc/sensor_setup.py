@@ -77,7 +77,7 @@ def recorded_setup(
         landmark_map: the map as it is to be used, if not as the file has it.
 
     Raises:
-        RecordingError: nothing in the recording says how the robot moves, or a frame is missing.
+        RecordingError: nothing in the recording measures how the robot moves, or a frame is missing.
         CameraError: the calibration is missing, unusable or does not fit the images.
         MapError, ModelError, ConfigError: as their loaders have it.
     """

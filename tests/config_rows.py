@@ -1,7 +1,11 @@
-"""The tables of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` rewrites them."""
+"""The tables of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` rewrites them.
+
+With them it rewrites the JSON schemas of docs/schema/.
+"""
 
 from pathlib import Path
 
+import schema_files
 from pydantic import BaseModel
 
 from fgloc.config import Config
@@ -47,3 +51,4 @@ if __name__ == "__main__":
     page = Path(__file__).parent.parent / "docs" / "configuration.md"
     start = page.read_text(encoding="utf-8").partition("\n### ")[0]
     page.write_text(f"{start}\n{tables()}", encoding="utf-8")
+    schema_files.write()

@@ -16,7 +16,12 @@ def schema(name):
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-if __name__ == "__main__":
+def write():
+    """Rewrite all."""
     FOLDER.mkdir(exist_ok=True)
     for name in MODELS:
         (FOLDER / name).write_text(schema(name), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write()

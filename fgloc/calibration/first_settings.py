@@ -17,7 +17,7 @@ from fgloc.types import Event
 
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
-    "command": "what the robot is told; learned motion reads it",
+    "command": "commanded velocities; learned motion reads them",
     "joints": "angles of the wheels",
     "imu": "gyro: yaw rate",
     "image": "the camera; markers are found in it",
@@ -71,7 +71,7 @@ def first_settings(bag: Path) -> RobotFile:
         "# motion:",
         "#   model: models/model.safetensors",
     ]
-    lacking = ("nothing tells", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
+    lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
     return RobotFile("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
 

@@ -194,11 +194,16 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
-    for remark in remarks(result, metrics):
-        say_remark(*remark)
-    say_table(None, rows)
+    found = remarks(result, metrics)
+    for remark in found:
+        if remark.kind != "note":
+            say_remark(*remark)
     for judgement in gravest(metrics.judgements, _TOLD):
         say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
+    for remark in found:
+        if remark.kind == "note":
+            say_remark(*remark)
+    say_table(None, rows)
     exit_unless_trusted(result)
 
 

@@ -46,11 +46,12 @@ def make_map(
     """
     from fgloc.calibration.drives import sees_corners
     from fgloc.calibration.survey import survey
+    from fgloc.sensors import registry
     from fgloc.sensors.maps import load_map, write_map
 
     check_out(out, folder=False)
     settings = configured(bags[0], config, model)
-    given = None if anchor is None else load_map(anchor, size or settings.markers.default_size_m)
+    given = None if anchor is None else load_map(anchor, size or registry.raw_landmarks().size(settings))
     settings = _with_markers(settings, dictionary, size, given)
     if not sees_corners(bags[0], settings):
         if len(bags) > 1 or anchor is not None or distance:
@@ -109,15 +110,15 @@ def _tell(found: Survey, out: Path) -> None:
 
 def _with_markers(settings: Config, dictionary: str | None, size: float | None, given: LandmarkMap | None) -> Config:
     """The configuration with the markers of the command line or the given map."""
+    from fgloc.sensors import registry
+
     if size is not None and not 0.0 < size <= 5.0:
         raise ConfigError(f"--size {size:g}: expected the side of the black square in metres, more than 0 and up to 5")
-    markers = settings.markers
+    markers = registry.raw_landmarks()
     sizes = {m.size_m for m in given.landmarks.values() if m.size_m > 0.0} if given is not None else set()
-    changes = {
-        "dictionary": dictionary or markers.dictionary or (given.dictionary if given is not None else None) or None,
-        "default_size_m": size or markers.default_size_m or (sizes.pop() if len(sizes) == 1 else None),
-    }
-    return settings.model_copy(update={"markers": markers.model_copy(update=changes)})
+    dictionary = dictionary or markers.dictionary(settings) or (given.dictionary if given is not None else None) or None
+    size = size or markers.size(settings) or (sizes.pop() if len(sizes) == 1 else None)
+    return markers.given(settings, dictionary, size)
 
 
 def _distance(text: str) -> Distance:

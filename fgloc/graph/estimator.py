@@ -108,7 +108,7 @@ class Estimator(ABC):
             stamp_ns: time of the keyframe.
             dt: time since the one before [s].
             motions: between-factors from the one before; at least one.
-            sightings: landmark measurements carried to this keyframe.
+            sightings: landmark measurements, motion-compensated to this keyframe.
             rejected: sightings that are only logged, for the cost of the batch.
             predicted: result of `predict` for these motions, if the caller has it already.
         """

@@ -153,7 +153,7 @@ def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFa
 
 
 class LandmarkFactors:
-    """What sightings say: of a known map as residuals by pose and installation, of an unknown one as factors.
+    """Residuals of sightings: of a known map as residuals by pose and installation, of an unknown one as factors.
 
     Attributes:
         installation: the parameters beside the pose.

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from fgloc.config import Config
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole
-from fgloc.types import FloatArray, Landmark, LandmarkMap
+from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
 SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
@@ -88,6 +89,14 @@ class Installation:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @cached_property
+    def motion_rows(self) -> IntArray:
+        """Rows of the parameters that are of no sighting: neither of a landmark nor of what sees it."""
+        of_sightings = {
+            first + i for first, count in (*self.blocks.values(), *self.landmarks.values()) for i in range(count)
+        }
+        return np.array([i for i in range(len(self)) if i not in of_sightings], dtype=np.int64)
 
     def prior(self) -> InstallationEstimate:
         """Before anything was measured."""

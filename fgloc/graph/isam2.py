@@ -98,7 +98,7 @@ class IncrementalEstimator(Estimator):
         newest.belief = self._replayed([*window, newest], newest.belief)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
-        """Where to linearize: at the prediction or, far from linear, at what it and the sightings make likeliest."""
+        """Where to linearize: at the prediction or, far from linear, at the most probable pose with the sightings."""
         if not frame.sightings or not self.factors.known:
             return frame.belief
         known = frame.belief.installation or self.installed

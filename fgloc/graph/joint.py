@@ -136,7 +136,7 @@ def correct(
     measurements: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
 ) -> tuple[PoseWithCovariance, float] | None:
-    """Pose and installation that prediction and sightings make likeliest, by Gauss-Newton.
+    """Most probable pose and installation given prediction and sightings, by Gauss-Newton.
 
     Returns:
         The corrected belief, and the least squared Mahalanobis distance of sightings and prediction together (χ² of as

@@ -28,7 +28,7 @@ class PoseWithCovariance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkFactor:
-    """A landmark measurement as the graph takes it: carried to its keyframe, with its kernel and its factors.
+    """A landmark measurement as the graph takes it: motion-compensated to its keyframe, with kernel and factors.
 
     Factors are immutable and may be held by any number of graphs.
     """

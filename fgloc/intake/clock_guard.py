@@ -1,4 +1,4 @@
-"""Which stamps are right: jumps of the clock are told from single wrong stamps."""
+"""Which stamps are right: jumps of the clock against single wrong stamps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual i
 _CONFIRM_COUNT = 3  # events that agree on a new time ...
 _CONFIRM_NS = 250_000_000  # ... over this span confirm it ...
 _CONFIRM_BACK_NS = 100_000_000  # ... and, of an earlier time, received over this: late messages come in a burst
-_GIVE_UP_NS = 5_000_000_000  # sightings alone confirm after this span that motion sources have fallen silent
+_GIVE_UP_NS = 5_000_000_000  # after this span without motion messages, sightings alone confirm
 _WINDOW_NS = 60_000_000_000  # events within it may agree with each other
 _MAX_SUSPECTS = 1024
 
@@ -29,7 +29,7 @@ class ClockGuard:
     """Sorts events by whether their stamps fit the running clock.
 
     A stamp far ahead of the newest or far behind it is kept in a bounded queue until others agree with it (the clock
-    has jumped, or all sensors were silent) or until one arrives that fits the running clock (then it was a stray).
+    has jumped, or all sensors had a gap) or until one arrives that fits the running clock (then it was a stray).
     Depends on the order of events alone, so that a replay decides as the live run did.
     """
 
@@ -39,7 +39,7 @@ class ClockGuard:
         self._back_ns = int(config.clock_back_s * 1e9)
         self._jump_ns = int(config.clock_jump_s * 1e9)
         self._usual_ns = 0.0  # running mean of the newest stamp's advances
-        self._motion = False  # a motion source has spoken on the running clock
+        self._motion = False  # a motion message has arrived on the running clock
         self._suspects: deque[Event] = deque()
         self._newest_of: dict[str, int] = {}  # by topic, on the running clock
 

@@ -19,7 +19,7 @@ class EventBuffer(Generic[E]):
         self._events: list[E] = []
 
     def insert(self, event: E) -> bool:
-        """Put in order of stamp; False if the topic has said something at this stamp already."""
+        """Put in order of stamp; False if the topic has a message of this stamp already."""
         stamp = event.stamp_ns
         if not self.stamps or stamp > self.stamps[-1]:
             self.stamps.append(stamp)

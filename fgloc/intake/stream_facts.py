@@ -91,13 +91,13 @@ class RecordingFacts:
 
 
 def first_events(recording: Recording) -> dict[type[Event], Event]:
-    """The first event of each kind, from as far into the recording as it takes for every topic to speak."""
+    """The first event of each kind, from as far into the recording as it takes for every topic to have a message."""
     found: dict[type[Event], Event] = {}
-    silent = set(recording.roles.values())
+    missing = set(recording.roles.values())
     for event in recording.events():
         found.setdefault(type(event), event)
-        silent.discard(event.topic)
-        if not silent:
+        missing.discard(event.topic)
+        if not missing:
             break
     return found
 

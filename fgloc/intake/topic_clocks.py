@@ -11,7 +11,7 @@ _RESET_NS = 5_000_000_000  # a topic's delay that changes by more is not the net
 _COUNT = 3  # messages that agree on the new delay, before ...
 _SPAN_NS = 200_000_000  # ... this long after the first of them another topic comes as usual: not just its last ones
 _AGREE_NS = 500_000_000  # how much their delays may differ
-_ALIVE_NS = 2_000_000_000  # a topic silent for longer bears no witness
+_ALIVE_NS = 2_000_000_000  # a topic without messages for longer is no reference
 _PATIENCE_NS = 3_000_000_000  # for how long messages are held back
 _SHARE = 0.1  # of a new delay in the mean
 _STAMPED = (MotionEvent, RawEvent, SightingsEvent)
@@ -131,7 +131,7 @@ class TopicClocks:
         return released
 
     def _all_jumped(self, now_ns: int) -> bool:
-        """Whether every topic that speaks is held back."""
+        """Whether every topic that has messages is held back."""
         return all(c.held for c in self._clocks.values() if now_ns - c.received_ns < _ALIVE_NS)
 
     def _jump(self) -> Iterator[Event]:

@@ -36,7 +36,7 @@ class EventValidator:
     An event comes back as it was, or as a repaired copy, or not at all (None). Repairs:
 
     - A nearly unit quaternion is normalised; a nearly symmetric covariance is made symmetric.
-    - A covariance that says nothing (a zero, NaN or absurdly large variance where one is needed) becomes all zeros:
+    - A covariance without meaning (a zero, NaN or absurdly large variance where one is needed) becomes all zeros:
       "use the configured default". The odometry's is judged by x, y, yaw, the others' whole.
     - A part that cannot be used is NaN in the copy and the rest is kept. Odometry: ``position`` and ``orientation``, or
       ``linear`` and ``angular``. Joints: single entries of ``position``, ``velocity``, ``effort``. IMU:

@@ -1,4 +1,4 @@
-"""What poses are carried on from: a keyframe's estimate, and the motion sources as they were then."""
+"""What poses are propagated from: a keyframe's estimate, and the motion sources as they were then."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, RateSensor
-from fgloc.types import Estimate, FloatArray, IntArray, Mode, Step
+from fgloc.types import Estimate, FloatArray, Mode, Step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +31,7 @@ class MotionParts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
-    """A keyframe to carry on from. Can be pickled."""
+    """A keyframe to propagate from. Can be pickled."""
 
     segment: int
     stamp_ns: int
@@ -72,7 +72,7 @@ class Anchors:
         """Take the parts of the run."""
         installation = parts.localizer.factors.installation
         self._run = parts
-        self._rows = _rows_of_motion(installation)
+        self._rows = installation.motion_rows
         sigmas = {installation.names[i]: float(installation.sigmas[i]) for i in self._rows}
         sources = parts.localizer.motion.sources
         model = None if parts.learned is None else parts.learned.model
@@ -112,15 +112,6 @@ class Anchors:
 
     def _belief_of_motion(self, known: InstallationEstimate) -> InstallationEstimate:
         return InstallationEstimate(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])
-
-
-def _rows_of_motion(installation: Installation) -> IntArray:
-    """Rows of the parameters that are of no sighting: neither of a landmark nor of what sees it."""
-    of_sightings = {
-        first + i for first, count in (*installation.blocks.values(), *installation.landmarks.values())
-        for i in range(count)
-    }  # fmt: skip
-    return np.array([i for i in range(len(installation)) if i not in of_sightings], dtype=np.int64)
 
 
 def _without_model(learned: MotionPredictor) -> MotionPredictor:

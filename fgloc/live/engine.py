@@ -28,7 +28,7 @@ class Engine:
     Attributes:
         busy: held while the run is used; take it to look into the run.
         changed: guards the queues and the counters; notified of every change.
-        dropped: events that were not used whatever they say, by role; images are counted by the worker.
+        dropped: events that were not used whatever is in them, by role; images are counted by the worker.
         notes: what the user should know, one sentence each.
         step_s, longest_s: wall time of an update: mean of the last ones, and the longest.
     """

@@ -1,4 +1,4 @@
-"""Poses between and beyond keyframes: the newest estimate, carried on by the motion sources as the estimator would."""
+"""Poses between and beyond keyframes: the newest estimate, propagated by the motion sources as the estimator would."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionSens
 from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
-HISTORY_S = 5.0  # poses further back than this are not told
+HISTORY_S = 5.0  # poses further back than this are not given
 _BEFORE_NS = 500_000_000  # motion events this long before a keyframe tell how it was moving then
 _PIECE_NS = 1_000_000_000  # motion models are made for steps up to this
 _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of the motion since
@@ -38,7 +38,7 @@ _MOST_EVENTS = 8192  # of one kind
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Means:
-    """What all anchors of one building of the parts are carried on by."""
+    """What all anchors of one building of the parts are propagated by."""
 
     joint: ErrorCorrelation | None
     model: Any
@@ -105,7 +105,7 @@ class Extrapolator:
                 del events[: _MOST_EVENTS // 2]
 
     def anchor(self, anchor: Anchor) -> None:
-        """Carry on from here."""
+        """Propagate from here."""
         with self._lock:
             assert self._means is not None
             if anchor.segment != self._segment:

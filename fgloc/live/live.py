@@ -93,7 +93,7 @@ class Live(EventMaker):
 
         Args:
             event: any that a recording has.
-            publisher: tells publishers of one topic apart; only the first is used, until it has been silent for 1 s.
+            publisher: tells publishers of one topic apart; only the first is used, until it has sent nothing for 1 s.
 
         Returns:
             What is used from now on: mostly the event itself; with a corrected stamp if the topic's clock was reset;
@@ -113,7 +113,7 @@ class Live(EventMaker):
         return tuple(used)
 
     def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = (0.5, 0.5, 0.26)) -> None:
-        """Go on from a pose that somebody tells: x, y [m], yaw [rad] in the map, and their sigmas.
+        """Go on from a given pose: x, y [m], yaw [rad] in the map, and their sigmas.
 
         Sightings that contradict it win: the robot is then found again on the map.
 
@@ -135,7 +135,7 @@ class Live(EventMaker):
     # --- out ---
 
     def pose_at(self, stamp_ns: int | None = None) -> LivePose | None:
-        """The pose at a time, carried on from the last keyframe before it by the motion sources.
+        """The pose at a time, propagated from the last keyframe before it by the motion sources.
 
         Args:
             stamp_ns: up to 5 s back; None: the newest that is known.

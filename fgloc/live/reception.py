@@ -15,7 +15,9 @@ from fgloc.live.status import TopicMeter, TopicStatus
 from fgloc.types import Event, MotionEvent, TransformEvent
 
 _SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
-_SUCCESSION_NS = 1_000_000_000  # a publisher silent for this long has ended; another one of the topic is used
+_SUCCESSION_NS = (
+    1_000_000_000  # a publisher that sends nothing for this long has ended; another one of the topic is used
+)
 
 
 @dataclass(slots=True)
@@ -37,7 +39,7 @@ class Reception:
     """Takes every event as it arrives; used under the lock of its owner.
 
     Attributes:
-        dropped: events that are not used whatever they say, by role.
+        dropped: events that are not used whatever is in them, by role.
     """
 
     def __init__(self, config: Config) -> None:
@@ -88,12 +90,12 @@ class Reception:
     def notes(self) -> tuple[str, ...]:
         """What the user should know so far, one sentence each."""
         newest = max((meter.last_ns for meter in self._meters.values()), default=0)
-        silent = [
-            f"{topic}: silent for {(newest - meter.last_ns) * 1e-9:.0f} s"
+        gaps = [
+            f"{topic}: no message for {(newest - meter.last_ns) * 1e-9:.0f} s"
             for topic, meter in sorted(self._meters.items())
             if meter.is_regular and newest - meter.last_ns > _SILENT_NS
         ]
-        return (*self._notes, *self._clocks.notes, *silent)
+        return (*self._notes, *self._clocks.notes, *gaps)
 
 
 def role_of(event: Event) -> str:

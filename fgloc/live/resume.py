@@ -36,7 +36,7 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
         state: what the last run saved.
         step: the first one.
         config: error model of the odometer.
-        wall_ns: wall clock at the step; tells the time away if the stamps' clock was set back.
+        wall_ns: wall clock at the step; gives the time away if the stamps' clock was set back.
 
     Returns:
         The pose, or None if too little is known of it; and a sentence on what was done.
@@ -49,9 +49,9 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
     saved = PoseWithCovariance(np.array(state.pose), np.array(state.cov))
     motion = _by_odometry(state, step, gap_s)
     if motion is not None:
-        cov, how = _odometry_cov(state, motion, gap_s, config), "the odometry went on and tells the motion since"
+        cov, how = _odometry_cov(state, motion, gap_s, config), "the odometry went on and has measured the motion since"
     else:
-        motion, how = np.zeros(3), "nothing tells the motion since"
+        motion, how = np.zeros(3), "nothing has measured the motion since"
         speed, turn = max(state.fastest[0], _LEAST_SPEED), max(state.fastest[1], _LEAST_TURN)
         cov = np.diag(np.square([speed * gap_s, speed * gap_s, turn * gap_s]) + 1e-9)
     ad = se2.adjoint(se2.inverse(motion))

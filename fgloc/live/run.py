@@ -140,7 +140,7 @@ class OnlineRun:
         return estimate
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
-        """To carry the newest estimate on from; ask before the next event is used."""
+        """To propagate the newest estimate from; ask before the next event is used."""
         assert self.anchors is not None
         return self.anchors.make(step, estimate)
 

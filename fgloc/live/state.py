@@ -25,7 +25,7 @@ Row3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class OdometryState(Section):
-    """The odometry's own pose at a time: while its frame goes on, it tells the motion while nothing listened."""
+    """The odometry's own pose at a time: while its frame goes on, it has measured the motion in between."""
 
     topic: str
     frame_id: str

@@ -1,4 +1,4 @@
-"""What a live run tells: poses between keyframes, and how it fares."""
+"""What a live run gives: poses between keyframes, and how it fares."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from fgloc.types import FloatArray, Ground, Mode
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePose:
-    """``T_map_base`` at any time: of the last keyframe at or before it, carried on by the motion sources."""
+    """``T_map_base`` at any time: of the last keyframe at or before it, propagated by the motion sources."""
 
     stamp_ns: int
     pose: FloatArray  # (3,)
     cov: FloatArray  # (3, 3) in the map frame
     mode: Mode
-    keyframe_ns: int  # stamp of the keyframe that it was carried from
+    keyframe_ns: int  # stamp of the keyframe that it was propagated from
     ground: Ground | None = None  # height, roll and pitch; None: the floor is flat
 
 
@@ -44,7 +44,7 @@ class LiveStatus:
     queued_events: int = 0
     queued_images: int = 0
     topics: Mapping[str, TopicStatus] = field(default_factory=dict)
-    dropped: Mapping[str, int] = field(default_factory=dict)  # by role: for overload, not for what they said
+    dropped: Mapping[str, int] = field(default_factory=dict)  # by role: for overload, not for their contents
     rejections: Mapping[str, int] = field(default_factory=dict)  # by "sensor.reason", as in reports
     waiting_for: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # what is wrong, one sentence each

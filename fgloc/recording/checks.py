@@ -1,7 +1,7 @@
 """What looks wrong in a recording: one collector for each role, each finding one sentence with its remedy.
 
 The gate rejects bad items one by one while a run goes on; here the same faults are looked for in the whole recording
-beforehand, so that the user hears of a wrong clock or of a spiking twist before trusting a result. Those of sensors
+beforehand, so that a wrong clock or a spiking twist is known before a result is used. Those of sensors
 come with them; here are those of the calibration and the truth.
 """
 

@@ -117,7 +117,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     roles, found = recording.roles, []
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
-        found.append("No odometry, joint states or commands: nothing tells how the robot moves.")
+        found.append("No odometry, joint states or commands: nothing measures how the robot moves.")
     if not unsettled and not roles.keys() - _NO_PLACE:
         found.append("No images and no marker sightings: nothing bounds the drift.")
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
@@ -142,7 +142,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
 
 
 def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: bool) -> list[str]:
-    """Whether tf tells where the sensor sits."""
+    """Whether tf has the place of the sensor."""
     if frame.lstrip("/") in bases and not camera:
         return []
     base = next((name for name in bases if name in recording.frames), bases[0])
@@ -155,7 +155,7 @@ def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: 
 
 
 def _base_names(config: Config, child_frame_id: str) -> tuple[str, ...]:
-    """Frames that may be the robot's base, the likeliest first."""
+    """Frames that may be the robot's base, the most probable first."""
     if config.recording.base_frame is not None:
         return (config.recording.base_frame,)
     return tuple(dict.fromkeys(name for name in (*BASE_NAMES, child_frame_id) if name))

@@ -1,4 +1,4 @@
-"""What an external positioning system says of the robot's base."""
+"""Poses of the robot's base by an external positioning system."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:
 
 
 def true_slips(recording: Recording) -> IntArray:
-    """Stamps ``(n, 2)`` between which a wheel truly slipped, as a simulator told; none in other recordings."""
+    """Stamps ``(n, 2)`` between which a wheel truly slipped, as a simulator recorded; none in other recordings."""
     spans: list[list[int]] = []
     slipping = False
     for topic, message_type, received_ns, raw in recording.messages({SLIPPING_TOPIC}):

@@ -26,7 +26,7 @@ _MAX_HYPOTHESES = 96  # four rings; the unlikeliest go first
 _MAX_SIGHTINGS = 8  # of one step
 _OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
 _UNIFORM = 1.0 / (2.0 * math.pi * 10.0)  # ... which may be seen in any direction [1/rad] and up to 10 m away [1/m]
-_NEGLIGIBLE = 12.0  # in log weight: less likely than e^-12 of the likeliest
+_NEGLIGIBLE = 12.0  # in log weight: less probable than e^-12 of the most probable
 _AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
 _SAME = np.array([0.05, 0.05, 0.03])  # m, m, rad: two hypotheses this near are one
 

@@ -52,7 +52,7 @@ class InitialPose:
         steps: what was collected, oldest first; the first one's motions are to be ignored.
         first: weak prior for the oldest step, to be followed by all its sightings.
         newest: pose at the newest step with the covariance that the sightings give.
-        by_sensors: told by registered sensors alone.
+        by_sensors: from registered sensors alone.
     """
 
     steps: tuple[SearchStep, ...]
@@ -148,7 +148,7 @@ class GlobalSearch:
         return True
 
     def give_up(self) -> InitialPose | None:
-        """The segment is over: all its steps, from the likeliest place; None if none are kept.
+        """The segment is over: all its steps, from the most probable place; None if none are kept.
 
         Without any sighting the first pose is put at the map's origin, and the others are relative to it.
         """

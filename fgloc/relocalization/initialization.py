@@ -76,7 +76,7 @@ class Initialization:
     def add(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
         """Take in a step while the pose is looked for; the estimate of it, if there is one by now."""
         if self._prior is not None:
-            prior, self._prior = self._prior, None  # it says nothing of where the robot is once it got lost
+            prior, self._prior = self._prior, None  # it does not hold once the robot got lost
             self._tracking.start_known()
             return self._start(step, prior, sightings)
         motions = self._motion.combine(step, readings)
@@ -103,16 +103,16 @@ class Initialization:
         estimate = self._start(step, place, ())
         return replace(estimate, decisions=(*decisions, *estimate.decisions))
 
-    def finish(self, blind: bool = False) -> list[Estimate]:
-        """The segment is over: if its first pose was never found, start from the likeliest place.
+    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
+        """The segment is over: if its first pose was never found, start from the most probable place.
 
         Args:
-            blind: no sensor was there that could have seen a landmark: then the map's origin is as likely as any place.
+            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
 
         Returns:
             The estimates of its steps; none if there is nothing to make up for.
         """
-        found = self._tracking.give_up(blind)
+        found = self._tracking.give_up(no_landmark_sensor)
         if found is None:
             return []
         first, mode = self._estimator.k + 1, Mode.LOST if self._tracking.lost else Mode.UNCONFIRMED

@@ -166,7 +166,7 @@ def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[Lan
 
 
 def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
-    """Whether registered sensors alone have told of a place for most of a time."""
+    """Whether a place follows from registered sensors alone for most of a time."""
     stamps = [m.stamp_ns for m in sightings]
     by_sensors = all(isinstance(m, PoseMeasurement) for m in sightings)
     return bool(stamps) and by_sensors and max(stamps) - min(stamps) > _LASTING * window_ns

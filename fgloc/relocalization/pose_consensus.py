@@ -23,7 +23,7 @@ _WHOLE_SHARE = 0.8  # a place that explains less takes a better fit, and has to 
 _PARTIAL_COST_PER_DOF = 1.5
 _PARTIAL_SIGMA = np.array([0.1, 0.1, 0.1])  # m, m, rad
 # Positions and ranges tell the yaw by the motion alone: over a short way their fit has several minima, and the sigma of
-# one of them says little. At 0.1 rad the way is ten times as long as the positions are uncertain.
+# one of them constrains the pose little. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SENSORS_SIGMA = np.array([1.0, 1.0, 0.1])  # m, m, rad
 REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 
@@ -46,7 +46,7 @@ class PoseConsensus:
     agreeing: frozenset[int]  # landmarks that it explains ...
     outlier_landmarks: frozenset[int]  # ... and those that it does not
     outliers: frozenset[SightingKey]  # sightings that it does not
-    by_sensors: bool = False  # told by registered sensors alone ...
+    by_sensors: bool = False  # from registered sensors alone ...
     lasting: bool = False  # ... over as long as is collected
 
     @property

@@ -96,10 +96,10 @@ class Recorder:
         return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED, rows)
 
     def never_confirmed(self, estimates: Sequence[Estimate], frames: Sequence[Keyframe], mode: Mode) -> list[Estimate]:
-        """Estimates of a segment whose first pose was never found, in the mode that says so.
+        """Estimates of a segment whose first pose was never found, in the mode for it.
 
         Args:
-            estimates: as recorded from the likeliest place on.
+            estimates: as recorded from the most probable place on.
             frames: their keyframes.
             mode: ``UNCONFIRMED``; or ``LOST``, with a covariance that allows for the whole map.
         """

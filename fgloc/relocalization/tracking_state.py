@@ -215,16 +215,16 @@ class Tracking:
         self._reported = True
         return belief
 
-    def give_up(self, blind: bool) -> InitialPose | None:
+    def give_up(self, no_landmark_sensor: bool) -> InitialPose | None:
         """The segment is over, and its first pose was not found: what is to be replayed, and from where.
 
         Args:
-            blind: nothing could have been seen, so that the map's origin does as well as any place.
+            no_landmark_sensor: nothing could have been seen: the map's origin is as probable as any place.
         """
         if not self.initializing or self.lost:
             return None
         belief = self._search.hypotheses.belief()
-        start = self._search.give_up() if blind or belief is not None else None
+        start = self._search.give_up() if no_landmark_sensor or belief is not None else None
         if start is not None and (belief is None or self.is_unlocalized(belief)):
             self._never_found = True
             self.get_lost()

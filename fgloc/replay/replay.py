@@ -39,7 +39,7 @@ class Replay:
         self._first_ns: int | None = None
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
-        self.blind = True  # no image and no sighting was recorded, not even an unusable one
+        self.no_landmark_sensor = True  # no image and no sighting was recorded, not even an unusable one
         self.activity = TopicActivity(recording.roles)
         self.clocks = TopicClocks()
         self.truth = TruthTrack(parts.config.truth, parts.config.gate.clock_back_s)
@@ -82,7 +82,7 @@ class Replay:
         self.decisions.extend(estimate.decisions)
 
     def make_up(self, estimates: list[Estimate]) -> None:
-        """Note what only the end of the run made possible; it replaces nothing that was told before."""
+        """Note what only the end of the run made possible; it replaces nothing that was reported before."""
         self.decisions.extend(d for estimate in estimates for d in estimate.decisions)
         if not self.estimates:
             self.estimates = estimates
@@ -107,7 +107,9 @@ class Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
-            self.blind = self.blind and not isinstance(event, RawEvent | SightingsEvent | SensorEvent)
+            self.no_landmark_sensor = self.no_landmark_sensor and not isinstance(
+                event, RawEvent | SightingsEvent | SensorEvent
+            )
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)

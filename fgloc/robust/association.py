@@ -24,7 +24,7 @@ from fgloc.types import (
 )
 
 REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
-# Sightings of one step whose agreement is searched, the likeliest: more than an image shows come in a burst.
+# Sightings of one step whose agreement is searched, those of the least NIS: more than an image shows come in a burst.
 # The others are held against what these agree on. The work grows with the square.
 _MOST_JOINT = 16
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
@@ -144,10 +144,10 @@ class Association:
     def nearby_consensus(
         self, rejected: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
     ) -> Fit | None:
-        """The place nearby that rejected sightings agree on, if they are of two landmarks or more and leave no doubt.
+        """The place nearby that rejected sightings agree on, if they are of two landmarks or more and are unambiguous.
 
-        Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their refusal
-        is taken back.
+        Then it is the prediction that was wrong (a wheel slipped, say), not each of them in the same way. Their
+        rejection is taken back.
         """
         gated = [s for s, d in zip(rejected, decisions, strict=True) if d.reason == "gate"]
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
@@ -196,17 +196,17 @@ class Association:
     ) -> list[tuple[float, int, str]]:
         """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
 
-        Between as many as that, those that the prediction finds likeliest.
+        Between as many as that, those of the least NIS.
 
         Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
         """
         rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
-        likeliest = rows if len(rows) <= _MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:_MOST_JOINT]
-        if len(rows) < 2 or (likeliest is rows and self._compatible(rows, measurements, predicted)):
+        candidates = rows if len(rows) <= _MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:_MOST_JOINT]
+        if len(rows) < 2 or (candidates is rows and self._compatible(rows, measurements, predicted)):
             return judged
-        most = self._largest_agreeing(likeliest, measurements, predicted)
-        if likeliest is not rows and most:
-            others = [i for i in rows if i not in likeliest]
+        most = self._largest_agreeing(candidates, measurements, predicted)
+        if candidates is not rows and most:
+            others = [i for i in rows if i not in candidates]
             most = [*most, *self._agreeing_with(most, others, measurements, predicted)[1]]
         return [
             (nis, dof, reason or ("" if i in most or not most else "contradicts_others"))

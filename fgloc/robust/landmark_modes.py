@@ -58,7 +58,7 @@ class LandmarkModes:
         self._ids, self._places = np.zeros(n, dtype=np.int64), np.full((n, 2), np.inf)
         self._M = np.zeros((n, 3 + len(factors.installation), 2))
         self._moved, self._cov = np.zeros((n, 2)), np.zeros((n, 2, 2))  # δ
-        self._evidence = np.zeros((n, n))  # for each hypothesis, by the landmark whose sightings say so
+        self._evidence = np.zeros((n, n))  # for each hypothesis, by the landmark whose sightings support it
         self._seen, self._explained = np.zeros((n, n)), np.zeros(n)  # sightings of each; those of itself that fit δ
         self._last_ns: dict[int, int] = {}
         self.displacements: dict[int, FloatArray] = {}
@@ -162,7 +162,7 @@ class LandmarkModes:
     def _take(
         self, predicted: PoseWithCovariance, belief: PoseWithCovariance, seen: Sequence[LandmarkMeasurement]
     ) -> None:
-        """Sightings that were fused: what they say, linear about the belief after them, and what they do to M."""
+        """Sightings that were fused: their residuals, linear about the belief after them, and what they do to M."""
         known, theta = self._known(predicted), self._known(belief).mean
         lines = self._factors.observe(seen).linearize(belief.pose, theta)
         if any(one.behind for one in lines):
@@ -245,7 +245,7 @@ class LandmarkModes:
         return math.sqrt(max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 1e-3)))
 
     def _certain(self) -> int | None:
-        """A landmark that was moved, with no doubt that it was this one."""
+        """A landmark that was moved, if no other one explains the sightings."""
         evidence = self._evidence.sum(1)
         for row in np.argsort(-evidence):
             if evidence[row] < ALARM:

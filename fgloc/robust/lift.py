@@ -1,13 +1,13 @@
 """Whether the robot was lifted or pushed: signs of it in accelerometer, gyro and wheels, and what then is known.
 
-Wheels that hang in the air or stand still say nothing of where the robot is carried. Two tests look for it; each has at
+Wheels that hang in the air or stand do not measure where the robot is carried. Two tests look for it; each has at
 most one false alarm an hour where its errors are normal (Bonferroni over steps and windows):
 
 - *vertical velocity*: the magnitude of the specific force, less what is usual, summed over windows of up to a second.
   It does not depend on the tilt. A robot on the floor cannot rise; its standard deviation is that of the run itself.
 - *turned at rest*: the gyro turns although the wheels stand and no command moves them.
 
-A wheel that spins while gyro and accelerometer show rest may as well slip; `MotionFaultMonitor` tells that.
+A wheel that spins while gyro and accelerometer show rest may as well slip; `MotionFaultMonitor` detects that.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _STANDS_NS = 1_000_000_000  # how long no command has moved the robot before its
 _STANDS_M, _STANDS_RAD = 1e-3, 1e-3  # motion of standing wheels in a second: quantization
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
 _CARRIED_SPEED = 0.7  # m/s: sigma of each axis; a person walks at 1 m/s
-_CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro tells the turn
+_CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro measures the turn
 _ONSET_S = 0.5  # from the start of a lift to its alarm
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
 _LONGEST_S = 10.0  # ... and without sightings it has been set down by then
@@ -48,7 +48,7 @@ class LiftMonitor:
         self.carried = False
         self._rise = _RiseTest()
         self._turn = _TurnTest()
-        self._since_fix_s = 0.0  # time in the air since a sighting has told the pose
+        self._since_fix_s = 0.0  # time in the air since a sighting has fixed the pose
         self._quiet_s = 0.0  # since the last sign
 
     def observe(self, k: int, step: Step, readings: MotionReadings) -> list[Decision]:
@@ -93,7 +93,7 @@ class LiftMonitor:
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
 
     def fix(self) -> None:
-        """Sightings have told the pose."""
+        """Sightings have fixed the pose."""
         self._since_fix_s = 0.0
         if self._quiet_s > _SETTLED_S:
             self.carried = False
@@ -151,7 +151,7 @@ class _RiseTest:
 
 
 class _TurnTest:
-    """The turn of a robot whose wheels stand and that was told to stand."""
+    """The turn of a robot whose wheels stand and that is commanded to stand."""
 
     def __init__(self) -> None:
         self._turned = self._variance = 0.0

@@ -88,7 +88,7 @@ class MotionJudge:
         self._faults.reset()
 
     def read(self, step: Step, since_fix_s: float) -> MotionReadings:
-        """Ask every source once; a silent one yields nothing.
+        """Read every source once; one without data yields nothing.
 
         Args:
             step: the newest one.

@@ -65,7 +65,7 @@ class MotionSources:
         return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
 
     def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
-        """Ask every source once.
+        """Read every source once.
 
         Args:
             step: its events.

@@ -61,8 +61,8 @@ def _explained_otherwise(
 ) -> tuple[PoseMeasurement, tuple[float, int, str]]:
     """The first alternative of a rejected measurement that the gate accepts; else the measurement itself.
 
-    Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the likeliest component
-    of a mixture stands for all of it; here the gate decides which.
+    Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the most probable
+    component of a mixture stands for all of it; here the gate decides which.
     """
     if verdict[2] in ("gate", "biased"):
         for other in m.alternatives(predicted.pose):

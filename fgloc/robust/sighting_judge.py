@@ -49,7 +49,7 @@ class JudgedSightings:
 
     @property
     def observes_yaw(self) -> bool:
-        """Whether any accepted one tells the yaw by itself."""
+        """Whether any accepted one determines the yaw by itself."""
         return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.observes_yaw for s in self.accepted)
 
     def dropped(self, reason: str) -> JudgedSightings:

@@ -53,17 +53,16 @@ def source_difference(readings: MotionReadings, sources: MotionSources) -> Diffe
 
 
 def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFactors) -> tuple[FloatArray, FloatArray]:
-    """Derivative ``(3, p)`` of ``b`` less ``a`` by the parameters of the sources, and their covariance."""
-    index = factors.installation.index
-    names = sorted({**a.depends_on, **b.depends_on}, key=_is_clock)
-    D = np.zeros((3, len(names)))
-    for i, name in enumerate(names):
+    """Derivative ``(3, p)`` of ``b`` less ``a`` by all parameters that are not of sightings, and their covariance.
+
+    By all: steps are summed although the reference source may be another one in each.
+    """
+    installation = factors.installation
+    rows = installation.motion_rows
+    D = np.zeros((3, len(rows)))
+    for i, row in enumerate(rows):
+        name = installation.names[row]
         for m, sign in ((a, -1.0), (b, 1.0)):
             if name in m.depends_on:
                 D[:, i] += sign * m.depends_on[name][0]
-    rows = [index[name] for name in names]
     return D, factors.estimated.cov[np.ix_(rows, rows)]
-
-
-def _is_clock(parameter: str) -> bool:
-    return parameter.endswith(".time_offset_s")

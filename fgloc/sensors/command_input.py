@@ -7,7 +7,7 @@ from fgloc.types import ControlEvent
 
 
 class CommandInput(EventInput):
-    """What the robot is told to do."""
+    """What the robot is commanded."""
 
     def command(self, stamp_ns: int, v: float, omega: float) -> None:
         """Forward speed [m/s] and yaw rate [rad/s] that the robot was commanded."""

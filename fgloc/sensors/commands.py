@@ -1,4 +1,4 @@
-"""Control inputs: what the robot was told to do. Wheels and learned motion read them."""
+"""Control inputs: the commanded velocity. Wheels and learned motion read them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class CommandChecks:
 
 
 def carried(carriage: Carriage) -> Callable[[Event], Event]:
-    """In the air the wheels are told to stand, or to spin."""
+    """In the air the wheels are commanded to stand, or to spin."""
 
     def tell(event: Event) -> Event:
         assert isinstance(event, ControlEvent)

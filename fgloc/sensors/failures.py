@@ -210,7 +210,7 @@ def by_receipt(events: Iterator[tuple[int, Event]]) -> Iterator[Event]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carriage:
-    """How a robot is carried: each sensor says what it then measures (`BuiltIn.carried`).
+    """How a robot is carried: each sensor defines what it then measures (`BuiltIn.carried`).
 
     Attributes:
         intervals: from when until when it is in the air [s].

@@ -102,7 +102,7 @@ class SightingContext:
 class LandmarkSensor:
     """Turns sightings into measurements, by the sensor that they are of.
 
-    Two sightings of one id in one message: both are dropped, as nothing says which one is false.
+    Two sightings of one id in one message: both are dropped, as nothing shows which one is false.
 
     ``rejections`` counts what was not used: "sightings.duplicate_id", ".unknown_id", ".beyond_max" (more markers than
     ``markers.max_sightings``, the smallest go), ".no_size", ".undistortable", ".no_pose", ".range", ".bearing_bound".
@@ -135,7 +135,7 @@ class LandmarkSensor:
         return self._context.camera is not None
 
     def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
-        """What one message says of the landmarks.
+        """What one message measured of the landmarks.
 
         Raises:
             CameraError: marker corners, but no camera.

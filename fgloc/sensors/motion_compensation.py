@@ -79,7 +79,7 @@ def _tilted(seen: Sequence[LandmarkMeasurement], rates: FloatArray, seconds: flo
 
 
 class MotionCompensation:
-    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is heard, the gyro's turn."""
+    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn."""
 
     def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
         """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""

@@ -156,6 +156,7 @@ class RawLandmarksRole:
     Attributes:
         size: of landmarks for which the map gives none [m]; None: not known.
         dictionary: of the landmarks that are detected; None: the map's.
+        given: settings with another dictionary and size; None: as they are.
         ids: how many ids a dictionary has; `ConfigError` where there is none of this name.
         sigma_px: noise of a corner, on each axis.
         detector: of one run; `ConfigError` where settings and map do not say what is to be detected.
@@ -164,6 +165,7 @@ class RawLandmarksRole:
 
     size: Callable[[Config], float | None]
     dictionary: Callable[[Config], str | None]
+    given: Callable[[Config, str | None, float | None], Config]
     ids: Callable[[str], int]
     sigma_px: Callable[[Config], float]
     detector: Callable[[Config, LandmarkMap | None], SensorDetector]

@@ -15,7 +15,7 @@ class DataConfig(Section):
     """How recordings become samples at a fixed time step."""
 
     smoothing_s: float = Field(0.5, gt=0, description="window of the local cubic fit that smooths the truth")
-    max_truth_gap_s: float = Field(0.15, gt=0, description="the samples are cut where the truth is silent for longer")
+    max_truth_gap_s: float = Field(0.15, gt=0, description="the samples are cut where the truth has longer gaps")
     max_sideways_mps: float | None = Field(
         None,
         gt=0,
@@ -27,7 +27,7 @@ class DataConfig(Section):
     )
     margin_s: float = Field(0.5, ge=0, description="left out at both ends")
     history_s: float = Field(3.0, ge=0, description="of commands before the first sample; the model wants less")
-    apart_s: float = Field(10.0, gt=0, description="a recording that falls silent for longer is several runs")
+    apart_s: float = Field(10.0, gt=0, description="a recording with a longer gap is several runs")
     shortest_s: float = Field(10.0, gt=0, description="a recording that is shorter is refused")
 
 

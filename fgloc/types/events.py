@@ -13,7 +13,7 @@ from fgloc.types.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Event:
-    """Something a recording or a live stream said at one time."""
+    """One message of a recording or a live stream."""
 
     stamp_ns: int
     received_ns: int
@@ -51,7 +51,7 @@ class OdometerPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControlEvent(MotionEvent):
-    """Control input: what the robot was told to do. It holds until the next."""
+    """Control input: the commanded velocity. It holds until the next."""
 
     v: float  # m/s, forward
     omega: float  # rad/s, counter-clockwise

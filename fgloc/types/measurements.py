@@ -43,7 +43,7 @@ class MotionMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionReadings:
-    """What each motion source says of one step, as if it were alone; None where it is silent."""
+    """What each motion source measured of one step, as if it were alone; None where it has no data."""
 
     wheels: MotionMeasurement | None = None
     learned: MotionMeasurement | None = None
@@ -125,7 +125,7 @@ class PoseMeasurement(ABC):
     stamp_ns: int
     cov: FloatArray  # (d, d) of the residual
     target: int = -1  # which anchor or beacon was measured, in the sensor's own numbering; -1: none
-    observes_yaw: bool = False  # whether one reading tells the yaw, as a compass does
+    observes_yaw: bool = False  # whether one reading determines the yaw, as a compass does
     cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
     T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
     motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
@@ -143,7 +143,7 @@ class PoseMeasurement(ABC):
         return ()
 
     def alternatives(self, predicted: FloatArray) -> Sequence[PoseMeasurement]:
-        """What else the reading may mean, likeliest first: tried in turn where the chi-square gate refuses this one.
+        """What else the reading may mean, most probable first: tried in turn where the chi-square gate refuses it.
 
         Args:
             predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.

@@ -155,7 +155,7 @@ class Setting:
 
     @property
     def off(self) -> float:
-        """How far what was given and what the measurements alone say are apart, in sigmas of both.
+        """How far what was given and what the measurements alone give are apart, in sigmas of both.
 
         What was found lies between the two, by their sigmas; its expected square distance from the given value is the
         difference of the variances.

@@ -1,6 +1,7 @@
 """Pictures: drawn for every shape of run; large sigmas, LOST stretches and jumps of the clock hide nothing."""
 
 import io
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,8 @@ from run_results import figure_eight
 
 from fgloc.config import Config
 from fgloc.evaluation import style, timeline
+from fgloc.evaluation.html import script_data
+from fgloc.evaluation.interactive import interactive
 from fgloc.evaluation.metrics import match_result
 from fgloc.evaluation.plots import plot_error
 from fgloc.evaluation.time_axis import TimeAxis
@@ -50,6 +53,9 @@ def test_every_picture_is_drawn(change):
     if len(result.trajectory) == 1:
         result = replace(result, modes=(Mode.OK,))
     matched = match_result(result, CONFIG)
+    zoomed = json.loads(script_data(interactive(result, matched)))
+    assert len(zoomed["poses"]["x"]) == len(result.trajectory)
+    assert (zoomed["truth"] is None) == (matched is None)
     for figure in (
         plot_trajectory(result, matched),
         plot_error(result, matched),

@@ -403,7 +403,7 @@ def test_the_status_says_how_the_topics_come_in():
     assert status.topics["/odom"].rate_hz == pytest.approx(20.0, rel=0.05)
     assert status.topics["/tags"].delay_s == pytest.approx(0.04, abs=0.005)
     assert status.topics["/tags"].role == "sightings"
-    assert "/cmd_vel: silent for 4 s" in status.notes
+    assert "/cmd_vel: no message for 4 s" in status.notes
     assert status.mode is Mode.OK
     assert status.running
     assert 0.0 < status.step_ms <= status.step_ms_max

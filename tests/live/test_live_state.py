@@ -62,7 +62,7 @@ def copied(path, tmp_path):
 def test_while_the_odometry_goes_on_it_tells_the_motion_of_the_gap(world, saved, tmp_path):
     blind = [e for e in between(world, GAP[1], 10.0) if e.topic != "/tags"]
     made, notes = resumed(world, copied(saved, tmp_path), blind, roles=("odometry", "command"))
-    assert "the odometry went on and tells the motion since" in notes[0]
+    assert "the odometry went on and has measured the motion since" in notes[0]
     assert errors(world, made[:1])[0] < 0.1
     assert made[0].mode is Mode.OK
     assert nees(made[0], world.truth(made[0].stamp_ns)) < 12.0
@@ -89,7 +89,7 @@ def test_an_odometry_that_was_set_to_zero_tells_nothing(world, saved, tmp_path):
 
     events = [zeroed(e) for e in between(world, GAP[1], 12.0)]
     made, notes = resumed(world, copied(saved, tmp_path), events)
-    assert "nothing tells the motion since" in notes[0]
+    assert "nothing has measured the motion since" in notes[0]
     assert errors(world, made[5:]).max() < 0.1
     assert made[-1].mode is Mode.OK
 

@@ -213,7 +213,7 @@ def test_ambiguity_and_damage_do_not_stop_the_report(tmp_path):
         (("turtlebot3", "rosbag2_2025_11_25-15_11_34"), ("no sighting", "21.0 s")),
         (("turtlebot3", "rosbag2_2025_11_25-14_27_38"), ("yaw rate beyond", "125.6")),
         (("turtlebot3", "rosbag2_2025_11_06-17_25_46"), ("/imu, /joint_states, /odom", "217 ms ahead")),
-        (("marker_images", "ubiquity", "aruco_images.bag"), ("nothing tells how the robot moves",)),
+        (("marker_images", "ubiquity", "aruco_images.bag"), ("nothing measures how the robot moves",)),
     ],
 )
 def test_real_recordings(parts, words):

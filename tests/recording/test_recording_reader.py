@@ -361,4 +361,4 @@ def test_recording_without_messages(tmp_path, kind):
         assert recording.duration_s == 0.0
         assert recording.roles == {}
     info = inspect(path, Config())
-    assert "nothing tells how the robot moves" in format_info(info)
+    assert "nothing measures how the robot moves" in format_info(info)

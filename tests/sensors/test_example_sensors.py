@@ -340,11 +340,20 @@ def test_their_failures_and_the_general_ones_are_ablated(recording, folders, tmp
     assert {run["outcome"] for run in runs.values()} == {"done"}
 
 
-def test_the_gyros_bias_is_not_learned_from_yaws_that_are_its_own(recording, monkeypatch):
-    """Positions tell the yaw along the way only: such a fix says nothing of the bias."""
+def test_the_gyros_bias_is_learned_from_positions_far_apart_only(recording, monkeypatch):
+    """Positions determine the yaw along the way: two of them correct the bias if they are far apart."""
     taught, fix = [], Gyro.fix
-    monkeypatch.setattr(Gyro, "fix", lambda gyro, *told: (taught.append(told), fix(gyro, *told)))
+
+    def spied(gyro, yaw, variance, apart_s=0.0):
+        before = gyro.bias, gyro._turned_s
+        fix(gyro, yaw, variance, apart_s)
+        taught.append((gyro.bias != before[0], before[1], apart_s))
+
+    monkeypatch.setattr(Gyro, "fix", spied)
     config = only(load_config(recording / "robot.yaml"), ["gnss"])
     result = run(recording / "bag", None, config, "online", check=False)
     assert result.counts["gnss"] > 40
-    assert not taught
+    learned = [(turned_s, apart_s) for changed, turned_s, apart_s in taught if changed]
+    assert all(turned_s >= apart_s for turned_s, apart_s in learned)
+    assert all(apart_s > 0.0 for _, _, apart_s in taught)
+    assert len(learned) < 0.2 * len(taught)

@@ -145,6 +145,17 @@ def test_an_uncertain_fix_teaches_nothing():
     assert gyro.bias == 0.0
 
 
+def test_fixes_that_rest_on_the_gyro_teach_its_bias_from_far_apart_only():
+    gyro, bias = Gyro(GyroConfig()), 0.01
+    gyro.fix(0.0, 1e-6, apart_s=8.0)
+    for i in range(100):
+        gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: bias), DRIVING).yaw, 0.1)
+        gyro.fix(0.0, 1e-6, apart_s=8.0)
+        if i < 78:
+            assert gyro.bias == 0.0
+    assert gyro.bias == pytest.approx(bias, abs=1e-3)
+
+
 def test_a_silence_between_two_fixes_teaches_nothing():
     gyro = known(Gyro(GyroConfig()), sigma=0.02)
     gyro.fix(0.0, 1e-6)

@@ -100,7 +100,7 @@ def test_the_gyros_bias_is_known_after_a_rest() -> None:
     heard = TopicTimes(events, Config(wheels=wheels))
     assert heard.gyro_bias(T0) == 0.0
     assert heard.gyro_bias(T0 + 5 * SECOND) == pytest.approx(bias, abs=1e-3)
-    gyro = heard.signals(("gyro",), T0).gyro
+    gyro = heard.signals(("gyro",), T0).named("gyro")
     assert gyro is not None
     np.testing.assert_allclose(gyro.means(np.array([1.5, 2.5, 3.2, 5.5]))[[0, 2], 0], [0.0, 0.5], atol=1e-3)
 

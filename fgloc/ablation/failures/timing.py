@@ -13,7 +13,7 @@ from fgloc.types import Event
 
 
 class Dropout(EventFailure):
-    """A sensor is silent: its messages are lost."""
+    """A sensor has no messages: they are lost."""
 
     kind: Literal["dropout"] = "dropout"
     sensor: Sensor

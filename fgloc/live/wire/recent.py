@@ -60,7 +60,7 @@ class RecentPoses:
         return twist, axes @ np.diag(np.maximum(variances, _LEAST_VARIANCE)) @ axes.T
 
     def ahead(self, stamp_ns: int) -> LivePose | None:
-        """The newest pose, carried on by the twist to a time soon after it; None if there is none soon before."""
+        """The newest pose, propagated by the twist to a time soon after it; None if there is none soon before."""
         if not self._poses or not 0 < stamp_ns - self._poses[-1].stamp_ns <= _AHEAD_NS:
             return None
         last = self._poses[-1]

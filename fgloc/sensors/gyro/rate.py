@@ -49,7 +49,7 @@ class Gyro:
         self._standing_s = 0.0
         self._anchor: tuple[float, float] | None = None  # yaw and variance of the last fix ...
         self._turned = self._turned_s = 0.0  # ... and what was turned since
-        self._heard = False
+        self._received = False
         self.forget_fix()
 
     def fork(self) -> Gyro:
@@ -67,21 +67,21 @@ class Gyro:
 
         Args:
             step: with the IMU's messages.
-            wheels: ``(3,)`` what the wheels say of the step: where they stand, the bias shows.
-            since_fix_s: how long before the step nothing but motion has told the yaw. A wrong bias turns all steps
+            wheels: ``(3,)`` what the wheels measured of the step: where they stand, the bias shows.
+            since_fix_s: how long before the step no fix has determined the yaw. A wrong bias turns all steps
                 alike, so that its variance grows with the square of that time, however it is cut into steps.
 
         Returns:
-            None if the gyro was silent; once it has spoken, that is counted.
+            None without data of the gyro; after its first data, that is counted.
         """
         dt = step.dt
         raw = None if dt <= 0.0 else self._integral(step.inertial, step.start_ns, step.stamp_ns)
         if raw is None:
             self._standing_s = 0.0
-            if self._heard:
+            if self._received:
                 self.rejections["gyro.silence"] += 1
             return None
-        self._heard = True
+        self._received = True
         self.bias_variance += self._config.bias_walk**2 * dt
         self._watch_rest(raw / dt, dt, wheels)
         yaw = raw - self.bias * dt
@@ -125,7 +125,7 @@ class Gyro:
         self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
 
     def forget_fix(self) -> None:
-        """The robot may have been turned unheard since the last fix."""
+        """The robot may have been turned without data since the last fix."""
         self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
 
     def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:

@@ -1,4 +1,4 @@
-"""What a model file says about itself: the JSON in the safetensors header, checked field by field."""
+"""The description of a model in its file: the JSON in the safetensors header, checked field by field."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class Kinematics(Section):
-    """Calibrated kinematics: the robot does what it was told, scaled, later, and drawn to one side by unequal wheels.
+    """Calibrated kinematics: the robot moves as commanded, scaled, later, and drawn to one side by unequal wheels.
 
     The names are those of `fgloc.config.WheelsConfig`; the values were fitted on the training recordings.
     """
@@ -112,7 +112,7 @@ class Split(Section):
 class ModelCard(Section):
     """Everything but the weights.
 
-    ``naive``: the robot does as it is told. A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later: a
+    ``naive``: the robot moves as commanded. A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later: a
     first-order lag plus Δt times a network. ``lag`` has no network, ``arx`` a linear one, ``rate`` no lag: its network
     is the acceleration. A ``displacement`` model maps the mean commands of the age bins ``edges_s`` and whatever else
     ``inputs`` names (means of measured signals over the sub-step and over ages before it, the velocity's innovation) to
@@ -173,7 +173,7 @@ class ModelCard(Section):
         return tuple(name for name in registry.channels() if name in self.inputs)
 
     def reads(self, role: MotionRole) -> bool:
-        """Whether the model reads the motion by a motion source: then it depends on it, and cannot tell its faults."""
+        """Whether the model reads the motion by a motion source: its faults then stay unseen by the model."""
         return any(registry.channels()[name].role == role for name in self.measured)
 
     @property

@@ -1,4 +1,4 @@
-"""The displacement model: the motion over a short time at once, from what was told and measured around it."""
+"""The displacement model: the motion over a short time at once, from what was commanded and measured around it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class DisplacementModel:
     ``velocity_decay_s``); its integral is the displacement. The kinematics are the calibrated commands; wheels that
     are read replace them, and a gyro that is read replaces the yaw rate. Nothing is fed back, so errors do not feed
     themselves.
-    An ensemble answers with its mean, and doubts where its members differ.
+    An ensemble predicts its members' mean; its variance grows where they differ.
     """
 
     def __init__(self, card: ModelCard, network: Answering) -> None:
@@ -103,7 +103,7 @@ class DisplacementModel:
         return means[:n] @ self._gains, x
 
     def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
-        """Let the signals say what they know better than the commands, and hand them to the network."""
+        """Replace what the signals know better than the commands, and hand them to the network."""
         n, at = len(base), self._n_bins
         start = 0.0 if signals is None else (start_ns - signals.origin_ns) * 1e-9
         starts = start + dt * np.arange(n, dtype=np.float64)

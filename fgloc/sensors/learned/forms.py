@@ -55,7 +55,7 @@ class MotionModel(Protocol):
             commands: in order of stamp, from ``card.history_s`` before the start (or the first there is) to the end.
             start_ns: start of the step.
             end_ns: its end.
-            velocity: ``(2,)`` body velocity v, ω at the start, if known. None: what the commands before the start say.
+            velocity: ``(2,)`` body velocity v, ω at the start, if known. None: by the commands before the start.
             signals: what was measured, if the model reads any of it.
 
         Returns:

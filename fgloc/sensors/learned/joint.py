@@ -1,4 +1,4 @@
-"""Two motion measurements with correlated errors, made independent without losing what they say together."""
+"""Two motion measurements with correlated errors, made independent without losing their joint information."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fgloc.errors import CovarianceError
 from fgloc.types import FloatArray, MotionMeasurement
 
 MAX_GAIN = 0.95  # of ‖K‖: nearer to 1 the difference of the two would be blown up
-MAX_CORRELATION = 0.99  # at 1 one of the two would say nothing of its own and its covariance would be singular
+MAX_CORRELATION = 0.99  # at 1 one of the two would add no information and its covariance would be singular
 
 
 class JointCalibration:

@@ -20,12 +20,12 @@ class LearnedMotion:
     """Turns the commands of a step into a `MotionMeasurement` of source "learned".
 
     Between contiguous steps it carries the model's own velocity; a gap or a new segment forgets it, and the model
-    starts from what the commands before the step say.
+    starts from the commands before the step.
 
     Attributes:
         rejections: steps without a measurement, by reason: ``learned.no_commands``, ``learned.stale_commands``,
             ``learned.non_finite``, and ``learned.no_gyro``, ``learned.no_effort`` or ``learned.no_wheels`` where a
-            signal that the model reads was silent.
+            signal that the model reads has a gap.
     """
 
     def __init__(self, model: MotionModel, config: MotionConfig, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
@@ -70,7 +70,7 @@ class LearnedMotion:
             gyro_bias: to be taken out of the IMU's yaw rate [rad/s].
 
         Returns:
-            None if the model is not used or has nothing to say; the reason is counted in `rejections`.
+            None if the model is not used or cannot predict; the reason is counted in `rejections`.
         """
         if not self._use:
             return None

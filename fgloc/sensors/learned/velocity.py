@@ -25,7 +25,7 @@ from fgloc.types import ControlEvent, FloatArray
 
 
 class NaiveModel:
-    """The robot does what it is told: v = u, in the model's kinematics. The baseline."""
+    """The robot moves as commanded: v = u, in the model's kinematics. The baseline."""
 
     def __init__(self, card: ModelCard) -> None:
         """Take a checked card."""

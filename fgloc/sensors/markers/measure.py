@@ -1,4 +1,4 @@
-"""From marker corners to measurements: corners if the marker's place is known, else what a single view says of it."""
+"""From marker corners to measurements: corners if the marker's place is known, else what a single view gives."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CornerMeasurer:
     def _single_view(
         self, event: CornersEvent, seen: MarkerCorners, camera: Camera, landmark: Landmark | None
     ) -> LandmarkSighting | None:
-        """What one view of a marker with no known place says, with the covariance that its corners give."""
+        """What one view of a marker with no known place gives, with the covariance that its corners give."""
         size = self._context.config.markers.default_size_m
         if size is None and landmark is None:
             raise ConfigError(
@@ -93,7 +93,7 @@ class CornerMeasurer:
         floor = self._context.config.landmarks.yaw_sigma_rad
         if floor is None or landmark is not None:
             return self._context.polar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy)
-        # Of a marker that may be mirrored the yaw says little; without it, it would be another kind of variable.
+        # Of a marker that may be mirrored the yaw is worth little; without it, it would be another kind of variable.
         yaw_var = max(floor if clear else _MIRRORED_SIGMA, math.sqrt((R @ cov[3:, 3:] @ R.T)[2, 2])) ** 2
         yaw = planar_yaw(in_base[:3, :3], None)
         return self._context.planar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy, yaw, yaw_var)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from fgloc.sensors.roles import RawLandmarksRole
+from fgloc.sensors.roles import RawLandmarksRole, with_values
 from fgloc.types import LandmarkMap
 
 if TYPE_CHECKING:
@@ -16,6 +16,12 @@ def _detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetecto
     from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
 
     return configured_detector(config, landmark_map)
+
+
+def _given(config: Config, dictionary: str | None, size_m: float | None) -> Config:
+    now = config.markers
+    values = {"dictionary": dictionary or now.dictionary, "default_size_m": size_m or now.default_size_m}
+    return with_values(config, "markers", values)
 
 
 def _ids(dictionary: str) -> int:
@@ -33,6 +39,7 @@ def _fitting_dictionary(recording: Any) -> str | None:
 ROLE = RawLandmarksRole(
     size=lambda config: config.markers.default_size_m,
     dictionary=lambda config: config.markers.dictionary,
+    given=_given,
     ids=_ids,
     sigma_px=lambda config: config.markers.sigma_px,
     detector=_detector,

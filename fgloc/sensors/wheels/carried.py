@@ -83,7 +83,7 @@ class _Held:
     def __init__(self, rate: float, speed: float) -> None:
         self._rate, self._speed = rate, speed  # rad/s, m/s in the air
         self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
-        self._last: FloatArray | None = None  # as told
+        self._last: FloatArray | None = None  # as reported
         self._last_ns = 0
 
     def tell(self, event: JointsEvent | OdometryEvent, lifted: bool) -> JointsEvent | OdometryEvent:

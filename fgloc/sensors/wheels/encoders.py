@@ -12,7 +12,7 @@ from fgloc.sensors.wheels.timeline import Twist
 from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, mean_twist
 from fgloc.types import FloatArray
 
-_PATIENCE = 20  # messages without the wheels' joints before that is said
+_PATIENCE = 20  # messages without the wheels' joints before a note is made
 
 
 class TicksTrack(Track):

@@ -1,4 +1,4 @@
-"""Failures of what the wheels' messages say: frozen, reset, rolled over, not a number, wrong covariance."""
+"""Failures in the contents of the wheels' messages: frozen, reset, rolled over, not a number, wrong covariance."""
 
 from __future__ import annotations
 

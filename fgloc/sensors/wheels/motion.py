@@ -1,4 +1,4 @@
-"""Wheel motion: what the wheels, or what stands in for them, say about a step."""
+"""Wheel motion over a step: by the wheels, or by what replaces them."""
 
 from __future__ import annotations
 

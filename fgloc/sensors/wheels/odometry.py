@@ -81,7 +81,7 @@ class OdometryTrack(Track):
         # Less than the slack is no jump, however short the time: stamps of receipt come in bursts.
         speed = max(math.hypot(dx, dy) - _SLACK_M, 0.0) / seconds
         turn = max(abs(dyaw) - _SLACK_RAD, 0.0) / seconds
-        # Judged by what the twist says or, if that is silent, by the motion just before.
+        # Judged by the twist or, without one, by the motion just before.
         slack = 1.0
         reference = mean if mean is not None and any(mean) else None
         if reference is None:

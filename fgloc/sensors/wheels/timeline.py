@@ -20,7 +20,7 @@ _MAX_TURN = 1.0  # rad: longer arcs are cut, so that the quadrature of the noise
 _SHORT_TURN = 0.1  # rad: below it two nodes do
 _TWO_NODES = ((0.5 - 0.5 / math.sqrt(3.0), 0.5), (0.5 + 0.5 / math.sqrt(3.0), 0.5))  # Gauss-Legendre on [0, 1]
 _THREE_NODES = tuple((0.5 + 0.5 * s * math.sqrt(0.6), w / 18.0) for s, w in ((-1.0, 5.0), (0.0, 8.0), (1.0, 5.0)))
-_SILENT_SPEED = 0.5  # m/s and rad/s that a silent robot is taken to be capable of at least ...
+_UNMEASURED_SPEED = 0.5  # m/s and rad/s that a robot without messages is taken to be capable of at least ...
 _SILENT_TAU_S = 2.0  # ... changing its mind after this time
 _STEADY_NS = 20_000_000  # a speed over less time may be a jitter of stamps
 _FLOOR = 1e-12  # keeps a covariance without any noise positive definite
@@ -43,8 +43,8 @@ class TwistTimeline:
         self._end = 0
         self._tail: Twist = (0.0, 0.0, 0.0)
         self._tail_end = 0
-        self._fastest = _SILENT_SPEED
-        self._fastest_turn = _SILENT_SPEED
+        self._fastest = _UNMEASURED_SPEED
+        self._fastest_turn = _UNMEASURED_SPEED
 
     @property
     def start_ns(self) -> int | None:
@@ -130,7 +130,7 @@ class TwistTimeline:
         at = start_ns
         k = bisect_right(self._starts, at) - 1
         while at < end_ns:
-            if k < 0:  # before anything was heard
+            if k < 0:  # before the first message
                 until = min(self._starts[0], end_ns) if self._starts else end_ns
                 yield at, until, None, start_ns
             elif at < self._end:
