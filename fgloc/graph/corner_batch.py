@@ -82,21 +82,12 @@ class CornerBatch:
         turned = _cross(marker[:, None, 3:], self._local)
         local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
         P = (self._position + marker[:, :3])[:, None] + local @ self._rotation.transpose(0, 2, 1)
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        Rz = np.zeros((n, 3, 3))  # R_map_base
-        Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
+        Rz, tilt = _map_base(poses)
         P[:, :, :2] -= poses[:, None, :2]
-        tilt = None
-        if self._tilting is not None:
+        if tilt is not None:
             P[:, :, 2] -= poses[:, None, 3]
-            tilt = rotations(poses[:, 4:6])
-            Rz = Rz @ tilt  # R_map_base of a base that is not level
         q = P @ Rz
-        flow = np.zeros_like(q)  # of the point in the base frame by a later stamp
-        flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
-        flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
-        if self._tilting is not None:
-            flow += _cross(self._tilting[:, None], q)
+        flow = self._flow(q)
         late = camera[11] - self._offset
         mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
         X = mounted - camera[:3] - _cross(camera[3:6], mounted)
@@ -130,6 +121,13 @@ class CornerBatch:
         self._by_marker(H, B @ Rz.transpose(0, 2, 1)[:, None], local)
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
         return Stacked(residual, J, H, self._columns, behind)
+
+    def _flow(self, q: FloatArray) -> FloatArray:
+        """How points ``(m, 4, 3)`` in the base frame move by a later stamp [m/s]."""
+        flow = np.zeros_like(q)
+        flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
+        flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
+        return flow if self._tilting is None else flow + _cross(self._tilting[:, None], q)
 
     def _by_marker(self, H: FloatArray, M: FloatArray, local: FloatArray) -> None:
         """Fill in derivatives by the marker, from those by a point in the map ``(m, 4, 2, 3)``; 0 what is no state."""
@@ -221,6 +219,15 @@ class CornerBatch:
         if moved is not None:
             common.append(J @ moved)
         return np.hstack(common)
+
+
+def _map_base(poses: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """R_map_base ``(m, 3, 3)`` of poses ``(m, 3)``; of ``(m, 6)`` of a base that is not level, and how it is tilted."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    Rz = np.zeros((len(poses), 3, 3))
+    Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
+    tilt = rotations(poses[:, 4:6]) if poses.shape[1] > 3 else None
+    return (Rz, None) if tilt is None else (Rz @ tilt, tilt)
 
 
 def _by_tilted_pose(B: FloatArray, q: FloatArray, tilt: FloatArray, roll: FloatArray) -> FloatArray:

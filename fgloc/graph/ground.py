@@ -156,15 +156,7 @@ def ground_step(
         ends[0, 1:] *= _kept(motion)
     else:
         cov += by_turn @ by_turn.T * (share * inertial.turn_variance)
-    projected = tuple(
-        replace(
-            m,
-            motion=planar[8 + i],
-            cov=_symmetric(P @ m.cov @ P.T),
-            depends_on={name: (P @ derivative, at) for name, (derivative, at) in m.depends_on.items()},
-        )
-        for i, m in enumerate(motions)
-    )
+    projected = tuple(_projected(m, planar[8 + i], P) for i, m in enumerate(motions))
     turning = None if inertial is None else Turning(measured, by_bias, smooth + inertial.turn_variance)
     D = by_motion @ by_theta + share * by_turn @ by_bias
     return GroundStep(projected, ground, ends[0], A, D, cov, turning)
@@ -184,6 +176,12 @@ def _smooth(motion: FloatArray, turn: FloatArray) -> float:
     way, turned = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
     usual = _SMOOTH_PER_SQRT_M**2 * way + _SMOOTH_PER_SQRT_RAD**2 * turned + _STILL_RAD**2
     return usual + float(turn @ turn)
+
+
+def _projected(m: MotionMeasurement, planar: FloatArray, P: FloatArray) -> MotionMeasurement:
+    """A motion in the plane of the map; ``P (3, 3)``: its derivative by that in the robot's plane."""
+    depends = {name: (P @ derivative, at) for name, (derivative, at) in m.depends_on.items()}
+    return replace(m, motion=planar, cov=_symmetric(P @ m.cov @ P.T), depends_on=depends)
 
 
 def _perturbed(

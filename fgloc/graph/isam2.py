@@ -246,9 +246,8 @@ class IncrementalEstimator(Estimator):
         """The installation with height, roll and pitch of this keyframe, which may not be the newest."""
         if frame.ground is None:
             return known
-        return InstallationEstimate(
-            np.concatenate([known.mean[: self.installation.constants], frame.ground]), known.cov
-        )
+        mean = np.concatenate([known.mean[: self.installation.constants], frame.ground])
+        return InstallationEstimate(mean, known.cov)
 
     def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
         """Give a first value to a landmark that is a variable and not yet in the graph."""
