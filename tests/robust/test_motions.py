@@ -20,7 +20,7 @@ from fgloc.graph.joint import fuse, predict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import NoiseBudget
 from fgloc.robust.decision_log import motion_decisions
-from fgloc.robust.motion_faults import FaultVerdict
+from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
@@ -115,6 +115,23 @@ def test_what_enters_when_a_source_is_not_believed(tmp_path):
     assert names(without) == ["wheels", "gyro"]
     assert without[0] is WHEELS
     assert names(combined(some, all_say, {"gyro": "distrusted"})) == ["wheels", "learned"]
+
+
+def test_the_reference_source_may_change_from_step_to_step(tmp_path):
+    """As at the start of a live run, when the first command comes after the first wheel messages."""
+    installation = Installation({"wheels.radius": 0.01, "gyro.scale": 0.005, "motion.scale": 0.02})
+    settings = Config()
+    sensors = MotionSensors(WheelMotion(settings.wheels), learned_motion(tmp_path), None, Gyro(GyroConfig()))
+    some = MotionSources(settings, sensors, LandmarkFactors(None, installation))
+    ahead = np.array([0.05, 0.0, 0.02])
+    wheels = replace(WHEELS, depends_on={"wheels.radius": (ahead, 0.0)})
+    learned = replace(LEARNED, depends_on={"motion.scale": (ahead, 0.0)})
+    gyro = replace(GYRO, depends_on={"gyro.scale": (np.array([0.0, 0.0, 0.02]), 0.0)})
+    faults = MotionFaultMonitor(settings.weights, some, None)
+    step = Step(0, 0, START_NS, START_NS + 10**8, {})
+    faults.begin(step)
+    for readings in (MotionReadings(wheels, None, gyro), MotionReadings(wheels, learned, gyro)) * 3:
+        assert faults.judge(step, readings).nis < settings.weights.alarm
 
 
 def test_sources_that_disagree_are_known_less_well_together(tmp_path):
