@@ -114,14 +114,14 @@ def test_ctrl_c_says_what_is_kept(bag, tmp_path, monkeypatch):
 
     def interrupt(listener, advance):
         calls.append(advance)
-        if len(calls) == 20:
+        if len(calls) == 2:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Lines, "__call__", interrupt)
     code, out, err = fgloc("online", bag, "--out", tmp_path / "out")
     assert (code, out) == (130, "")
     assert err == "interrupted: of this result nothing was written; an earlier one is as it was\n"
-    assert 0.0 < calls[19].done < 5.0
+    assert 0.0 <= calls[1].done < 5.0
     assert not (tmp_path / "out").exists()
 
 

@@ -266,14 +266,6 @@ def test_fixed_lag_agrees_with_full_isam2_within_the_noise():
     assert (np.abs(errors).max(axis=0) < sigma).all()
 
 
-def test_factors_held_equal_factors_added():
-    estimator, factors, _, _ = replay(2)
-    result = BatchSmoother(estimator.log, factors, BatchConfig(), 1 - 1e-12).result()
-    added = sum(1 if f.prior is not None else len(f.motions) for f in estimator.log.keyframes.values())
-    added += sum(bool(f.sightings) for f in estimator.log.keyframes.values())  # one for all that were made at once
-    assert result.factors == added
-
-
 def test_nees_is_consistent_over_seeds():
     values = {"online": [], "batch": []}
     for seed in range(12):
