@@ -31,7 +31,7 @@ from benchmarks.adaptive_runs import CASES, cell
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
 from fgloc.datasets.sim.camera import RenderError
-from fgloc.progress import counted
+from fgloc.instrumentation.progress import counted
 from fgloc.types import FloatArray
 
 

@@ -28,6 +28,7 @@ from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.factors import pose_key
 from fgloc.graph.isam2_backends import FixedLag, isam2_params
+from fgloc.instrumentation.timing import Stopwatch
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
@@ -41,7 +42,6 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.timing import Stopwatch
 from fgloc.types import Camera, ControlEvent, Event, FloatArray, Landmark, LandmarkMap
 
 _ROOT = Path(__file__).resolve().parent.parent

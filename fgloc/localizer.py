@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from fgloc.config import Config
 from fgloc.graph.estimators import make_estimator
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.instrumentation.timing import Stopwatch
 from fgloc.relocalization.initialization import Initialization
 from fgloc.relocalization.recorder import Recorder
 from fgloc.relocalization.tracking_state import Tracking
@@ -15,7 +16,6 @@ from fgloc.robust.motion_judge import MotionJudge
 from fgloc.robust.sighting_judge import SightingJudge
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.timing import Stopwatch
 from fgloc.types import Estimate, LandmarkMap, LandmarkMeasurement, MotionReadings, Step
 
 

@@ -19,12 +19,12 @@ from fgloc.calibration.settings import installation_found
 from fgloc.config import Config
 from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.errors import EstimatorError
+from fgloc.instrumentation.timing import one_blas_thread
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay.options import Progress, RunMode, RunOptions
 from fgloc.replay.outcome import Outcome, never_found, sentence
 from fgloc.replay.replay import Replay
 from fgloc.replay.smoothing import SmoothedRun, smooth_run
-from fgloc.timing import one_blas_thread
 from fgloc.types import (
     Estimate,
     FloatArray,

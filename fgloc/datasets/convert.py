@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from fgloc.config import load_config
 from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
-from fgloc.progress import counted
+from fgloc.instrumentation.progress import counted
 from fgloc.recording.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 

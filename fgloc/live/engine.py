@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from fgloc.config import LiveConfig
 from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.instrumentation.timing import one_blas_thread
 from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import role_of
 from fgloc.live.run import OnlineRun
-from fgloc.timing import one_blas_thread
 from fgloc.types import Estimate, Event, RawEvent, Step
 
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot

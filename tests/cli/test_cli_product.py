@@ -12,13 +12,13 @@ import yaml
 from command_line import fgloc
 from test_cli import write_circle
 
-from fgloc import progress
 from fgloc.cli import extras
 from fgloc.cli.progress import LINE_S, Lines
 from fgloc.cli.remarks import remarks
 from fgloc.config import Config, load_config
 from fgloc.datasets.bag import BagWriter
 from fgloc.evaluation.metrics import compute_metrics
+from fgloc.instrumentation import progress
 from fgloc.runner import run
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.training.config import load_train_config

@@ -20,7 +20,7 @@ from fgloc.datasets.sim.positioning import gnss_settings, uwb_settings
 from fgloc.datasets.sim.scenario import Scenario
 from fgloc.datasets.sim.sensors import streams
 from fgloc.files.atomic import atomic_folder
-from fgloc.progress import counted
+from fgloc.instrumentation.progress import counted
 from fgloc.sensors.maps import write_map
 
 DONE = "scenario.yaml"  # a folder that holds it is complete

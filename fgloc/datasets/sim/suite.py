@@ -19,7 +19,7 @@ from fgloc.datasets.sim.scenario import Control, Scenario
 from fgloc.datasets.sim.section import Section
 from fgloc.errors import ConfigError, FglocError
 from fgloc.files.settings_file import Settings
-from fgloc.progress import counted
+from fgloc.instrumentation.progress import counted
 
 BUNDLED = Path(__file__).parent / "suite.yaml"
 
