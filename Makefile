@@ -35,7 +35,7 @@ follow: .venv/.sim
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
-test-all: .venv/.dev
+test-all: .venv/.docs
 	$(BIN)/python -m pytest -n $(JOBS)
 
 check: .venv/.dev
@@ -50,10 +50,10 @@ format: .venv/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-docs: .venv/.dev
+docs: .venv/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-docs-test: .venv/.dev
+docs-test: .venv/.docs
 	$(BIN)/python -m pytest -n $(JOBS) tests/docs
 
 bench: .venv/.dev
@@ -88,3 +88,7 @@ clean:
 .venv/.dev: pyproject.toml constraints.txt | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch .venv/.base .venv/.sim $@
+
+.venv/.docs: .venv/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
+	@touch $@
