@@ -26,8 +26,8 @@ from fgloc.sensors.learned.card import Input, Split
 from fgloc.training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from fgloc.training.data import Run, make_run
 from fgloc.training.evaluate import evaluate
-from fgloc.training.heard import TopicTimes
 from fgloc.training.rollouts import Rollout, roll_model, roll_wheels
+from fgloc.training.sensor_record import SensorRecord
 from fgloc.training.train import train
 from fgloc.types import Event, TruthEvent
 
@@ -35,7 +35,7 @@ _STEPS = {"train": range(120), "validation": range(120, 150), "test": range(150,
 _HORIZON_S = 1.5
 _DT_S = 0.1
 _APART_NS = 10_000_000_000  # of a silence between two windows
-_HISTORY_S = 0.3  # of a window, heard before the prediction starts
+_HISTORY_S = 0.3  # of a window, before the prediction starts
 _DATA = DataConfig(smoothing_s=0.3, max_truth_gap_s=0.4, margin_s=0.0, shortest_s=_HORIZON_S)
 _CALIBRATION = CalibrationConfig(horizons_s=(1.0, _HORIZON_S), short_s=(0.1, 0.5), window_s=_HORIZON_S)
 
@@ -94,7 +94,7 @@ def _windows(source: Path, steps: range, part: str, scratch: Path) -> list[Run]:
         if truth[-1].stamp_ns < window[0].stamp_ns + round((_HISTORY_S + _HORIZON_S) * 1e9):
             continue
         stamps, poses = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
-        runs.append(make_run(f"{part}_{k}", TopicTimes(window, settings), stamps, poses, _DT_S, _HISTORY_S, _DATA))
+        runs.append(make_run(f"{part}_{k}", SensorRecord(window, settings), stamps, poses, _DT_S, _HISTORY_S, _DATA))
     return runs
 
 

@@ -93,20 +93,15 @@ def turtlebot3(
     url: Url = None,
 ) -> None:
     """A TurtleBot3 Burger with AprilTags."""
-    from fgloc.datasets.download import Remote, fetch, unpack
+    from fgloc.datasets.download import unpack
     from fgloc.datasets.turtlebot3 import convert_and_tell
 
     check_out(out)
-    if download is not None:
-        if url is None:
-            raise typer.BadParameter("the owner's address is not known; give it with --url")
-        source = fetch(Remote(url), download)
-        if source.suffix == ".zip":
-            source = unpack(source, download / source.stem)
-            found = sorted(source.rglob("metadata.yaml"))
-            source = found[0].parent if found else source
-    if source is None:
-        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS")
+    source = _given_or_fetched(source, download, url, "the owner's address is not known; give it with --url")
+    if download is not None and source.suffix == ".zip":
+        source = unpack(source, source.with_suffix(""))
+        found = sorted(source.rglob("metadata.yaml"))
+        source = found[0].parent if found else source
     bag, dropped, notes = convert_and_tell(source, out, storage, landmarks)
     say(f"{bag} and {out / 'robot.yaml'} written")
     for what, count in dropped.items():
@@ -126,17 +121,23 @@ def drive(
     url: Url = None,
 ) -> None:
     """DRIVE: a skid-steered Husky in windows of 2 s."""
-    from fgloc.datasets.download import Remote, fetch
     from fgloc.datasets.drive import convert as converted
     from fgloc.datasets.drive import span
 
     check_out(out)
+    unknown = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
+    source = _given_or_fetched(source, download, url, unknown)
+    say(f"{converted(source, out, storage, span(windows), span(calibration))} and {out / 'robot.yaml'} written")
+
+
+def _given_or_fetched(source: Path | None, download: Path | None, url: str | None, unknown: str) -> Path:
+    """The recording that was given, or downloaded from an address; ``unknown``: why that has to be given."""
+    from fgloc.datasets.download import Remote, fetch
+
     if download is not None:
         if url is None:
-            raise typer.BadParameter(
-                "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
-            )
-        source = fetch(Remote(url), download)
+            raise typer.BadParameter(unknown)
+        return fetch(Remote(url), download)
     if source is None:
-        raise typer.BadParameter("give the CSV file, or --download FOLDER --url ADDRESS")
-    say(f"{converted(source, out, storage, span(windows), span(calibration))} and {out / 'robot.yaml'} written")
+        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS")
+    return source

@@ -35,7 +35,7 @@ class MeanTwists(Protocol):
         ...
 
 
-def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
+def fit_kinematics(runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
     Shorter runs count whole. Over shorter times the robot's lag, which these kinematics do not know, would pass for a
@@ -45,10 +45,10 @@ def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambd
     def residuals(parameters: FloatArray) -> FloatArray:
         scale_v, scale_omega, yaw_per_m, delay = parameters
         parts = []
-        for told_track, run, k, actual in windows:
-            told = told_track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
-            v = scale_v * told[:, 0]
-            omega = scale_omega * told[:, 1] + yaw_per_m * v
+        for track, run, k, actual in windows:
+            mean = track.means(np.column_stack([run.times[k], run.times[k + steps]]) - delay)[:, 0]
+            v = scale_v * mean[:, 0]
+            omega = scale_omega * mean[:, 1] + yaw_per_m * v
             parts += [(v - actual[:, 0]) / v_unit, (omega - actual[:, 1]) / omega_unit]
         return np.concatenate(parts)
 
@@ -60,7 +60,7 @@ def fit_kinematics(runs: list[Run], told_by: Callable[[Run], MeanTwists] = lambd
         forward = run.velocities[:, 0]
         travelled = np.concatenate([[0.0], np.cumsum(0.5 * (forward[1:] + forward[:-1]) * run.dt_s)])
         change = np.column_stack([travelled[k + steps] - travelled[k], run.poses[k + steps, 2] - run.poses[k, 2]])
-        windows.append((told_by(run), run, k, change / (steps * run.dt_s)))
+        windows.append((twists_of(run), run, k, change / (steps * run.dt_s)))
     v_unit, omega_unit = np.maximum(1e-3, np.concatenate([actual for _, _, _, actual in windows]).std(axis=0))
     bounds = ([0.3, 0.3, -1.0, 0.0], [2.0, 2.0, 1.0, 1.0])
     fit = least_squares(residuals, [1.0, 1.0, 0.0, 0.2], bounds=bounds, diff_step=1e-2, x_scale=[1.0, 1.0, 0.1, 0.2])

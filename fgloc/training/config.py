@@ -1,4 +1,4 @@
-"""What a training run is told: strict, from YAML, stored in every model it makes."""
+"""Settings of a training run: strict, from YAML, stored in every model it makes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class NetworkConfig(Section):
         (128, 128), description="gru: units of the cell, then of layers; naive, lag, arx: unused"
     )
     variance_units: int = Field(
-        64, gt=0, description="displacement: width of the layers, as many as the mean has, that tell the variance"
+        64, gt=0, description="displacement: width of the layers, as many as the mean has, that predict the variance"
     )
     members: int = Field(1, ge=1, le=64, description="displacement: networks trained from different seeds and averaged")
     dt_s: float = Field(0.1, gt=0, le=1.0, description="time step of the samples and longest sub-step later")
@@ -102,7 +102,7 @@ class CalibrationConfig(Section):
     )
     horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
     short_s: tuple[float, ...] = Field(
-        (0.2, 1.0), description="windows that, beside the horizons', tell lasting errors from passing ones"
+        (0.2, 1.0), description="windows that, beside the horizons', separate lasting errors from passing ones"
     )
     memory_s: tuple[float, ...] = Field((0.2, 0.5, 1.0, 2.0), description="time constants tried for lasting errors")
     window_s: float = Field(5.0, gt=0, description="windows from which W, N and C are estimated")
@@ -129,7 +129,7 @@ class AdaptationConfig(Section):
 
 
 class SpeedLimits(Section):
-    """What the robot may be told, so that training can say what the recordings left out."""
+    """The largest commands of the robot, so that training can name what the recordings left out."""
 
     v_mps: float = Field(gt=0, description="forward")
     omega_radps: float = Field(gt=0, description="to either side")

@@ -1,4 +1,4 @@
-"""Whether the recordings drove the robot through all that it may be told: what was never told is not identified."""
+"""Whether the recordings drove the robot through all that it may be commanded: nothing else is identified."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _ENOUGH_TOGETHER_S = 2.0  # in a range of both
 
 @dataclass(frozen=True, slots=True)
 class Controls:
-    """Seconds for which speeds were told, in ranges between the robot's limits."""
+    """Seconds for which speeds were commanded, in ranges between the robot's limits."""
 
     v_edges: FloatArray  # (a + 1,) m/s
     omega_edges: FloatArray  # (b + 1,) rad/s
     seconds: FloatArray  # (a, b)
-    told: FloatArray  # (n, 2) v, ω at each sample
+    commanded: FloatArray  # (n, 2) v, ω at each sample
     limits: SpeedLimits | None
 
     def missing(self) -> list[str]:
@@ -41,8 +41,8 @@ class Controls:
             for (low, high), spent in zip(pairwise(edges), seconds, strict=True):
                 if spent < _ENOUGH_S:
                     found.append(f"{name} from {low:.2g} to {high:.2g} {unit}: {spent:.1f} s, want {_ENOUGH_S:.0f} s")
-        for side, fast in (("left", self.told[:, 1]), ("right", -self.told[:, 1])):
-            both = (self.told[:, 0] > 0.5 * self.limits.v_mps) & (fast > 0.5 * self.limits.omega_radps)
+        for side, fast in (("left", self.commanded[:, 1]), ("right", -self.commanded[:, 1])):
+            both = (self.commanded[:, 0] > 0.5 * self.limits.v_mps) & (fast > 0.5 * self.limits.omega_radps)
             spent = self.seconds.sum() * float(both.mean())
             if spent < _ENOUGH_TOGETHER_S:
                 found.append(
@@ -53,17 +53,17 @@ class Controls:
 
 
 def controls(runs: list[Run], limits: SpeedLimits | None) -> Controls:
-    """Count what was told while the truth was heard.
+    """Count what was commanded while there was a truth.
 
     Args:
         runs: those that train.
         limits: of the robot; None: the ranges end at the largest commands.
     """
-    told, seconds = [], []
+    commanded, seconds = [], []
     for run in runs:
-        told.append(run.track.means(np.append(run.times, len(run.poses) * run.dt_s))[run.valid])
-        seconds.append(np.full(len(told[-1]), run.dt_s))
-    commands, weights = np.concatenate(told), np.concatenate(seconds)
+        commanded.append(run.track.means(np.append(run.times, len(run.poses) * run.dt_s))[run.valid])
+        seconds.append(np.full(len(commanded[-1]), run.dt_s))
+    commands, weights = np.concatenate(commanded), np.concatenate(seconds)
     if limits is None:
         lowest, (v, omega) = min(0.0, float(commands[:, 0].min())), np.maximum(1e-3, np.abs(commands).max(axis=0))
     else:
@@ -84,7 +84,7 @@ def draw_controls(path: Path, found: Controls) -> None:
     for i, j in np.argwhere(found.seconds < _ENOUGH_TOGETHER_S):
         (left, right), (low, high) = found.omega_edges[j : j + 2], found.v_edges[i : i + 2]
         axes.fill([left, right, right, left], [low, low, high, high], fill=False, hatch="//", color="C3", alpha=0.4)
-    axes.plot(found.told[:, 1], found.told[:, 0], ".", color="0.2", markersize=1.5)
+    axes.plot(found.commanded[:, 1], found.commanded[:, 0], ".", color="0.2", markersize=1.5)
     for i, row in enumerate(found.seconds):
         for j, spent in enumerate(row):
             middle = 0.5 * (found.omega_edges[j] + found.omega_edges[j + 1]), 0.5 * sum(found.v_edges[i : i + 2])

@@ -24,7 +24,7 @@ from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.learned.commands import CommandHistory
 from fgloc.training.config import DataConfig
-from fgloc.training.heard import TopicTimes
+from fgloc.training.sensor_record import SensorRecord
 from fgloc.training.slopes import in_robots_plane
 from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 
@@ -40,14 +40,14 @@ class Run:
     dt_s: float
     poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
     velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
-    valid: NDArray[np.bool_]  # (n,) the truth was heard around this time, and can be true
-    heard: TopicTimes
+    valid: NDArray[np.bool_]  # (n,) there is a truth around this time, and it can be true
+    sensors: SensorRecord
     track: CommandHistory  # time zero is origin_ns
 
     @property
     def commands(self) -> tuple[ControlEvent, ...]:
         """In order of stamp."""
-        return self.heard.commands
+        return self.sensors.commands
 
     @property
     def times(self) -> FloatArray:
@@ -81,23 +81,28 @@ def load_run(
     """
     whole = _read(path, config, truth_from)
     return make_run(
-        name, TopicTimes(whole.sensed, whole.settings, whole.imu_up, whole.truth), *whole.truth, dt_s, history_s, config
+        name,
+        SensorRecord(whole.sensed, whole.settings, whole.imu_up, whole.truth),
+        *whole.truth,
+        dt_s,
+        history_s,
+        config,
     )
 
 
 def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from: Path | None = None) -> dict[str, Run]:
-    """Read a bag as one run or, where nothing at all was heard for longer than ``config.apart_s``, as several.
+    """Read a bag as one run or, where no message at all came for longer than ``config.apart_s``, as several.
 
     The name of one run is the recording's, of several ``name.0``, ``name.1`` and so on; stretches that are too short
     are left out. Arguments else, and errors, as of `load_run`.
     """
     whole = _read(path, config, truth_from)
     stamps, poses = whole.truth
-    heard_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
-    limits = [int(heard_ns[0]), *heard_ns[1:][np.diff(heard_ns) > config.apart_s * 1e9].tolist(), int(heard_ns[-1]) + 1]
+    all_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
+    limits = [int(all_ns[0]), *all_ns[1:][np.diff(all_ns) > config.apart_s * 1e9].tolist(), int(all_ns[-1]) + 1]
     if len(limits) == 2:
-        heard = TopicTimes(whole.sensed, whole.settings, whole.imu_up, whole.truth)
-        return {name: make_run(name, heard, stamps, poses, dt_s, config.history_s, config)}
+        record = SensorRecord(whole.sensed, whole.settings, whole.imu_up, whole.truth)
+        return {name: make_run(name, record, stamps, poses, dt_s, config.history_s, config)}
     runs: dict[str, Run] = {}
     sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
     sensed_ns = [e.stamp_ns for e in sensed]
@@ -106,9 +111,9 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
         inside = (stamps >= first) & (stamps < last)
         if not inside.any() or not any(isinstance(event, ControlEvent) for event in part):
             continue
-        heard, label = TopicTimes(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
+        record, label = SensorRecord(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
-            runs[label] = make_run(label, heard, stamps[inside], poses[inside], dt_s, config.history_s, config)
+            runs[label] = make_run(label, record, stamps[inside], poses[inside], dt_s, config.history_s, config)
     if not runs:
         raise RecordingError(f"{path}: {len(limits) - 1} stretches, each shorter than {config.shortest_s:g} s")
     return runs
@@ -149,20 +154,20 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
 
 def make_run(
     name: str,
-    heard: TopicTimes | Sequence[ControlEvent],
+    record: SensorRecord | Sequence[ControlEvent],
     truth_ns: NDArray[np.int64],
     truth: FloatArray,
     dt_s: float,
     history_s: float,
     config: DataConfig,
 ) -> Run:
-    """A run from what was heard, or commands alone, and truth poses ``(m, 3)`` at ``truth_ns``; else as `load_run`.
+    """A run from sensors, or commands alone, and truth poses ``(m, 3)`` at ``truth_ns``; else as `load_run`.
 
     Raises:
         RecordingError: commands and truth overlap too little.
     """
-    heard = heard if isinstance(heard, TopicTimes) else TopicTimes(heard)
-    commands = heard.commands
+    record = record if isinstance(record, SensorRecord) else SensorRecord(record)
+    commands = record.commands
     order = np.unique(truth_ns, return_index=True)[1]
     truth_ns, truth = truth_ns[order], truth[order]
     first = max(int(truth_ns[0]) + round(config.margin_s * 1e9), commands[0].stamp_ns + round(history_s * 1e9))
@@ -182,8 +187,8 @@ def make_run(
         dt_s=dt_s,
         poses=poses,
         velocities=velocities,
-        valid=_heard(t_truth, times, config) & _possible(velocities, dt_s, config),
-        heard=heard,
+        valid=_has_truth(t_truth, times, config) & _possible(velocities, dt_s, config),
+        sensors=record,
         track=CommandHistory(commands, first),
     )
 
@@ -248,14 +253,14 @@ def _smooth(
     return poses, body
 
 
-def _heard(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArray[np.bool_]:
+def _has_truth(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArray[np.bool_]:
     """Whether the smoothing window around each time is free of gaps."""
     reach = 0.5 * config.smoothing_s
     gaps = np.flatnonzero(np.diff(t_truth) > config.max_truth_gap_s)
-    heard = np.ones(len(times), dtype=bool)
+    known = np.ones(len(times), dtype=bool)
     for k in gaps:
-        heard[(times > t_truth[k] - reach) & (times < t_truth[k + 1] + reach)] = False
-    return heard
+        known[(times > t_truth[k] - reach) & (times < t_truth[k + 1] + reach)] = False
+    return known
 
 
 def _possible(velocities: FloatArray, dt_s: float, config: DataConfig) -> NDArray[np.bool_]:

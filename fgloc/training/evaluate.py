@@ -107,7 +107,7 @@ def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]
     loaded = {name: load_model(path) for name, path in models.items()}
     kinds = {"commands": Kinematics(), "calibrated commands": next(iter(loaded.values())).card.kinematics}
     found = {name: [roll_kinematics(kinematics, run, STEP_S) for run in runs] for name, kinematics in kinds.items()}
-    if all(run.heard.has_wheels for run in runs):
+    if all(run.sensors.has_wheels for run in runs):
         found["wheel odometry"] = [roll_wheels(run, STEP_S) for run in runs]
     return found | {name: [roll_model(model, run, STEP_S) for run in runs] for name, model in loaded.items()}
 

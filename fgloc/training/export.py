@@ -10,7 +10,7 @@ from fgloc.training.config import TrainConfig
 from fgloc.training.models import DisplacementNet, MotionNet, VelocityNet
 from fgloc.training.recurrent import Trunk
 
-_WARM_UP_S = 2.0  # a velocity model that is told no velocity starts from rest this long ago
+_WARM_UP_S = 2.0  # a velocity model that is given no velocity starts from rest this long ago
 
 
 def tensors_of(nets: list[MotionNet]) -> Tensors:

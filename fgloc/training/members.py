@@ -47,7 +47,7 @@ def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
 
 
 def _wheels_of(run: Run) -> Signal:
-    wheels = run.heard.signals(("wheels",), run.origin_ns).named("wheels")
+    wheels = run.sensors.signals(("wheels",), run.origin_ns).named("wheels")
     if wheels is None:
         raise RecordingError(
             f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"

@@ -61,7 +61,7 @@ class DisplacementNet(nn.Module):
         """Take the normalization from the training runs."""
         super().__init__()
         self.config, self.kinematics, self.wheel_kinematics = config, kinematics, wheel_kinematics
-        self.joints = runs[0].heard.joints
+        self.joints = runs[0].sensors.joints
         self.measured = tuple(name for name in registry.channels() if name in config.inputs)
         self._gyro_columns = self._columns("gyro")
         features = np.concatenate([self._features(run) for run in runs])
@@ -86,7 +86,7 @@ class DisplacementNet(nn.Module):
         else:
             own = mlp([len(mean), *[config.variance_units] * len(config.hidden), 3])
             self.variance = variance_net(own, self.mean, self.std, self._neighbors())
-            if "velocity" in config.inputs:  # which nobody tells while the variance is learned: it would stay random
+            if "velocity" in config.inputs:  # which is not given while the variance is learned: it would stay random
                 with torch.no_grad():
                     own[0].weight[:, -2:] = 0.0
 
@@ -103,9 +103,9 @@ class DisplacementNet(nn.Module):
 
     def _features(self, run: Run) -> FloatArray:
         middles = run.times + 0.5 * run.dt_s
-        told = run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
+        commanded = run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
         signals, edges = self._signals(run), np.array(self.config.signal_edges_s)
-        parts = [told]
+        parts = [commanded]
         for name in self.measured:
             signal = signals.named(name)
             if signal is None:
@@ -119,7 +119,7 @@ class DisplacementNet(nn.Module):
         return base
 
     def _signals(self, run: Run) -> Signals:
-        return run.heard.signals(self.measured, run.origin_ns)
+        return run.sensors.signals(self.measured, run.origin_ns)
 
     def _columns(self, name: str) -> slice:
         """Columns of the features that hold a measured input; empty if it is not read."""
@@ -140,7 +140,7 @@ class DisplacementNet(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Base twists ``(b, steps, 3)`` and normalized inputs ``(b, steps, ·)``.
 
-        With ``rng``, half of the windows are told the velocity at their start, with noise (if the model reads it), and
+        With ``rng``, half of the windows are given the velocity at their start, with noise (if the model reads it), and
         the gyro has a bias that is not known.
         """
         rows = starts[:, None] + torch.arange(steps)
@@ -225,11 +225,11 @@ class VelocityNet(nn.Module):
         super().__init__()
         self.config, self.kinematics, self.lag = config, kinematics, lag
         self._delay_s = kinematics.delay_s if lag is None else lag.delay_s
-        told = np.concatenate([self._features(run) for run in runs])
+        commanded = np.concatenate([self._features(run) for run in runs])
         actual = np.concatenate([run.velocities[:, [0, 2]] for run in runs])
         dts = np.array([0.5, 1.0]) * config.dt_s  # the range that sub-steps will have
-        mean = [*actual.mean(axis=0), *told.mean(axis=0), dts.mean()]
-        std = [*actual.std(axis=0), *told.std(axis=0), dts.std()]
+        mean = [*actual.mean(axis=0), *commanded.mean(axis=0), dts.mean()]
+        std = [*actual.std(axis=0), *commanded.std(axis=0), dts.std()]
         rate = np.maximum(actual.std(axis=0), 1e-3) / (_RATE_S if lag is None else np.array(lag.lag_s))
         if config.kind == "lag":
             mean, std, rate = [], [], np.zeros(0)
@@ -257,7 +257,7 @@ class VelocityNet(nn.Module):
         pair = 2 if rng is not None and steps % 2 == 0 and torch.rand(1, generator=rng).item() < 0.5 else 1
         dt = samples.dt_s * pair
         rows = starts[:, None] + torch.arange(steps)
-        told, aims = (
+        commanded, aims = (
             part.reshape(len(starts), steps // pair, pair, 2).mean(dim=2)
             for part in (samples.features[rows], samples.base[rows][..., [0, 2]])
         )
@@ -266,7 +266,7 @@ class VelocityNet(nn.Module):
         dts = torch.full((len(starts), 1), dt)
         states = [state]
         for k in range(steps // pair):
-            x = torch.cat([state, told[:, k], dts], dim=1)
+            x = torch.cat([state, commanded[:, k], dts], dim=1)
             state = aims[:, k] + keep * (state - aims[:, k])
             if self.net is not None:
                 state = state + dt * self.scale * self.net((x - self.mean) / self.std)

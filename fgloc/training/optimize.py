@@ -100,9 +100,9 @@ def _nll_of_pieces(poses: Tensor, truth: Tensor, log_density: Tensor, length: in
     """`composed_nll` of windows ``(b, n + 1, 3)`` cut into pieces of ``length`` steps."""
     firsts = torch.arange(0, log_density.shape[1], length)
     rows = firsts[:, None] + torch.arange(length + 1)
-    told, actual = (whole[:, rows].flatten(0, 1) for whole in (poses, truth))
+    predicted, actual = (whole[:, rows].flatten(0, 1) for whole in (poses, truth))
     with torch.no_grad():
-        error, adjoints = end_errors(relative(told[:, :1], told[:, 1:]), actual)
+        error, adjoints = end_errors(relative(predicted[:, :1], predicted[:, 1:]), actual)
     return composed_nll(error, adjoints, log_density.reshape(-1, length, 3), dt_s, beta)
 
 

@@ -37,8 +37,8 @@ class Trunk(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Hidden values ``(..., width)`` of normalized inputs ``(..., in)``."""
-        told = x[..., : 2 * self._n_bins].reshape(-1, self._n_bins, 2).flip(1)
-        _, last = self.cell(told)
+        commands = x[..., : 2 * self._n_bins].reshape(-1, self._n_bins, 2).flip(1)
+        _, last = self.cell(commands)
         state = last[0].reshape(*x.shape[:-1], -1)
         return self.layers(torch.cat([state, x[..., 2 * self._n_bins :]], dim=-1))
 

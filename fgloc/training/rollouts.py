@@ -34,7 +34,7 @@ class Rollout:
     memory: ErrorMemory | None = None  # of the errors from step to step
 
     def starts(self, horizon_s: float, every_s: float = 1.0) -> tuple[NDArray[np.int64], int]:
-        """Indices at which windows of this length start with the truth heard throughout, and their steps."""
+        """Indices at which windows of this length start with truth throughout, and their steps."""
         steps = round(horizon_s / self.step_s)
         broken = np.concatenate([[0], np.cumsum(~self.valid)])
         k = np.arange(0, len(self.motions) - steps + 1, max(1, round(every_s / self.step_s)))
@@ -69,16 +69,16 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
     Raises:
         ModelError: a prediction is not finite.
     """
-    reader = SignalReader(model.card, run.heard.imu_up)
+    reader = SignalReader(model.card, run.sensors.imu_up)
     velocity: FloatArray | None = None
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         nonlocal velocity
-        heard = run.heard.step(start_ns, end_ns, model.card.history_s)
-        commands = heard.controls[: bisect_left(heard.controls, end_ns, key=lambda c: c.stamp_ns)]
-        signals = reader.read(heard, run.heard.gyro_bias(start_ns))
+        events = run.sensors.step(start_ns, end_ns, model.card.history_s)
+        commands = events.controls[: bisect_left(events.controls, end_ns, key=lambda c: c.stamp_ns)]
+        signals = reader.read(events, run.sensors.gyro_bias(start_ns))
         if isinstance(signals, str):
-            raise ModelError(f"{run.name}: the model reads {signals}, which was silent at {start_ns} ns")
+            raise ModelError(f"{run.name}: the model reads {signals}, of which there is no message at {start_ns} ns")
         carried = velocity if model.card.family == "velocity" else None
         prediction = model.predict(commands, start_ns, end_ns, carried, signals)
         if prediction is None:
@@ -95,12 +95,12 @@ def roll_wheels(run: Run, step_s: float) -> Rollout:
     Raises:
         ModelError: the recording holds none.
     """
-    if not run.heard.has_wheels:
+    if not run.sensors.has_wheels:
         raise ModelError(f"{run.name}: no wheel odometry in the recording")
-    wheels = WheelMotion(run.heard.wheels)
+    wheels = WheelMotion(run.sensors.wheels)
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
-        measured = wheels.measure(run.heard.step(start_ns, end_ns))
+        measured = wheels.measure(run.sensors.step(start_ns, end_ns))
         if measured is None:
             raise ModelError(f"{run.name}: no wheel motion at {start_ns} ns")
         return measured.motion, measured.cov

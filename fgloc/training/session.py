@@ -21,14 +21,14 @@ CHECKPOINTS = ".checkpoints"
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """Who hears of it: `say` of each finished model, `warn` of what looks wrong."""
+class Reporter:
+    """Where messages go: `say` those on each finished model, `warn` those on what looks wrong."""
 
     say: Callable[[str], None]
     warn: Callable[[str], None]
 
 
-def train_models(config_file: Path, data: Path, out: Path, start: Path | None, told: Told) -> list[Path]:
+def train_models(config_file: Path, data: Path, out: Path, start: Path | None, reporter: Reporter) -> list[Path]:
     """Train what a configuration asks for. Interrupted and run again it goes on, and ends at the same files.
 
     Args:
@@ -36,7 +36,7 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, t
         data: folder that the recordings' paths are relative to.
         out: folder of the models; it appears whole.
         start: a model to adapt, instead of training one.
-        told: who hears of it.
+        reporter: where messages go.
 
     Returns:
         The models' files.
@@ -62,33 +62,33 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, t
     with atomic_folder(out, own=("*.safetensors", "*.png", CHECKPOINTS)) as stage:
         if start is not None:
             path = stage / "model.safetensors"
-            told.say(_figures(path.stem, adapt(start, config, runs, path, f"{made_by}; from {start.name}")))
+            reporter.say(_figures(path.stem, adapt(start, config, runs, path, f"{made_by}; from {start.name}")))
         else:
-            _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), told)
+            _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), reporter)
         names = sorted(path.name for path in stage.glob("*.safetensors"))
     return [out / name for name in names]
 
 
 def _train_all(
-    config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, told: Told
+    config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, reporter: Reporter
 ) -> None:
     """The model of the configuration's split, or one for each recording left out, and one of all."""
     trained = list(runs) if config.split is None else config.split.train
     found = controls([runs[name] for name in trained], config.limits)
     draw_controls(out / "controls.png", found)
     for missing in found.missing():
-        told.warn(f"the recordings hold too little of {missing}")
+        reporter.warn(f"the recordings hold too little of {missing}")
     if config.split is not None:
         path = out / "model.safetensors"
-        card = train(config, config.split, runs, path, made_by, checkpoints, told.warn)
-        told.say(_figures(path.stem, card))
+        card = train(config, config.split, runs, path, made_by, checkpoints, reporter.warn)
+        reporter.say(_figures(path.stem, card))
         return
     folds = []
     for split in leave_one_out(list(runs)):
         path = out / f"without_{split.test[0]}.safetensors"
-        folds.append(train(config, split, runs, path, made_by, checkpoints, told.warn))
-        told.say(_figures(path.stem, folds[-1]))
-    told.say(_figures("all", train_on_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints)))
+        folds.append(train(config, split, runs, path, made_by, checkpoints, reporter.warn))
+        reporter.say(_figures(path.stem, folds[-1]))
+    reporter.say(_figures("all", train_on_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints)))
 
 
 def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:

@@ -7,7 +7,7 @@ import numpy as np
 from fgloc.graph.ground import rotations
 from fgloc.types import FloatArray
 
-_LEVEL_RAD = 0.01  # a positioning system tells roll and pitch no better; below, the floor is flat
+_LEVEL_RAD = 0.01  # a positioning system measures roll and pitch no better; below, the floor is flat
 
 
 def in_robots_plane(poses: FloatArray, ground: FloatArray) -> FloatArray:

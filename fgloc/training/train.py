@@ -51,7 +51,7 @@ def train(
         path: file of the model.
         made_by: kept in the model's card.
         checkpoints: what an interrupted training goes on from.
-        warn: told where the validation got worse.
+        warn: called where the validation got worse.
     """
     validation = [runs[name] for name in split.validation]
     tensors, card, curves = train_uncalibrated(config, split, runs, path, made_by, checkpoints)
@@ -118,7 +118,9 @@ def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tupl
     model = load_model(path)
 
     def wheels(run: Run) -> Rollout:
-        return roll_wheels(run, card.dt_s) if run.heard.has_wheels else roll_kinematics(card.kinematics, run, card.dt_s)
+        return (
+            roll_wheels(run, card.dt_s) if run.sensors.has_wheels else roll_kinematics(card.kinematics, run, card.dt_s)
+        )
 
     return [(roll_model(model, run, card.dt_s), wheels(run)) for run in runs]
 

@@ -1,4 +1,4 @@
-"""The network that tells how uncertain motion is: what makes motion uncertain is not what makes it."""
+"""The network that predicts how uncertain motion is: what makes motion uncertain is not what makes it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.training.config import DataConfig
 from fgloc.training.data import Run, make_run
-from fgloc.training.heard import TopicTimes
+from fgloc.training.sensor_record import SensorRecord
 from fgloc.types import ControlEvent, Event, FloatArray
 
 SECOND = 1_000_000_000
@@ -66,8 +66,8 @@ def sensing(seed: int, seconds: float = 60.0, bias: float = 0.0) -> Run:
     commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
     geometry = {"left_radius": RADIUS, "right_radius": RADIUS, "track": TRACK}
     config = Config(wheels=WheelsConfig(source="ticks", **geometry))
-    heard = TopicTimes([*commands, *sensed(seed, seconds, bias)], config)
-    return make_run(f"run{seed}", heard, stamps, poses, 0.1, 2.0, DataConfig())
+    record = SensorRecord([*commands, *sensed(seed, seconds, bias)], config)
+    return make_run(f"run{seed}", record, stamps, poses, 0.1, 2.0, DataConfig())
 
 
 def synthetic(seed: int, seconds: float = 60.0, dt_s: float = 0.1, name: str = "") -> Run:

@@ -19,8 +19,8 @@ from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.training.config import DataConfig
 from fgloc.training.data import load_runs
-from fgloc.training.heard import TopicTimes
 from fgloc.training.rollouts import roll_wheels
+from fgloc.training.sensor_record import SensorRecord
 from fgloc.types import Event
 
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
@@ -97,17 +97,17 @@ def test_the_gyros_bias_is_known_after_a_rest() -> None:
         angles = np.array([-turned, turned])
         events.append(JointsEvent(stamp, stamp, "/joints", JOINTS, angles, np.zeros(2), np.zeros(2)))
     wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
-    heard = TopicTimes(events, Config(wheels=wheels))
-    assert heard.gyro_bias(T0) == 0.0
-    assert heard.gyro_bias(T0 + 5 * SECOND) == pytest.approx(bias, abs=1e-3)
-    gyro = heard.signals(("gyro",), T0).named("gyro")
+    record = SensorRecord(events, Config(wheels=wheels))
+    assert record.gyro_bias(T0) == 0.0
+    assert record.gyro_bias(T0 + 5 * SECOND) == pytest.approx(bias, abs=1e-3)
+    gyro = record.signals(("gyro",), T0).named("gyro")
     assert gyro is not None
     np.testing.assert_allclose(gyro.means(np.array([1.5, 2.5, 3.2, 5.5]))[[0, 2], 0], [0.0, 0.5], atol=1e-3)
 
 
 def test_wheel_odometry_is_rolled_out_as_the_localizer_measures_it() -> None:
     run = sensing(3, 20.0)
-    assert run.heard.has_wheels
+    assert run.sensors.has_wheels
     wheels = roll_wheels(run, 0.2)
     assert 0.002 < np.hypot(*wheels.errors(5.0)[:, :2].T).mean() < 0.1  # a wheel 2 % larger than nominal
     assert np.linalg.eigvalsh(wheels.covs).min() > 0.0
@@ -117,11 +117,11 @@ def test_the_truth_teaches_the_gyros_bias_until_ten_seconds_before() -> None:
     commands, stamps, poses = drive(np.random.default_rng(3), 40.0)
     wheels = WheelsConfig(source="ticks", left_radius=RADIUS, right_radius=RADIUS, track=TRACK)
     bias = 0.02
-    heard = TopicTimes([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps, poses))
-    assert heard.gyro_bias(T0 + 5 * SECOND) == 0.0  # this robot sets out at once
-    assert heard.gyro_bias(T0 + 35 * SECOND) == pytest.approx(bias, abs=2e-3)
+    record = SensorRecord([*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps, poses))
+    assert record.gyro_bias(T0 + 5 * SECOND) == 0.0  # this robot sets out at once
+    assert record.gyro_bias(T0 + 35 * SECOND) == pytest.approx(bias, abs=2e-3)
     silent = (stamps > T0 + 1 * SECOND) & (stamps < T0 + 39 * SECOND)
-    mute = TopicTimes(
+    mute = SensorRecord(
         [*commands, *sensed(3, 40.0, bias)], Config(wheels=wheels), truth=(stamps[~silent], poses[~silent])
     )
     assert mute.gyro_bias(T0 + 35 * SECOND) == 0.0

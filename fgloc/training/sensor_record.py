@@ -1,4 +1,4 @@
-"""What the robot's own sensors said in a recording, and how it is told apart into steps."""
+"""What the robot's own sensors measured in a recording, and how it is cut into steps."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Step
 _E = TypeVar("_E", bound=Event)
 
 _STEP_NS = 200_000_000  # of the gyro's filter
-_BLIND_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
+_NO_FIX_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
 _FIRST_NS = 2_000_000_000
 _FIX_SIGMA = 0.002  # rad
 _MAX_TRUTH_GAP_NS = 200_000_000
 
 
-class TopicTimes:
+class SensorRecord:
     """Commands, IMU, joints and odometry of one recording.
 
     Attributes:
@@ -96,7 +96,7 @@ class TopicTimes:
         )
 
     def step(self, start_ns: int, end_ns: int, history_s: float = 0.0) -> Step:
-        """All that was heard around a time, as the localizer would get it."""
+        """All messages around a time, as the localizer would get them."""
         return Step(
             index=0,
             segment=0,
@@ -140,13 +140,13 @@ class TopicTimes:
             if truth is not None and (yaw := _yaw_at(*truth, step.stamp_ns)) is not None:
                 gyro.fix(yaw, _FIX_SIGMA**2)
             biases.append(gyro.bias)
-        known = np.searchsorted(at, np.array(stamps) - _BLIND_NS, "right") - 1
+        known = np.searchsorted(at, np.array(stamps) - _NO_FIX_NS, "right") - 1
         first = np.searchsorted(at, stamps[0] + _FIRST_NS)  # a robot rests before it sets out
         return np.array(biases)[np.maximum(known, np.minimum(np.searchsorted(at, stamps, "right") - 1, first))]
 
 
 def _yaw_at(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: int) -> float | None:
-    """Yaw [rad] between the poses around a time; None if the truth is silent there."""
+    """Yaw [rad] between the poses around a time; None if there is no truth there."""
     k = int(np.searchsorted(stamps_ns, at_ns, "right")) - 1
     if k < 0 or k + 1 >= len(stamps_ns) or stamps_ns[k + 1] - stamps_ns[k] > _MAX_TRUTH_GAP_NS:
         return None
