@@ -10,7 +10,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, apart
-from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose, sighting_costs
+from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     FloatArray,
@@ -30,9 +30,8 @@ _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for th
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
 _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
-_UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
 _MAX_PLACES = 4  # that are fitted to the end
-_ITERATIONS, _ROUGH_ITERATIONS = 16, 4
+_ROUGH_ITERATIONS = 4
 _LASTING = 0.8  # of the time that is collected
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
 _YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
@@ -58,7 +57,7 @@ class PlaceSearch:
             return None  # one landmark alone may have been moved, or misread
         fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
         candidates = sorted(
-            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], _UNLIKELY).sum())
+            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], UNEXPLAINED).sum())
         )
         rough = [fit for c in candidates[:_MAX_CANDIDATES] if (fit := fit_few.solve(c, _ROUGH_ITERATIONS)) is not None]
         if known and all(fit.cost > _HOPELESS * MAX_COST_PER_DOF * fit.dof for fit in rough):
@@ -86,14 +85,14 @@ class PlaceSearch:
         if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
             return True
         for landmark_id in best.agreeing:
-            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id], _ITERATIONS)
+            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id])
             if fit is None or (np.sqrt(np.diag(fit.cov)) > MAX_SIGMA).any() or apart(fit.pose, best.fit.pose):
                 return False
         return True
 
     def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
-        fit = self._fit(place, sightings, _ITERATIONS)
+        fit = self._fit(place, sightings)
         if fit is None:
             return None
         agreeing = list(sightings)
@@ -102,7 +101,7 @@ class PlaceSearch:
             agreeing = self._explained(fit.pose, sightings)
             if len(agreeing) == len(before):
                 break
-            trimmed = self._fit(fit.pose, agreeing, _ITERATIONS) if agreeing else None
+            trimmed = self._fit(fit.pose, agreeing) if agreeing else None
             if trimmed is None:
                 return None
             fit = trimmed
@@ -121,7 +120,7 @@ class PlaceSearch:
             fit,
             share,
             len(residuals),
-            sum(residuals.values()) - 3,
+            sum(residuals.values()) - se2.DOF,
             frozenset(information_of),
             frozenset(m.landmark_id for m in outliers) - frozenset(information_of),
             frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
@@ -134,8 +133,8 @@ class PlaceSearch:
         explained = (costs < MAX_COST_PER_DOF * dofs).tolist()
         return [m for m, kept in zip(sightings, explained, strict=True) if kept]
 
-    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
-        return fit_pose(start, sightings, self._factors, self._config, iterations)
+    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> Fit | None:
+        return fit_pose(start, sightings, self._factors, self._config)
 
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:

@@ -12,6 +12,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.noise_models import repetition
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
@@ -270,12 +271,10 @@ class Association:
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
-        correlation_s = self._config.landmarks.repeat_s
-        last = self._last_used_ns.get(m.landmark_id)
-        if correlation_s == 0.0 or last is None or isinstance(m, PixelMeasurement | PoseMeasurement):
+        if isinstance(m, PixelMeasurement | PoseMeasurement):
             return m, 1.0
-        apart = max((m.stamp_ns - last) * 1e-9, 0.01)
-        scale = max(1.0, correlation_s / apart)
+        last = self._last_used_ns.get(m.landmark_id)
+        scale = repetition(self._config.landmarks.repeat_s, last, m.stamp_ns)
         return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
 
     @property

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgloc import se2
 from fgloc.config import WeightsConfig
 from fgloc.types import FloatArray
 
@@ -15,7 +16,6 @@ _CALM = 0.6  # of the alarm: below it the newest window agrees
 _LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
 _LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
 _LEAST_LEVEL = 0.25  # covariances are taken to be given too large by at most four times
-_DOF = 3.0  # expected of one window
 _ADAPTS = 0.1  # share by which a step moves the quantile
 
 
@@ -94,7 +94,7 @@ class GlrTest:
         nis /= self._level
         if not self.flagged:
             if nis <= self._config.alarm:
-                return GlrResult(False, 0, nis, span, max(self._level, nis / _DOF))
+                return GlrResult(False, 0, nis, span, max(self._level, nis / se2.DOF))
             self.flagged, self._calm_s = True, 0.0
             return GlrResult(True, span, nis, span)
         self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0

@@ -24,7 +24,7 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import innovation, joint_cov, transition
 from fgloc.graph.linearized import Linearized
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.noise_models import sighting_whitening
+from fgloc.graph.noise_models import repetition, sighting_whitening
 from fgloc.graph.observation import Observations
 from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
@@ -239,10 +239,9 @@ class LandmarkModes:
 
     def _shared(self, m: LandmarkMeasurement) -> float:
         """Scale on the sigma of a rejected sighting, as errors of one landmark are correlated for some time."""
-        last = self._last_ns.get(m.landmark_id)
-        if last is None or isinstance(m, PixelMeasurement):
+        if isinstance(m, PixelMeasurement):
             return 1.0
-        return math.sqrt(max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 1e-3)))
+        return math.sqrt(repetition(self._repeat_s, self._last_ns.get(m.landmark_id), m.stamp_ns))
 
     def _certain(self) -> int | None:
         """A landmark that was moved, if no other one explains the sightings."""

@@ -17,6 +17,7 @@ from collections import deque
 
 import numpy as np
 
+from fgloc.sensors.rest import commanded_to_move, is_standing
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
 
@@ -27,8 +28,6 @@ _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a 
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
 _LEARN_S = 2.0  # before the first test
 _LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
-_STANDS_NS = 1_000_000_000  # how long no command has moved the robot before its turn is not its own
-_STANDS_M, _STANDS_RAD = 1e-3, 1e-3  # motion of standing wheels in a second: quantization
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
 _CARRIED_SPEED = 0.7  # m/s: sigma of each axis; a person walks at 1 m/s
 _CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro measures the turn
@@ -159,9 +158,10 @@ class _TurnTest:
 
     def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
         """Squared ratio of turn and standard deviation since the robot stands, and its bound."""
-        bound = chi2_bound(1.0 - _FALSE_PER_S * max(step.dt, 1e-3), 1)
+        bound = chi2_bound(1.0 - _FALSE_PER_S * step.dt, 1)
         wheels, gyro = readings.wheels, readings.gyro
-        if wheels is None or gyro is None or not _told_to_stand(step) or not _stand(wheels.motion, step.dt):
+        told_to_stand = commanded_to_move(step) is False
+        if wheels is None or gyro is None or not told_to_stand or not is_standing(wheels.motion, step.dt):
             self._turned = self._variance = 0.0
             return 0.0, bound
         self._turned += float(gyro.motion[2])
@@ -169,14 +169,3 @@ class _TurnTest:
         if abs(self._turned) < _LEAST_TURN:
             return 0.0, bound
         return self._turned**2 / self._variance, bound
-
-
-def _told_to_stand(step: Step) -> bool:
-    """Whether all commands of the last second are zero, and there are some."""
-    recent = [c for c in step.controls if c.stamp_ns >= step.start_ns - _STANDS_NS]
-    return bool(recent) and all(c.v == 0.0 and c.omega == 0.0 for c in recent)
-
-
-def _stand(motion: FloatArray, dt: float) -> bool:
-    x, y, yaw = motion
-    return math.hypot(x, y) < _STANDS_M * max(dt, 0.1) and abs(yaw) < _STANDS_RAD * max(dt, 0.1)

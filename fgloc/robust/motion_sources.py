@@ -17,12 +17,12 @@ from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
-_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 
 
 class MotionSources:
@@ -83,7 +83,7 @@ class MotionSources:
         if self.gyro is not None:
             without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
             turn = self.gyro.measure(
-                step, None if wheels is None or _is_commanded_to_move(step) else motion, without_yaw_s
+                step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s
             )
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
@@ -204,17 +204,11 @@ class MotionSources:
         """
         if self.gyro is None or self._turn is None:
             return 0.0
-        noise, bias = self._turn.noise_density, self.gyro.bias_variance
-        return 2.0 * variance / (noise + math.sqrt(noise**2 + 4.0 * bias * variance))
+        noise, bias = 0.5 * self._turn.noise_density, self.gyro.bias_variance
+        return variance / (noise + math.sqrt(noise**2 + bias * variance))
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
         self._silent_s = self._yaw_indirect_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
-
-
-def _is_commanded_to_move(step: Step) -> bool:
-    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
-    since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.controls)
