@@ -24,29 +24,6 @@ _MODES = "fgloc.robust.landmark_modes:LandmarkModes"
 _NO_KERNEL = 1e6  # sigmas
 
 
-def _linear_nis(real: Function) -> Function:
-    """`correct` for the test of joint compatibility alone."""
-
-    def correct(*args: Any) -> Any:
-        return real(*args) if _linear_nis.testing else None  # type: ignore[attr-defined]
-
-    return correct
-
-
-def _testing(real: Function) -> Function:
-    def agreed(*args: Any) -> Any:
-        _linear_nis.testing = True  # type: ignore[attr-defined]
-        try:
-            return real(*args)
-        finally:
-            _linear_nis.testing = False  # type: ignore[attr-defined]
-
-    return agreed
-
-
-_linear_nis.testing = False  # type: ignore[attr-defined]
-
-
 def _unblurred(real: Function) -> Function:
     def corner(*args: Any) -> Any:
         m = real(*args)
@@ -67,13 +44,6 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
         ("robust/association.py",),
         (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
-        batch=True,
-    ),
-    Mechanism(
-        "corrected_nis",
-        "Far from linear the NIS is taken at the pose that prediction and sighting make likeliest.",
-        ("robust/association.py", "graph/joint.py"),
-        (Switch(f"{_GATE}:correct", _linear_nis), Switch(f"{_GATE}:Association._agreed", _testing)),
         batch=True,
     ),
     Mechanism(

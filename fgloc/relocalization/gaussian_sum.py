@@ -29,7 +29,7 @@ _OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was m
 _UNIFORM = 1.0 / (2.0 * math.pi * 10.0)  # ... which may be seen in any direction [1/rad] and up to 10 m away [1/m]
 _NEGLIGIBLE = 12.0  # in log weight: less probable than e^-12 of the most probable
 _AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
-_SAME = np.array([0.05, 0.05, 0.03])  # m, m, rad: two hypotheses this near are one
+_SAME = 0.05  # m, rad: two hypotheses this near are one
 
 
 class GaussianSum:

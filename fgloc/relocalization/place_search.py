@@ -9,7 +9,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, apart
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
@@ -24,15 +24,13 @@ from fgloc.types import (
 
 _LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
-_CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
+_DETERMINE = 2  # beacons that determine a pose: of more on the map, one can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
 _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
-_MAX_PLACES = 4  # that are fitted to the end
 _ROUGH_ITERATIONS = 4
-_LASTING = 0.8  # of the time that is collected
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
 _YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
 
@@ -64,7 +62,7 @@ class PlaceSearch:
             return None
         places: list[FloatArray] = []
         for fit in sorted(rough, key=lambda fit: fit.cost):
-            if len(places) < _MAX_PLACES and all(apart(fit.pose, other) for other in places):
+            if all(apart(fit.pose, other) for other in places):
                 places.append(fit.pose)
         found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
         if not found:
@@ -81,7 +79,7 @@ class PlaceSearch:
         agreeing = [
             m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
-        few = self._map is not None and len(self._map) < _CHECKABLE
+        few = self._map is not None and len(self._map) <= _DETERMINE
         if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
             return True
         for landmark_id in best.agreeing:
@@ -168,7 +166,7 @@ def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
     """Whether a place follows from registered sensors alone for most of a time."""
     stamps = [m.stamp_ns for m in sightings]
     by_sensors = all(isinstance(m, PoseMeasurement) for m in sightings)
-    return bool(stamps) and by_sensors and max(stamps) - min(stamps) > _LASTING * window_ns
+    return bool(stamps) and by_sensors and max(stamps) - min(stamps) > WHOLE_SHARE * window_ns
 
 
 def _information(m: LandmarkMeasurement) -> float:

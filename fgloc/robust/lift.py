@@ -19,7 +19,7 @@ import numpy as np
 
 from fgloc.sensors.rest import commanded_to_move, is_standing
 from fgloc.stats import chi2_bound
-from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
+from fgloc.types import Decision, MotionReadings, Step
 
 _FALSE_PER_S = 1.0 / 3600.0  # of each test
 _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
@@ -29,8 +29,6 @@ _MEMORY_S = 60.0  # over which level and standard deviation of the specific forc
 _LEARN_S = 2.0  # before the first test
 _LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
-_CARRIED_SPEED = 0.7  # m/s: sigma of each axis; a person walks at 1 m/s
-_CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro measures the turn
 _ONSET_S = 0.5  # from the start of a lift to its alarm
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
 _LONGEST_S = 10.0  # ... and without sightings it has been set down by then
@@ -78,18 +76,10 @@ class LiftMonitor:
             told = [Decision(k, step.stamp_ns, "lift", -1, math.nan, math.nan, 0, 0.0, "carried")]
         return told
 
-    def motion(self, step: Step, readings: MotionReadings) -> MotionMeasurement:
-        """What is known of the motion of a carried robot: that a person is not fast, and the turn if there is a gyro.
-
-        Its way goes on in one direction, so that sigma grows with the time since the last fix.
-        """
+    def carried_s(self, step: Step) -> float:
+        """How long before a step that it is carried over the robot was fixed last [s]."""
         before, self._since_fix_s = self._since_fix_s, self._since_fix_s + step.dt
-        cov: FloatArray = np.diag(np.square([_CARRIED_SPEED, _CARRIED_SPEED, _CARRIED_TURN]))
-        cov = cov * (self._since_fix_s**2 - before**2)
-        motion, gyro = np.zeros(3), readings.gyro
-        if gyro is not None:
-            motion[2], cov[2, 2] = gyro.motion[2], gyro.cov[2, 2]
-        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
+        return before
 
     def fix(self) -> None:
         """Sightings have fixed the pose."""
