@@ -6,7 +6,6 @@ from typing import Any
 
 from benchmarks.mechanisms_switch import (
     Constant,
-    Function,
     Mechanism,
     Probe,
     Returns,

@@ -12,7 +12,6 @@ from fgloc.types import (
     FloatArray,
 )
 
-
 _SAME_STAMP_S = 0.01  # sightings nearer than this are one
 
 

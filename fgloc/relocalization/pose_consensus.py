@@ -18,8 +18,8 @@ _SAME_PLACE = 0.3  # m, rad: candidates nearer than this are one place
 # rest have wrong ids, or were moved. One that explains less than this ...
 WHOLE_SHARE = 0.8
 _PARTIAL_COST_PER_DOF = 1.5  # ... takes a better fit ...
-# ... and has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a short
-# way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
+# ... and has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a
+# short way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SHARP_SIGMA = 0.1  # m, rad
 REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 

@@ -18,10 +18,9 @@ from collections import deque
 import numpy as np
 
 from fgloc.sensors.rest import commanded_to_move, is_standing
-from fgloc.stats import chi2_bound
+from fgloc.stats import alarm_bound
 from fgloc.types import Decision, MotionReadings, Step
 
-_FALSE_PER_S = 1.0 / 3600.0  # of each test
 _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
 _PARTS = 10  # windows that are looked at in each step: these tenths of it
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
@@ -130,7 +129,7 @@ class _RiseTest:
         ends = np.searchsorted(spans, np.linspace(1.0 / _PARTS, 1.0, _PARTS) * spans[-1] - 1e-9)
         sigmas = np.sqrt(np.maximum(self._variance * spans[ends] / _WINDOW_S, _LEAST_SIGMA**2))
         nis = np.where(np.abs(rises[ends]) > _LEAST_RISE, (rises[ends] / sigmas) ** 2, 0.0)
-        bound = chi2_bound(1.0 - _FALSE_PER_S * dt / _PARTS, 1)
+        bound = alarm_bound(dt, _PARTS, 1)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)
@@ -148,7 +147,7 @@ class _TurnTest:
 
     def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
         """Squared ratio of turn and standard deviation since the robot stands, and its bound."""
-        bound = chi2_bound(1.0 - _FALSE_PER_S * step.dt, 1)
+        bound = alarm_bound(step.dt, 1, 1)
         wheels, gyro = readings.wheels, readings.gyro
         told_to_stand = commanded_to_move(step) is False
         if wheels is None or gyro is None or not told_to_stand or not is_standing(wheels.motion, step.dt):
