@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
 
 from benchmarks.mechanisms_switch import (
     Argument,
-    Function,
     Mechanism,
     Probe,
     Returns,
     Switch,
-    called,
     not_none,
     something,
 )
@@ -22,14 +18,6 @@ _GATE = "fgloc.robust.association"
 _POSE_FIT = "fgloc.relocalization.pose_fit"
 _MODES = "fgloc.robust.landmark_modes:LandmarkModes"
 _NO_KERNEL = 1e6  # sigmas
-
-
-def _unblurred(real: Function) -> Function:
-    def corner(*args: Any) -> Any:
-        m = real(*args)
-        return None if m is None else replace(m, blur_s=0.0)
-
-    return corner
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
@@ -75,14 +63,6 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         ("robust/association.py", "robust/sighting_judge.py"),
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
-        batch=True,
-    ),
-    Mechanism(
-        "blur_noise",
-        "Noise of corners grows with the speed of the image.",
-        ("sensors/markers/measure.py", "graph/corner_batch.py"),
-        (Switch("fgloc.sensors.markers.measure:CornerMeasurer._corner", _unblurred),),
-        Probe("fgloc.sensors.markers.measure:CornerMeasurer._corner", called),
         batch=True,
     ),
 )
