@@ -14,7 +14,7 @@ _LEAST_S = 0.1  # a shorter step has as large a quantization
 def is_standing(motion: FloatArray, seconds: float) -> bool:
     """Whether a motion ``(3,)`` that wheels measured over a step of this length is none."""
     x, y, yaw = motion
-    return max(math.hypot(x, y), abs(yaw)) < _QUANTIZATION * max(seconds, _LEAST_S)
+    return bool(max(math.hypot(x, y), abs(yaw)) < _QUANTIZATION * max(seconds, _LEAST_S))
 
 
 def commanded_to_move(step: Step) -> bool | None:
