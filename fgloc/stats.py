@@ -1,7 +1,7 @@
 """Quantiles that decide: one place for what "unlikely" means.
 
 There are three levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm an hour of a
-monitor (`alarm_bound`), and the gate's of several hypotheses over a whole run (`evidence_bound`), by which a landmark is
+monitor (`alarm_bound`), and the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is
 named to the user.
 """
 
