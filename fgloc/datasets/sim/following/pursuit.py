@@ -27,6 +27,7 @@ class State(StrEnum):
     FOLLOWING = "following"
     SLOWED = "slowed"  # the pose is uncertain
     STOPPED = "stopped"  # no pose, or one that is too uncertain to drive by
+    LOOKING = "looking"  # turns round once before it drives
     SEARCHING = "searching"  # turns on the spot: the camera may see a marker
     ARRIVED = "arrived"
 
@@ -46,6 +47,8 @@ class PursuitSettings(Section):
     stop_sigma_m: Positive = 0.40  # and from which on it stands: a path of waypoints 0.3 m apart is lost
     search_after_s: float = Field(3.0, ge=0)  # so long stopped, the robot turns to look for markers ...
     search_omega: float = Field(0.4, ge=0)  # rad/s, ... so slowly that images are sharp
+    look_sigma_m: float = Field(0.01, ge=0)  # a robot that knows its place less well turns round once before it drives
+    look_omega: Positive = 0.8  # rad/s
 
 
 class Pursuit:
@@ -64,6 +67,9 @@ class Pursuit:
         self._settings = settings or PursuitSettings()
         self._v = 0.0
         self._stopped_since_s: float | None = None
+        self._looked_rad = 0.0  # how far it has turned round
+        self._yaw: float | None = None  # while it does; None: before
+        self._looks = True
         self._curvature = _curvature(curve)
 
     def command(self, t: float, pose: FloatArray | None, position_sigma_m: float = 0.0) -> Command:
@@ -81,6 +87,9 @@ class Pursuit:
         if pose is None or trust == 0.0:
             return self._stand(t)
         self._stopped_since_s = None
+        if self._looks and self._looking(float(pose[2]), position_sigma_m):
+            self.state = State.LOOKING
+            return 0.0, min(s.look_omega, _APPROACH_PER_S * (math.tau - self._looked_rad))
         self.state = State.FOLLOWING if trust == 1.0 else State.SLOWED
         self.progress = self._nearest(pose)
         left_m = self._curve.length_m - float(self._curve.along_m[self.progress])
@@ -88,6 +97,16 @@ class Pursuit:
             self.state, self._v = State.ARRIVED, 0.0
             return 0.0, 0.0
         return self._pursue(pose, left_m, trust)
+
+    def _looking(self, yaw: float, position_sigma_m: float) -> bool:
+        """Whether the robot is still to turn round: once, at the beginning, if it does not know its place well."""
+        if self._yaw is None:
+            self._looks = position_sigma_m > self._settings.look_sigma_m
+        else:
+            self._looked_rad += math.remainder(yaw - self._yaw, math.tau)
+            self._looks = self._looked_rad < math.tau - _LOOKED_RAD
+        self._yaw = yaw
+        return self._looks
 
     def _pursue(self, pose: FloatArray, left_m: float, trust: float) -> Command:
         s = self._settings
@@ -99,7 +118,7 @@ class Pursuit:
         off = math.atan2(left, forward)
         if abs(off) > s.turn_on_spot_rad:
             self._v = 0.0
-            return 0.0, math.copysign(min(s.max_omega, 2.0 * abs(off)), off)
+            return 0.0, math.copysign(min(s.max_omega, _APPROACH_PER_S * abs(off)), off)
         curvature = 2.0 * left / max(forward**2 + left**2, s.lookahead_m[0] ** 2)
         sharpest = float(self._curvature[self.progress : ahead + 1].max())
         speed = self._speed * min(1.0, 1.0 / (sharpest * s.curvature_radius_m), left_m / s.approach_m) * trust
@@ -132,6 +151,8 @@ class Pursuit:
 
 
 _SEARCHED_M = 0.3
+_APPROACH_PER_S = 2.0  # yaw rate on the spot over what is left to be turned
+_LOOKED_RAD = 0.03  # short of a whole turn: it is over
 _SMOOTHED_M = 0.05  # to each side: curvature of the curve, not of its corners
 
 
