@@ -15,6 +15,7 @@ from fgloc.evaluation.metrics import ground_metrics, match_result
 from fgloc.frames import quaternion_matrix
 from fgloc.types import RunResult
 
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording with the corners of markers."""

@@ -1,4 +1,4 @@
-"""What a learned motion is off by on this robot: its scale, straight on and while turning, estimated beside the poses."""
+"""What a learned motion is off by on this robot: its scale, and a speed that depends on its turning."""
 
 from __future__ import annotations
 
