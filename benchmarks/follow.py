@@ -10,7 +10,7 @@ pose that guided the robot, and how long it drove, without the learned motion: a
 
 With ``--corners`` the camera sends corners with a detector's noise (`fgloc.datasets.sim.corners`); nothing is rendered.
 Cases (`fgloc.datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
-friction 0.1 everywhere; dark20, no images from 8 to 28 s, on ice; onewheel, the left encoder counts nothing in that
+friction 0.1 everywhere; dark20, no images from 16 to 36 s, on ice; onewheel, the left encoder counts nothing in that
 time; moved, a marker is 0.5 m from where the map has it. Rows ``slope``, ``rough`` and ``flat.uneven_over_flat`` are
 described in `benchmarks.follow_ground`; ``--ground`` measures these alone. Finished drives are kept, so that an
 interrupted run goes on.

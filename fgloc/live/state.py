@@ -121,11 +121,15 @@ def read_state(path: Path, map_fingerprint: str) -> Resumed:
 
 
 def installation_of_state(state: RunState, installation: Installation) -> InstallationEstimate | None:
-    """What was found, if the parameters are still the same."""
+    """What was found, if the parameters are still the same; the ground is that of where the robot is now: not known."""
     saved = state.installation
     if saved.names != installation.names or not saved.names:
         return None
-    return InstallationEstimate(np.array(saved.mean), np.array(saved.cov))
+    prior, constants = installation.prior(), installation.constants
+    mean, cov = prior.mean, prior.cov
+    mean[:constants] = saved.mean[:constants]
+    cov[:constants, :constants] = np.array(saved.cov)[:constants, :constants]
+    return InstallationEstimate(mean, cov)
 
 
 def matrix3(cov: FloatArray) -> tuple[Row3, Row3, Row3]:

@@ -115,7 +115,7 @@ def test_paths_are_followed_to_their_end_also_where_they_cross_themselves(name: 
     pursuit = Pursuit(curve, path.speed_m_s)
     poses = driven(pursuit, path.start)
     assert pursuit.state is State.ARRIVED
-    assert curve.distances(poses[:, :2]).mean() < 0.005
+    assert curve.distances(poses[:, :2]).mean() < 0.006
     nearest = [np.hypot(*(poses[:, :2] - w).T).min() for w in path.waypoints]
     assert max(nearest) < 0.03
 
@@ -126,8 +126,35 @@ def test_a_robot_that_looks_away_turns_on_the_spot_first() -> None:
     assert pursuit.command(0.1, np.array([-0.6, 0.0, math.pi - 0.1]))[1] < -1.0
 
 
+def test_a_robot_that_does_not_know_its_place_well_turns_round_once() -> None:
+    pose, pursuit = np.array([-0.6, 0.0, 0.0]), Pursuit(Curve(HOOK), 0.4)
+    turned, states = 0.0, []
+    for k in range(400):
+        v, omega = pursuit.command(0.05 * k, pose, 0.02)
+        states.append(pursuit.state)
+        if pursuit.state is State.LOOKING:
+            assert v == 0.0
+            turned += 0.05 * omega
+        pose = se2.compose(pose, se2.exp((0.05 * v, 0.0, 0.05 * omega)))
+    assert turned == pytest.approx(math.tau, abs=0.05)
+    assert states.index(State.FOLLOWING) == states.count(State.LOOKING) < 400  # once, and before all else
+    sure = Pursuit(Curve(HOOK), 0.4)
+    sure.command(0.0, np.array([-0.6, 0.0, 0.0]), 0.005)
+    assert sure.state is State.FOLLOWING
+
+
+def test_a_robot_whose_tyres_stick_is_told_to_turn_more() -> None:
+    off = np.array([-0.6, 0.02, 0.0])
+    stuck, follows = (Pursuit(Curve(HOOK), 0.4, PursuitSettings(rate_gain=g)) for g in (0.5, 0.0))
+    stuck.command(0.0, off)
+    follows.command(0.0, off)
+    wanted = follows.command(0.05, off)[1]
+    assert wanted < 0.0
+    assert stuck.command(0.05, off)[1] == pytest.approx(1.5 * wanted)
+
+
 def test_an_uncertain_pose_slows_the_robot_and_a_lost_one_stops_it_until_it_is_found() -> None:
-    settings = PursuitSettings(slow_sigma_m=0.1, stop_sigma_m=0.3, search_after_s=2.0)
+    settings = PursuitSettings(slow_sigma_m=0.1, stop_sigma_m=0.3, search_after_s=2.0, look_sigma_m=1.0)
     pose, pursuit = np.array([-0.3, 0.0, 0.0]), Pursuit(Curve(HOOK), 0.4, settings)
     sure, slow, lost = (pursuit.command(0.1, pose, sigma) for sigma in (0.05, 0.2, 0.31))
     assert 0.0 < slow[0] == pytest.approx(0.5 * sure[0])

@@ -3,61 +3,23 @@
 from __future__ import annotations
 
 import csv
-import heapq
 import json
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sim_ramp import estimated, record_ramp
 
-from fgloc import run
 from fgloc.cli.terminal import exit_code
-from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.sim.physics import make_scene, simulate
-from fgloc.datasets.sim.record import write_beside
-from fgloc.datasets.sim.scenario import Scenario
-from fgloc.datasets.sim.sensors import streams
 from fgloc.evaluation.metrics import ground_metrics, match_result
 from fgloc.frames import quaternion_matrix
 from fgloc.types import RunResult
-
-RAMP = Scenario.model_validate(
-    {
-        "name": "ramp",
-        "duration_s": 16.0,
-        "start": (-1.9, 0.0, 0.0),
-        "world": {
-            "size_m": (6.0, 5.0),
-            "floor": {"ramp": {"start_x": -1.2, "angle_deg": 12.0, "rise_m": 0.8, "top_m": 0.6}},
-            "markers": {"count": 20},
-        },
-        "camera": {"rate_hz": 5},
-        "control": {"waypoints": [(0.9, 0.0), (0.2, 0.3), (-1.9, 0.0)], "speed": 0.45},
-        "installation": "as_installed",
-    }
-)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording with the corners of markers."""
-    out = tmp_path_factory.mktemp("ramp")
-    scene = make_scene(RAMP, 5)
-    log = simulate(scene)
-    with BagWriter(out / "bag", compress=True) as bag:
-        for _, write in heapq.merge(*streams(scene, log, bag, "corners"), key=itemgetter(0)):
-            write()
-    write_beside(out, scene, RAMP, camera=False)
-    return out
-
-
-def estimated(folder: Path, mode: str, **estimator: object) -> tuple[RunResult, Config]:
-    config = load_config(folder / "robot.yaml")
-    changed = config.estimator.model_copy(update=estimator)
-    config = config.model_copy(update={"estimator": changed})
-    return run(folder / "bag", folder / "map.yaml", config, mode, check=False), config  # type: ignore[arg-type]
+    return record_ramp(tmp_path_factory.mktemp("ramp"))
 
 
 @pytest.mark.parametrize(("mode", "kind"), [("online", "fixed_lag"), ("batch", "fixed_lag"), ("online", "ekf")])

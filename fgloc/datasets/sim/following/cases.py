@@ -19,7 +19,7 @@ from fgloc.datasets.sim.scenario import Camera, Scenario
 from fgloc.datasets.sim.sensors import Sees
 from fgloc.datasets.sim.suite import BUNDLED, load_suite
 
-FAILED_S = (8.0, 28.0)  # when a sensor fails: from the first lane to the last but one
+FAILED_S = (16.0, 36.0)  # when a sensor fails: from the first lane to the last but one
 MOVED_M = 0.5
 _CAMERA_HZ = 5.0
 _BLIND = ("truth", "wheels", "learned")  # need no images

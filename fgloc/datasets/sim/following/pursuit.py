@@ -4,7 +4,9 @@ Source: Macenski, Singh, Martin, Ginés 2023, "Regulated pure pursuit for robot 
 the look-ahead grows with the speed, the speed falls with the curvature and towards the goal, and the robot turns on the
 spot where the path leads behind it. Two things differ: the curvature is that of the path between the robot and the
 look-ahead point, which is known before the robot is there; and instead of obstacles it is the pose's uncertainty that
-slows the robot down.
+slows the robot down. Two things are added: a robot that does not know its place well turns round once before it drives,
+so that the camera sees markers on all sides; and the yaw rate is regulated, because tyres stick: without that a robot
+that is told to turn slowly turns a second late, and swings about the path by a centimetre.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ class State(StrEnum):
     FOLLOWING = "following"
     SLOWED = "slowed"  # the pose is uncertain
     STOPPED = "stopped"  # no pose, or one that is too uncertain to drive by
+    LOOKING = "looking"  # turns round once before it drives
     SEARCHING = "searching"  # turns on the spot: the camera may see a marker
     ARRIVED = "arrived"
 
@@ -41,11 +44,14 @@ class PursuitSettings(Section):
     least_speed_m_s: Positive = 0.08
     turn_on_spot_rad: Positive = 1.2  # the look-ahead point is so far off the robot's heading
     max_omega: Positive = 1.5  # rad/s
+    rate_gain: float = Field(0.5, ge=0, lt=1)  # of the yaw rate that is lacking: tyres stick; 1: a quick robot swings
     arrived_m: Positive = 0.02
     slow_sigma_m: Positive = 0.15  # standard deviation of the position from which on the robot drives more slowly
     stop_sigma_m: Positive = 0.40  # and from which on it stands: a path of waypoints 0.3 m apart is lost
     search_after_s: float = Field(3.0, ge=0)  # so long stopped, the robot turns to look for markers ...
     search_omega: float = Field(0.4, ge=0)  # rad/s, ... so slowly that images are sharp
+    look_sigma_m: float = Field(0.01, ge=0)  # a robot that knows its place less well turns round once before it drives
+    look_omega: Positive = 0.8  # rad/s
 
 
 class Pursuit:
@@ -64,6 +70,8 @@ class Pursuit:
         self._settings = settings or PursuitSettings()
         self._v = 0.0
         self._stopped_since_s: float | None = None
+        self._looked_rad: float | None = None  # how far it has turned round; None: before the first pose
+        self._last: tuple[float, float] | None = None  # time and yaw of the last command
         self._curvature = _curvature(curve)
 
     def command(self, t: float, pose: FloatArray | None, position_sigma_m: float = 0.0) -> Command:
@@ -81,13 +89,34 @@ class Pursuit:
         if pose is None or trust == 0.0:
             return self._stand(t)
         self._stopped_since_s = None
+        seconds, turned = self._since_last(t, float(pose[2]))
+        left_rad = self._left_to_look(turned, position_sigma_m)
+        if left_rad > _LOOKED_RAD:
+            self.state = State.LOOKING
+            return 0.0, min(s.look_omega, _APPROACH_PER_S * left_rad)
         self.state = State.FOLLOWING if trust == 1.0 else State.SLOWED
         self.progress = self._nearest(pose)
         left_m = self._curve.length_m - float(self._curve.along_m[self.progress])
         if left_m < s.arrived_m:
             self.state, self._v = State.ARRIVED, 0.0
             return 0.0, 0.0
-        return self._pursue(pose, left_m, trust)
+        v, omega = self._pursue(pose, left_m, trust)
+        if v > 0.0:
+            omega += s.rate_gain * (omega - turned / seconds)
+        return v, math.copysign(min(abs(omega), s.max_omega), omega)
+
+    def _since_last(self, t: float, yaw: float) -> tuple[float, float]:
+        """Time [s] since the last command, and what the robot has turned in it [rad]."""
+        before, self._last = self._last or (t, yaw), (t, yaw)
+        return max(t - before[0], 1e-3), math.remainder(yaw - before[1], math.tau)
+
+    def _left_to_look(self, turned: float, position_sigma_m: float) -> float:
+        """How far the robot is still to turn round [rad]: once, at first, if it does not know its place well."""
+        if self._looked_rad is None:
+            self._looked_rad = 0.0 if position_sigma_m > self._settings.look_sigma_m else math.tau
+        elif self._looked_rad < math.tau - _LOOKED_RAD:
+            self._looked_rad += turned
+        return math.tau - self._looked_rad
 
     def _pursue(self, pose: FloatArray, left_m: float, trust: float) -> Command:
         s = self._settings
@@ -99,7 +128,7 @@ class Pursuit:
         off = math.atan2(left, forward)
         if abs(off) > s.turn_on_spot_rad:
             self._v = 0.0
-            return 0.0, math.copysign(min(s.max_omega, 2.0 * abs(off)), off)
+            return 0.0, math.copysign(min(s.max_omega, _APPROACH_PER_S * abs(off)), off)
         curvature = 2.0 * left / max(forward**2 + left**2, s.lookahead_m[0] ** 2)
         sharpest = float(self._curvature[self.progress : ahead + 1].max())
         speed = self._speed * min(1.0, 1.0 / (sharpest * s.curvature_radius_m), left_m / s.approach_m) * trust
@@ -132,6 +161,8 @@ class Pursuit:
 
 
 _SEARCHED_M = 0.3
+_APPROACH_PER_S = 2.0  # yaw rate on the spot over what is left to be turned
+_LOOKED_RAD = 0.03  # short of a whole turn: it is over
 _SMOOTHED_M = 0.05  # to each side: curvature of the curve, not of its corners
 
 
