@@ -10,7 +10,7 @@ from fgloc.sensors.markers.images import GrayImage
 from fgloc.types import FloatArray
 
 BoolArray = NDArray[np.bool_]
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complexfloating]
 
 _ALONG = 12  # profiles on the part of an edge that belongs to a corner
 _ACROSS = 11  # samples of a profile
@@ -22,13 +22,15 @@ _ITERATIONS = 2
 _MOST_AT_ONCE = 128  # markers; OpenCV's remap takes 32767 rows
 _MAX_MOVE_PX = 2.5
 _FLOOR = 0.1  # of a profile's steepest place; what is flatter is noise
-_TINY = 1e-9  # in place of a weight of zero
+_MIN_VARIANCE = 1e-3  # of the places of edge points, weighted, in units of their range
 _MIN_CROSSING = 0.2  # sine of the angle in which two edges meet
 
+_SIGNS = np.array([1.0, -1.0])
 _WITH_NEXT, _WITH_PREVIOUS = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
-_STEPS_ALONG = np.linspace(0.0, 1.0, _ALONG)
-_STEPS_ACROSS = np.linspace(-1.0, 1.0, _ACROSS)
-_SUM_AND_MOMENT = np.stack([np.ones(_ACROSS - 1), 0.5 * (_STEPS_ACROSS[1:] + _STEPS_ACROSS[:-1])]).astype(np.float32)
+_ALONG_STEPS = np.linspace(0.0, 1.0, _ALONG)
+_ACROSS_STEPS = np.linspace(-1.0, 1.0, _ACROSS)
+_SUM_AND_MOMENT = np.stack([np.ones(_ACROSS - 1), 0.5 * (_ACROSS_STEPS[1:] + _ACROSS_STEPS[:-1])]).astype(np.float32)
+_POWERS = np.stack([np.ones(_ALONG), _ALONG_STEPS, _ALONG_STEPS**2], axis=1).astype(np.float32)
 
 
 def refine_corners(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
@@ -56,64 +58,73 @@ def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
     if len(corners) > _MOST_AT_ONCE:
         first = refine_all(image, corners[:_MOST_AT_ONCE], cells)
         return np.asarray(np.vstack([first, refine_all(image, corners[_MOST_AT_ONCE:], cells)]))
+    # Points and directions of the image are complex numbers x + iy: half as many calls of numpy as for pairs.
     given = np.ascontiguousarray(corners, dtype=np.float64).view(np.complex128)[..., 0]
-    found = given.copy()
-    clear = np.arange(len(given))  # markers with clear edges so far
-    for _ in range(_ITERATIONS):
-        if not len(clear):
-            break
-        moved, fits = _meeting_points(image, found[clear], cells)
-        move = moved - given[clear]
-        fits &= np.maximum(np.abs(move.real), np.abs(move.imag)).max(axis=1) <= _MAX_MOVE_PX
-        found[clear] = np.where(fits[:, None], moved, given[clear])
-        clear = clear[fits]
-    return found[..., None].view(np.float64)
-
-
-def _meeting_points(image: GrayImage, corners: ComplexArray, cells: int) -> tuple[ComplexArray, BoolArray]:
-    """Corners ``(m, 4)`` one step better, and of which markers ``(m,)`` the edges are clear.
-
-    Points and directions of the image are complex numbers x + iy: numpy takes half as many calls as for pairs.
-    """
     # 1. Each edge is seen from its two ends: index [marker, edge, end, place along it].
-    following = corners[:, _WITH_NEXT]
-    sides = following - corners
+    following = given[:, _WITH_NEXT]
+    sides = following - given
     lengths = np.abs(sides)
     clear = lengths.min(axis=1) >= _MIN_SIDE_PX
     lengths = np.maximum(lengths, 1.0)
-    along = sides / lengths
+    unit = sides / lengths
     near = np.minimum(1.5, 0.1 * lengths)
     reach = np.minimum(0.5 * lengths, _MAX_LENGTH_PX) - near
-    s = along[..., None] * (near[..., None] + _STEPS_ALONG * reach[..., None])
     half_width = np.minimum(np.maximum(_CELL_SHARE * lengths / cells, 1.0), _MAX_HALF_WIDTH_PX)
-    outward = half_width * (-1j * along)
-    on_edge = np.empty((len(corners), 4, 2, _ALONG), dtype=np.complex128)
-    np.add(corners[..., None], s, out=on_edge[:, :, 0])
-    np.subtract(following[..., None], s, out=on_edge[:, :, 1])
-    # 2. Profiles across the edges. Outwards they rise from black to white; falling parts belong to inner cells.
-    across = (_STEPS_ACROSS[:, None, None] * outward).astype(np.complex64)
-    points = on_edge.astype(np.complex64) + across[..., None, None]
-    places = points.view(np.float32).reshape(_ACROSS, -1, 2)
-    levels = cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    rise = cv2.subtract(levels[1:], levels[:-1], dtype=cv2.CV_32F)
-    rise = np.maximum(rise - np.float32(_FLOOR) * rise.max(axis=0), np.float32(0.0))
-    weights, moments = (_SUM_AND_MOMENT @ rise).reshape(2, *on_edge.shape)
-    totals = weights.sum(axis=3)
-    clear &= totals.min(axis=(1, 2)) > 0.0
-    edge_points = on_edge + outward[:, :, None, None] * (moments / np.maximum(weights, _TINY))
-    # 3. A line through each end's edge points: weighted total least squares. The square root of the second moment, of
-    # which the real part is xx - yy and the imaginary part 2 xy, points along the line.
-    share = weights / np.maximum(totals, _TINY)[..., None]
-    centers = (share * edge_points).sum(axis=3)
-    spread = edge_points - centers[..., None]
-    directions = np.sqrt((share * spread * spread).sum(axis=3))
-    directions /= np.maximum(np.abs(directions), _TINY)
-    # 4. A corner lies on the start of its edge and on the end of the one before.
+    outward = (half_width * (-1j * unit))[..., None]
+    starts = np.stack([given + near * unit, following - near * unit], axis=2)
+    along = (reach * unit)[..., None] * _SIGNS
+    places = starts[..., None] + along[..., None] * _ALONG_STEPS
+    # 2. A line through the edge points of each end, offset + slope * place, seen again from where the first one was.
+    across = (_ACROSS_STEPS[:, None, None, None, None] * outward[..., None]).astype(np.complex64)
+    offset, slope, sharp = _lines(image, places, across)
+    clear &= sharp
+    for _ in range(_ITERATIONS - 1):
+        shifts = offset[..., None] + slope[..., None] * _ALONG_STEPS
+        more_offset, more_slope, sharp = _lines(image, places + outward[..., None] * shifts, across)
+        offset, slope, clear = offset + more_offset, slope + more_slope, clear & sharp
+    # 3. A corner lies on the start of its edge and on the end of the one before.
+    moved, crossed = _meeting_points(starts + outward * offset, along + outward * slope)
+    move = (moved - given).view(np.float64)
+    clear &= crossed & (np.abs(move).max(axis=1) <= _MAX_MOVE_PX)
+    return np.where(clear[:, None], moved, given)[..., None].view(np.float64)
+
+
+def _meeting_points(origins: ComplexArray, directions: ComplexArray) -> tuple[ComplexArray, BoolArray]:
+    """Where lines ``(m, 4, 2)``, of two ends of four edges, meet: corners ``(m, 4)``, and of which markers ``(m,)``."""
     first, second = directions[:, :, 0], directions[:, _WITH_PREVIOUS, 1]
     crossing = _cross(first, second)
-    clear &= np.abs(crossing).min(axis=1) >= _MIN_CROSSING
-    from_first = _cross(centers[:, _WITH_PREVIOUS, 1] - centers[:, :, 0], second)
-    return centers[:, :, 0] + first * (from_first / np.where(clear[:, None], crossing, 1.0)), clear
+    least = _MIN_CROSSING * np.abs(first) * np.abs(second)
+    clear = np.asarray((np.abs(crossing) >= least).all(axis=1))
+    steps = _cross(origins[:, _WITH_PREVIOUS, 1] - origins[:, :, 0], second) / np.where(clear[:, None], crossing, 1.0)
+    return origins[:, :, 0] + first * steps, clear
+
+
+def _lines(image: GrayImage, places: ComplexArray, across: ComplexArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Lines of edge points, offset at the first place and slope ``(m, 4, 2)``; of which markers ``(m,)`` all are clear.
+
+    Offset and slope are in units of a profile's half width, per step from the first place to the last. Edge points are
+    uncertain across the edge only: weighted least squares, with the rise of gray level as weight.
+
+    Args:
+        image: gray levels.
+        places: middles ``(m, 4, 2, n)`` of the profiles.
+        across: samples of a profile from its middle ``(k, m, 4, 1, 1)``, outwards.
+    """
+    # Outwards profiles rise from black to white; falling parts belong to inner cells.
+    points = places.astype(np.complex64) + across
+    maps = points.view(np.float32).reshape(_ACROSS, -1, 2)
+    levels = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    rise = cv2.subtract(levels[1:], levels[:-1], dtype=cv2.CV_32F)
+    rise = np.maximum(rise - np.float32(_FLOOR) * rise.max(axis=0), np.float32(0.0))
+    sums = (_SUM_AND_MOMENT @ rise).reshape(2, *places.shape) @ _POWERS
+    w, wx, wxx = np.moveaxis(sums[0].astype(np.float64), 3, 0)
+    wy, wxy = np.moveaxis(sums[1, ..., :2].astype(np.float64), 3, 0)
+    determinant = w * wxx - wx * wx
+    sharp = determinant > _MIN_VARIANCE * w * w
+    determinant = np.where(sharp, determinant, 1.0)
+    offset = (wxx * wy - wx * wxy) / determinant
+    slope = (w * wxy - wx * wy) / determinant
+    return offset, slope, sharp.all(axis=(1, 2))
 
 
 def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:

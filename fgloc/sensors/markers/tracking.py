@@ -13,12 +13,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from fgloc.sensors.markers.aruco import Found, in_order
 from fgloc.sensors.markers.detector import Box, MarkerDetector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.types import FloatArray
-
-Found = list[tuple[int, FloatArray]]
 
 _EVERY = 30  # images from one search of the whole image at full resolution to the next
 _EVERY_WITHOUT = 4  # likewise, while there are no markers
@@ -42,6 +41,7 @@ class TrackingDetector:
         """Take a detector, which may be used elsewhere too."""
         self.counts: Counter[str] = Counter()
         self._detector = detector
+        self._coarse = detector.coarse()
         self._last: Found = []
         self._last_ns = -math.inf
         self._shape: tuple[int, ...] = ()
@@ -75,33 +75,33 @@ class TrackingDetector:
 
     def _coarsely(self, image: GrayImage, known: Found) -> Found | None:
         """What a coarse search and a close look at some parts find; None if the whole image is to be searched."""
-        found, squares = self._detector.find_coarse(image)
-        missing, shift = _compare(known, found)
-        squares += [corners + shift for _, corners in missing]
-        parts = _parts(squares, found, image.shape)
+        found, squares = self._coarse.find(image)
+        missing, moved = _compare(known, found)
+        if missing:
+            shift = np.median(moved, axis=0) if moved else np.zeros(2)
+            squares += [corners + shift for corners in missing]
+        parts = _parts(squares, found, image.shape) if squares else []
         if sum((right - left) * (bottom - top) for left, top, right, bottom in parts) > _MOST_SHARE * image.size:
             return None
         for part in parts:
             self.counts["parts"] += 1
             read = self._detector.find_within(image, part)
             found += [(i, c) for i, c in read if not any(i == j and _near(c, d) for j, d in found)]
-        if known and not found:
-            return None
-        return sorted(found, key=lambda f: (f[0], *f[1].mean(axis=0)))
+        return None if known and not found else in_order(found)
 
 
-def _compare(known: Found, found: Found) -> tuple[Found, FloatArray]:
-    """Markers that are missing now, and how far those that are not have moved ``(2,)``."""
+def _compare(known: Found, found: Found) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Corners of the last image's markers that are missing now, and how far those that are not have moved ``(2,)``."""
     left: dict[int, deque[FloatArray]] = {}
     for i, corners in found:
         left.setdefault(i, deque()).append(corners)
     missing, moved = [], []
     for i, corners in known:
         if left.get(i):
-            moved.append(left[i].popleft().mean(axis=0) - corners.mean(axis=0))
+            moved.append(left[i].popleft()[0] - corners[0])
         else:
-            missing.append((i, corners))
-    return missing, np.median(moved, axis=0) if moved else np.zeros(2)
+            missing.append(corners)
+    return missing, moved
 
 
 def _parts(squares: Iterable[FloatArray], found: Found, shape: tuple[int, ...]) -> list[Box]:
