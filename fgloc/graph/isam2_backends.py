@@ -7,6 +7,7 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dpotri
 
 from fgloc.config import EstimatorConfig
 from fgloc.graph.factors import (
@@ -118,10 +119,14 @@ class WholeRun:
 
 
 def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
-    x = pose_key(k)
-    found = isam2.jointMarginalCovariance([x, INSTALLATION])
-    known = InstallationEstimate(np.asarray(theta), np.asarray(found.at(INSTALLATION, INSTALLATION)))
-    return PoseWithCovariance(pose, np.asarray(found.at(x, x)), np.asarray(found.at(x, INSTALLATION)), known)
+    """Pose and installation with their joint covariance, of its square-root information: (RᵀR)⁻¹."""
+    R, _ = isam2.jointBayesNet(pose_key(k), INSTALLATION).matrix()
+    upper, failed = dpotri(R)
+    if failed:
+        raise RuntimeError("the joint information of pose and installation is singular")
+    upper = np.triu(upper)
+    P = upper + np.triu(upper, 1).T
+    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(np.asarray(theta), P[3:, 3:]))
 
 
 def _joint_on_ground(

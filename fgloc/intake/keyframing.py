@@ -30,8 +30,10 @@ class KeyframeBuilder:
     Where nothing was received, the step reaches to the next event, in pieces of at most 1 s.
 
     A keyframe is closed when every active source has sent at or beyond it, or ``reorder_s`` later by the newest
-    stamp. Motion events older than the last keyframe are lost ("late"), sightings are not; their source is waited for
-    longer in the next minute, up to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
+    stamp. A command holds until the next: of its topic nothing beyond the keyframe is needed, and it is waited for no
+    longer than its messages have lately been behind those of other topics. Measured motion older than the last
+    keyframe is lost ("late"), commands and sightings are not; their source is waited for longer in the next minute, up
+    to 1 s. Clock jumps (see ``ClockGuard``) end the segment.
 
     The first step of a segment has ``start_ns == stamp_ns``. Depends on the events alone, never on the wall clock.
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
@@ -126,7 +128,8 @@ class KeyframeBuilder:
         self._received_ns = event.received_ns
         source = self._sources.get(event.topic)
         if source is None:
-            source = self._sources[event.topic] = Punctuality(stamp, event.received_ns, self._reorder_ns)
+            held = isinstance(event, ControlEvent)
+            source = self._sources[event.topic] = Punctuality(stamp, event.received_ns, self._reorder_ns, held)
         elif stamp > source.newest_ns:
             source.newest_ns = stamp
         source.received_ns = event.received_ns
@@ -135,11 +138,12 @@ class KeyframeBuilder:
         late_ns = self._newest_ns - stamp if late else 0
         hopeless = late_ns > MAX_PATIENCE_NS and isinstance(event, _USED_LATE)  # they are used at whatever time
         source.late_ns.add(0 if hopeless else late_ns, self._newest_ns)
+        source.lag_ns.add(self._newest_ns - stamp, self._newest_ns)
         if isinstance(event, _USED_LATE):
             self._insert_late(event)
             return
         assert isinstance(event, MotionEvent)
-        if late:
+        if late and not (isinstance(event, ControlEvent) and late_ns < self._history_ns):
             self.rejections[f"{self._name(event)}.late"] += 1
         elif not self._motion.setdefault(type(event), EventBuffer()).insert(event):
             self.rejections[f"{self._name(event)}.duplicate"] += 1
@@ -229,6 +233,7 @@ class KeyframeBuilder:
         return all(
             source.newest_ns >= stamp_ns + source.disorder_ns.ns
             or (newest >= stamp_ns + source.patience_ns and waited_ns >= source.patience_ns // 2)
+            or (source.held and min(newest - stamp_ns, waited_ns) >= source.settled_ns)
             or (newest > source.newest_ns + _ALIVE_NS and self._received_ns - source.received_ns >= _ALIVE_NS // 2)
             for source in self._sources.values()
         )

@@ -27,6 +27,7 @@ class MotionParts:
     joint: ErrorCorrelation | None
     model: Any  # of the learned motion
     attitude: AttitudeSensor | None = None  # on uneven ground
+    signals_back_ns: int = 0  # how far before a keyframe the learned motion reads measured signals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +43,7 @@ class Anchor:
     since_fix_s: float
     budget: NoiseBudget
     gyro: RateSensor | None
-    learned: MotionPredictor | None  # without its model
+    learned: MotionPredictor | None  # without its model, and without the events that it has read
 
 
 class Outlet(Protocol):
@@ -75,8 +76,15 @@ class Anchors:
         self._rows = installation.motion_rows
         sigmas = {installation.names[i]: float(installation.sigmas[i]) for i in self._rows}
         sources = parts.localizer.motion.sources
-        model = None if parts.learned is None else parts.learned.model
-        self.parts = MotionParts(parts.config, Installation(sigmas), sources.rules.joint, model, sources.attitude)
+        learned = parts.learned
+        self.parts = MotionParts(
+            parts.config,
+            Installation(sigmas),
+            sources.rules.joint,
+            None if learned is None else learned.model,
+            sources.attitude,
+            0 if learned is None else learned.signals_back_ns,
+        )
 
     def make(self, step: Step, estimate: Estimate) -> Anchor:
         """The anchor of the estimate that the run's last step led to."""
@@ -102,7 +110,7 @@ class Anchors:
             since_fix_s=localizer.tracking.since_fix_s,
             budget=budget,
             gyro=None if gyro is None else gyro.fork(),
-            learned=None if learned is None else _without_model(learned),
+            learned=None if learned is None else learned.fork(None, {}),
         )
 
     def _of_motion(self, belief: PoseWithCovariance) -> PoseWithCovariance:
@@ -112,10 +120,3 @@ class Anchors:
 
     def _belief_of_motion(self, known: InstallationEstimate) -> InstallationEstimate:
         return InstallationEstimate(known.mean[self._rows], known.cov[np.ix_(self._rows, self._rows)])
-
-
-def _without_model(learned: MotionPredictor) -> MotionPredictor:
-    """A copy to be forked with a model again: the model is large, and always the same."""
-    copied: MotionPredictor = learned.fork(learned.model)
-    del copied.model
-    return copied

@@ -6,6 +6,7 @@ import copy
 import threading
 from bisect import bisect_left, bisect_right, insort
 from collections import defaultdict, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,8 @@ _FURTHEST_NS = 10_000_000_000  # beyond the newest message: nothing is known of 
 _CONTRADICTION = chi2_bound(0.99, 3)  # of wheels and learned motion; where they are rejected in error, little is lost
 _MOST_EVENTS = 8192  # of one kind
 
+_Events = Mapping[type[MotionEvent], Sequence[MotionEvent]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Means:
@@ -44,6 +47,7 @@ class _Means:
     model: Any
     factors: LandmarkFactors  # hold what is known of the installation
     attitude: AttitudeSensor | None
+    signals_back_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +87,10 @@ class Extrapolator:
         """The parts of the run have been built, or built again: the next anchor is the first of them."""
         model = copy.deepcopy(parts.model)  # it writes into buffers of its own
         with self._lock:
-            self._means = _Means(parts.joint, model, LandmarkFactors(None, parts.installation), parts.attitude)
+            self._kept_ns = max(self._history_ns, _BEFORE_NS, parts.signals_back_ns)
+            self._means = _Means(
+                parts.joint, model, LandmarkFactors(None, parts.installation), parts.attitude, parts.signals_back_ns
+            )
             self._anchors.clear()
 
     def add(self, event: MotionEvent) -> None:
@@ -128,10 +135,10 @@ class Extrapolator:
             if k < 0 or at_ns > newest + _FURTHEST_NS:
                 return None
             held = self._anchors[k]
-            step = self._step(held.anchor, at_ns)
+            step, past = self._step(held.anchor, at_ns), self._past(held)
         anchor = held.anchor
         with self._asked:
-            belief, mode = self._carried(held, step), anchor.mode
+            belief, mode = self._carried(held, step, past), anchor.mode
         since_fix_s = anchor.since_fix_s + step.dt
         if mode is Mode.OK and since_fix_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
@@ -150,6 +157,13 @@ class Extrapolator:
             {kind: self._window(kind, start_ns - self._back_ns(kind), end_ns) for kind in self._events},
         )
 
+    def _past(self, held: _Held) -> _Events:
+        """What the learned motion has read of measured signals up to the anchor."""
+        back_ns = held.means.signals_back_ns
+        if not back_ns:
+            return {}
+        return {kind: self._window(kind, held.stamp_ns - back_ns, held.stamp_ns) for kind in self._events}
+
     def _back_ns(self, kind: type[MotionEvent]) -> int:
         """How far before a step its events are of use: those of an inertial unit are integrated from end to end."""
         if issubclass(kind, ControlEvent):
@@ -162,12 +176,12 @@ class Extrapolator:
         first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
 
-    def _carried(self, held: _Held, step: Step) -> PoseWithCovariance:
+    def _carried(self, held: _Held, step: Step, past: _Events) -> PoseWithCovariance:
         anchor, means = held.anchor, held.means
         means.factors.estimated = anchor.known
         sensors = MotionSensors(
             held.wheels,
-            None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model),
+            None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model, past),
             means.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
             means.attitude,

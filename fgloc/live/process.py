@@ -22,17 +22,18 @@ from typing import Any, TypeAlias
 
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.anchors import Outlet
+from fgloc.live.anchors import Anchor, Outlet
 from fgloc.live.estimation import Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.types import Event, MotionEvent, RawEvent
+from fgloc.types import Estimate, Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
-# Motion events only matter to the estimation when a sighting or a question comes.
-_GATHER_S = 0.005  # for which they wait for one another: waking both processes costs more than sending
+# Motion events only matter to the estimation when a sighting or a question comes, and to close a sighting's keyframe.
+_GATHER_S = 0.02  # for which they wait for one another: waking both processes costs more than sending ...
+_GATHER_BRIEFLY_S = 0.003  # ... and while the estimate of a sighting is awaited
 _END_S = 10.0  # that it may take to use what it has and to save its state
 
 _Question: TypeAlias = tuple[int, str, tuple[Any, ...]]  # number, method of `Estimation`, arguments
@@ -56,6 +57,7 @@ class EstimationProcess:
         self._waiting: deque[Event | PoseWithCovariance | _Question] = deque()
         self._images = 0  # among them
         self._urgent = False  # one of them is to be sent at once
+        self._awaited_ns: int | None = None  # stamp of a sighting whose estimate has not come yet
         self._most_images = 0
         self._dropped: Counter[str] = Counter()
         self._numbers = itertools.count()
@@ -146,6 +148,8 @@ class EstimationProcess:
             raise EstimatorError("the live run is closed; make a new Live")
         self._waiting.append(item)
         self._urgent = self._urgent or not isinstance(item, MotionEvent)
+        if isinstance(item, RawEvent | SightingsEvent | SensorEvent):
+            self._awaited_ns = item.stamp_ns
         if self._urgent or len(self._waiting) == 1:
             self._changed.notify_all()
 
@@ -168,7 +172,8 @@ class EstimationProcess:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closing or self._failed is not None)
-                self._changed.wait_for(lambda: self._urgent or self._closing, _GATHER_S)
+                gather_s = _GATHER_S if self._awaited_ns is None else _GATHER_BRIEFLY_S
+                self._changed.wait_for(lambda: self._urgent or self._closing, gather_s)
                 batch = list(self._waiting)
                 self._waiting.clear()
                 self._images, self._urgent = 0, False
@@ -178,6 +183,11 @@ class EstimationProcess:
                 self._connection.send(batch)
             except OSError:  # the process has ended: `_receive` tells
                 return
+
+    def _has_come(self, _: Anchor, estimate: Estimate) -> None:
+        with self._changed:
+            if self._awaited_ns is not None and estimate.stamp_ns >= self._awaited_ns:
+                self._awaited_ns = None
 
     def _receive(self, outlet: Outlet) -> None:
         while True:
@@ -191,6 +201,7 @@ class EstimationProcess:
                 outlet.built(*content)
             elif kind == "estimated":
                 outlet.estimated(*content)
+                self._has_come(*content)
             elif kind == "failed":
                 self._fail(*content)
             else:

@@ -113,12 +113,14 @@ class OnlineRun:
         for step in self.parts.stepper.push(event):
             self.reordering_s = (self.parts.stepper.newest_ns - step.stamp_ns) * 1e-9
             yield step, self._update(step)
+            self._diagnose(step)
 
     def finish(self) -> Iterator[tuple[Step, Estimate | None]]:
         """The stream has ended: its last steps."""
         if self.parts is not None:
             for step in self.parts.stepper.flush():
                 yield step, self._update(step)
+                self._diagnose(step)
 
     def _update(self, step: Step) -> Estimate | None:
         parts = self.parts
@@ -132,12 +134,16 @@ class OnlineRun:
                 parts.localizer.restart_at(belief)
         self._reset = self._resumed = None
         estimate = parts.localizer.update(step)
-        parts.diagnosis.observe(step, parts.wheels.measure(step))
         self.keyframes += 1
         self._last_step = step
         if estimate is not None:
             self.newest = estimate
         return estimate
+
+    def _diagnose(self, step: Step) -> None:
+        """After the estimate was handed out: whoever waits for it does not wait for this."""
+        assert self.parts is not None
+        self.parts.diagnosis.observe(step, self.parts.wheels.measure(step))
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
         """To propagate the newest estimate from; ask before the next event is used."""

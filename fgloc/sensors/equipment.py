@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fgloc.sensors.base import Sensor, Turn
 from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.types import FloatArray, InertialEvent, InertialReading, MotionMeasurement, Step
+from fgloc.types import FloatArray, InertialEvent, InertialReading, MotionEvent, MotionMeasurement, Step
 
 
 class Odometer(Protocol):
@@ -143,8 +143,18 @@ class MotionPredictor(Protocol):
         """Of a predicted motion by what the model is off by."""
         ...
 
-    def fork(self, model: Any) -> Any:
-        """A copy with another copy of the model, which may go on without changing this one."""
+    @property
+    def signals_back_ns(self) -> int:
+        """How far before a step the measured signals reach that the model reads; 0: it reads none."""
+        ...
+
+    def fork(self, model: Any, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]) -> Any:
+        """A copy, which may go on without changing this one.
+
+        Args:
+            model: another copy of the model; None: the copy is to be forked again with one.
+            events: of each class, those of the last `signals_back_ns` before the newest step's end.
+        """
         ...
 
 

@@ -117,6 +117,36 @@ def test_an_online_step_comes_soon():
     assert worst < ns(0.16)
 
 
+def test_a_keyframe_does_not_wait_for_the_next_command():
+    """The command before it holds: at 4 commands a second a keyframe is closed by the odometry, 20 ms apart."""
+    target = stepper()
+    waits = []
+    for event in in_order_of_receipt(
+        [odometry(t) for t in times(1, 9, 50)],
+        [command(t, 0.2, received=t + 0.002) for t in times(1.001, 9, 4)],
+        [corners(t, received=t + 0.03) for t in times(1.26, 9, 5)],
+    ):
+        steps = target.push(event)
+        waits += [event.received_ns - step.stamp_ns for step in steps if step.sightings]
+    assert len(waits) > 30
+    assert max(waits[5:]) <= ns(0.05)
+
+
+def test_a_late_command_holds_from_the_next_keyframe_on():
+    events = in_order_of_receipt(
+        [odometry(t) for t in times(1, 4, 50)],
+        [command(t, 0.2, received=t + 0.002) for t in times(1.001, 4, 10) if abs(t - 2.501) > 0.01],
+        [command(2.501, 0.7, received=2.75)],
+        [corners(t, received=t + 0.03) for t in times(1.1, 4, 10)],
+    )
+    target = stepper()
+    steps = run(target, events)
+    check_steps(steps)
+    assert target.rejections == {}
+    late = [step for step in steps if any(c.v == 0.7 for c in step.controls)]
+    assert ns(2.6) <= late[0].stamp_ns <= ns(2.9)
+
+
 def test_sightings_alone_make_steps():
     steps = run(stepper(), [corners(t) for t in times(1, 5, 5)])
     check_steps(steps)

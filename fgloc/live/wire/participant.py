@@ -36,6 +36,7 @@ _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static t
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
 _MOST_PASSES = 20  # over the readers before their messages are delivered
 _WAIT_S = 60.0  # the reading thread waits this long for messages, then again
+_GATHER_S = 0.008  # for which messages that are not urgent wait for one another: waking costs more than reading
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 _domains_lock = threading.Lock()
@@ -61,6 +62,17 @@ class Sample:
 
 
 OnSample = Callable[[Sample], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reader:
+    """Of one topic, and whom its messages are delivered to."""
+
+    reader: Any
+    unread: Any  # the condition that it has unread messages
+    publication: Publication
+    on_sample: OnSample
+    urgent: bool
 
 
 class Writer:
@@ -118,14 +130,15 @@ class Participant:
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._publications: dict[object, Publication] = {}
         self._topics: dict[str, Any] = {}
-        self._readers: list[tuple[Any, Publication, OnSample]] = []
-        self._entering: list[tuple[Any, Publication, OnSample]] = []
+        self._readers: list[_Reader] = []
+        self._entering: list[_Reader] = []
         self._failure: Exception | None = None
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._changed = GuardCondition(self._participant)
-        self._waiting = WaitSet(self._participant)
-        self._waiting.attach(self._changed)
+        self._waiting, self._urgent = WaitSet(self._participant), WaitSet(self._participant)
+        for conditions in (self._waiting, self._urgent):
+            conditions.attach(self._changed)
         self._thread = threading.Thread(target=self._read, name="fgloc-wire", daemon=True)
         self._thread.start()
 
@@ -145,7 +158,7 @@ class Participant:
         self._readers.clear()
         self._entering.clear()
         self._topics.clear()
-        del self._waiting, self._changed, self._found, self._participant, self._domain
+        del self._waiting, self._urgent, self._changed, self._found, self._participant, self._domain
 
     def publications(self) -> tuple[Publication, ...]:
         """What others publish now, by name.
@@ -182,11 +195,13 @@ class Participant:
         )
         return Writer(DataWriter(self._participant, entity, qos=qos), entity.data_type)
 
-    def read(self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False) -> None:
+    def read(
+        self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False, urgent: bool = True
+    ) -> None:
         """Deliver a topic's messages from now on, in a thread of this object's.
 
         Quality of service is that of sensor data (best effort), which every publisher offers; of a latched topic
-        reliable and transient local.
+        reliable and transient local. Messages that are not urgent may wait 8 ms for others.
         """
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.qos import Policy, Qos
@@ -203,7 +218,7 @@ class Participant:
         reader = DataReader(self._participant, entity, qos=qos)
         unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
         with self._lock:
-            self._entering.append(((reader, unread), Publication(topic, message_type), on_sample))
+            self._entering.append(_Reader(reader, unread, Publication(topic, message_type), on_sample, urgent))
         self._changed.set(True)
 
     def _topic(self, topic: str, message_type: str, messages: Messages) -> Any:
@@ -223,9 +238,12 @@ class Participant:
             with self._lock:
                 entering, self._entering = self._entering, []
             for entry in entering:
-                self._waiting.attach(entry[0][1])
+                self._waiting.attach(entry.unread)
+                if entry.urgent:
+                    self._urgent.attach(entry.unread)
                 self._readers.append(entry)
             self._waiting.wait(round(_WAIT_S * 1e9))
+            self._urgent.wait(round(_GATHER_S * 1e9))
             self._changed.take()
             self._deliver()
 
@@ -238,13 +256,14 @@ class Participant:
         found: list[tuple[int, int, Sample, OnSample]] = []
         for _ in range(_MOST_PASSES):
             before = len(found)
-            for (reader, _), publication, on_sample in self._readers:
-                for message in reader.take(_BATCH):
+            for one in self._readers:
+                topic, message_type = one.publication.topic, one.publication.message_type
+                for message in one.reader.take(_BATCH):
                     if message.sample_info.valid_data:
                         info = message.sample_info
                         source_ns, publisher = info.source_timestamp, str(info.publication_handle)  # stands for a GUID
-                        sample = Sample(publication.topic, publication.message_type, message.cdr, source_ns, publisher)
-                        found.append((source_ns, len(found), sample, on_sample))
+                        sample = Sample(topic, message_type, message.cdr, source_ns, publisher)
+                        found.append((source_ns, len(found), sample, one.on_sample))
             if len(found) == before:
                 break
         for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):

@@ -21,8 +21,7 @@ _LEAST_VARIANCE = 1e-8  # (m/s)², (rad/s)²: no motion is known better
 class RecentPoses:
     """Poses of the base over `SPAN_S`, all as the newest keyframe has them.
 
-    Asking `Live` for an earlier pose costs as much as for the newest one; here it is asked for one only after a
-    keyframe.
+    Asking `Live` for an earlier pose costs as much as for the newest one, but for that of a keyframe.
     """
 
     def __init__(self, pose_at: Callable[[int], LivePose | None]) -> None:
@@ -34,7 +33,7 @@ class RecentPoses:
     def add(self, now: LivePose) -> None:
         """Take in the newest pose."""
         if self._poses and now.keyframe_ns != self._poses[-1].keyframe_ns:
-            self._correct()
+            self._correct(now.keyframe_ns)
         if self._poses and now.stamp_ns <= self._poses[-1].stamp_ns:  # the clock was set back
             self._poses.clear()
         self._poses.append(now)
@@ -78,16 +77,17 @@ class RecentPoses:
         poses = np.array([p.pose for p in self._poses])
         return np.asarray(se2.interpolate(stamps, poses, np.array([stamp_ns], dtype=np.int64))[0])
 
-    def _correct(self) -> None:
-        """Move all poses with the last one, which is where the new keyframe has it."""
-        last = self._poses.pop()
-        again = self._pose_at(last.stamp_ns)
-        if again is None:
+    def _correct(self, keyframe_ns: int) -> None:
+        """Move all poses so that the one at the new keyframe's time is that of the keyframe."""
+        stamp_ns = max(keyframe_ns, self._poses[0].stamp_ns)
+        propagated = self.ahead(stamp_ns)
+        before = self.at(stamp_ns) if propagated is None else propagated.pose
+        again = self._pose_at(stamp_ns)
+        if before is None or again is None:
             self._poses.clear()
             return
-        correction = se2.compose(again.pose, se2.inverse(last.pose))
+        correction = se2.compose(again.pose, se2.inverse(before))
         self._poses = deque(replace(p, pose=se2.compose(correction, p.pose)) for p in self._poses)
-        self._poses.append(again)
 
 
 def _seconds(first: LivePose, last: LivePose) -> float:

@@ -45,14 +45,18 @@ class JointCalibration:
             )
         if norm > MAX_CORRELATION:
             self.correlation *= MAX_CORRELATION / norm
+        self._last: tuple[FloatArray, FloatArray, FloatArray] | None = None  # covariances and gain
 
     def gain(self, W: FloatArray, N: FloatArray) -> FloatArray:
         """K = C W⁻¹ ``(3, 3)`` for a step with these covariances.
 
         Shrunk until its norm, in units of the wheels' sigmas, is at most 0.95.
         """
-        L_w, L_n = _cholesky(W, "the wheels' covariance"), _cholesky(N, "the learned covariance")
-        return self._gain(L_w, L_n)
+        last = self._last  # it is asked for twice in most steps; other threads ask too
+        if last is None or last[0] is not W or last[1] is not N:
+            L_w, L_n = _cholesky(W, "the wheels' covariance"), _cholesky(N, "the learned covariance")
+            last = self._last = W, N, self._gain(L_w, L_n)
+        return last[2]
 
     def difference_cov(self, W: FloatArray, N: FloatArray) -> FloatArray:
         """Covariance ``(3, 3)`` of the difference of the two motions over a step: W + N - C - Cᵀ."""
@@ -87,9 +91,8 @@ class JointCalibration:
 
     def _gain(self, L_w: FloatArray, L_n: FloatArray) -> FloatArray:
         scaled = np.linalg.solve(L_w, L_n @ self.correlation)  # K as the wheels' sigmas see it
-        norm = float(np.linalg.norm(scaled, 2))
-        if norm > MAX_GAIN:
-            scaled *= MAX_GAIN / norm
+        if np.vdot(scaled, scaled) > MAX_GAIN**2:  # else the norm, which is not above Frobenius', is small enough
+            scaled *= MAX_GAIN / max(float(np.linalg.norm(scaled, 2)), MAX_GAIN)
         return np.asarray(L_w @ np.linalg.solve(L_w.T, scaled.T).T)
 
 

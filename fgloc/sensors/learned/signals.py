@@ -58,10 +58,15 @@ class SignalReader:
             registry.channels()[name].event: [] for name in self._wanted
         }
 
-    def fork(self) -> SignalReader:
-        """A copy that may read on without changing this one."""
+    @property
+    def back_ns(self) -> int:
+        """How far before a step the events reach that are read; 0: none are read."""
+        return self._back_ns if self._wanted else 0
+
+    def fork(self, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]) -> SignalReader:
+        """A copy that may read on without changing this one, with these events in place of its own."""
         forked = copy.copy(self)
-        forked._events = {kind: list(events) for kind, events in self._events.items()}
+        forked._events = {kind: list(events.get(kind, ())) for kind in self._events}
         return forked
 
     def read(self, step: Step, gyro_bias: float = 0.0) -> Signals | str:

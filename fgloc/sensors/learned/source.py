@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from fgloc.sensors.learned import installation
 from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.forms import MotionModel
 from fgloc.sensors.learned.signals import SignalReader
-from fgloc.types import FloatArray, MotionMeasurement, Step
+from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Step
 
 
 class LearnedMotion:
@@ -50,15 +51,27 @@ class LearnedMotion:
         card = self.model.card
         return "velocity" in card.inputs
 
-    def fork(self, model: MotionModel) -> LearnedMotion:
+    @property
+    def signals_back_ns(self) -> int:
+        """How far before a step the measured signals reach that the model reads; 0: it reads none."""
+        return self._reader.back_ns
+
+    def fork(
+        self, model: MotionModel | None, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]
+    ) -> LearnedMotion:
         """A copy that may predict beyond the newest step without changing this one.
 
         Args:
-            model: a copy of this one's, for use in another thread: a model writes into buffers of its own.
+            model: a copy of this one's, for use in another thread: a model writes into buffers of its own. None: to be
+                forked again with one.
+            events: of each class, those of the last `signals_back_ns` before the newest step's end.
         """
         forked = copy.copy(self)
-        forked.model = model
-        forked._reader, forked.rejections = self._reader.fork(), Counter()
+        if model is None:
+            del forked.model
+        else:
+            forked.model = model
+        forked._reader, forked.rejections = self._reader.fork(events), Counter()
         return forked
 
     def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:

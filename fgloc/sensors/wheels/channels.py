@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -40,22 +40,18 @@ def _motion(events: Sequence[JointsEvent], origin_ns: int, mounting: Mounting) -
 def _pairs(events: Sequence[JointsEvent], joints: WheelJoints, what: str) -> tuple[list[int], FloatArray]:
     """Stamps and values ``(2, n)`` of the left and the right wheel, where both are known."""
     stamps: list[int] = []
-    values: list[tuple[float, float]] = []
-    names: tuple[str, ...] | None = None
-    left = right = -1
-    for event in events:
-        if event.names is not names and event.names != names:
-            pair = wheel_names(event.names, joints.left, joints.right) or ("", "")
-            left, right = (event.names.index(name) if name in event.names else -1 for name in pair)
-        names = event.names
-        found: FloatArray = getattr(event, what)
-        if left < 0 or right < 0 or len(found) <= max(left, right):
-            continue
-        a, b = float(found[left]), float(found[right])
-        if math.isfinite(a + b):
-            stamps.append(event.stamp_ns)
-            values.append((a, b))
-    return stamps, np.array(values).reshape(-1, 2).T
+    values: list[FloatArray] = [np.empty((0, 2))]
+    for names, group in groupby(events, key=lambda event: event.names):
+        pair = wheel_names(names, joints.left, joints.right) or ("", "")
+        at = [names.index(name) for name in pair if name in names]
+        reported = [(event.stamp_ns, getattr(event, what)) for event in group]
+        reported = [(stamp, found) for stamp, found in reported if len(found) == len(names)]
+        if len(at) == 2 and reported:
+            stamps += [stamp for stamp, _ in reported]
+            values.append(np.array([found for _, found in reported])[:, at])
+    both = np.concatenate(values)
+    known = np.flatnonzero(np.isfinite(both).all(axis=1))
+    return [stamps[k] for k in known], both[known].T
 
 
 CHANNELS = (
