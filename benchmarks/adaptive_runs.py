@@ -1,7 +1,7 @@
 """One cell of the benchmark of adaptive weights: a failure on a floor, replayed for some seeds with some configuration.
 
     >>> from benchmarks.adaptive_runs import cell
-    >>> cell("slip", (22, 23), {"weights": {"alarm": 20.0}}, split="validation")  # doctest: +SKIP
+    >>> cell("slip", (22, 23), {"weights": {"window_s": 1.0}}, split="validation")  # doctest: +SKIP
 
 Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch
 come from the same replay.

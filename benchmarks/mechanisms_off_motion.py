@@ -16,10 +16,8 @@ from benchmarks.mechanisms_switch import (
     called,
 )
 from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.types import FloatArray
 
 _TRUST = "fgloc.robust.motion_faults"
-_GYRO = "fgloc.sensors.gyro.rate"
 _BUDGET = "fgloc.graph.noise_budget"
 
 
@@ -33,17 +31,6 @@ def _scaled(result: Any, before: Any, budget: NoiseBudget, *args: Any) -> bool:
 
 def _without_wheels(result: Any, before: Any, budget: NoiseBudget, *args: Any) -> bool:
     return "wheels" in budget.rejected
-
-
-def _learned_alone(real: Function) -> Function:
-    return lambda self, wheels, learned: learned
-
-
-def _summed(real: Function) -> Function:
-    def difference_cov(self: Any, W: FloatArray, N: FloatArray) -> FloatArray:
-        return W + N
-
-    return difference_cov
 
 
 OF_MOTION: tuple[Mechanism, ...] = (
@@ -103,30 +90,11 @@ OF_MOTION: tuple[Mechanism, ...] = (
         batch=True,
     ),
     Mechanism(
-        "source_correlation",
-        "Errors of wheels and learned motion are taken as correlated, as calibrated.",
-        ("sensors/learned/joint.py", "graph/noise_budget.py"),
-        (
-            Switch("fgloc.sensors.learned.joint:JointCalibration.decorrelate", _learned_alone),
-            Switch("fgloc.sensors.learned.joint:JointCalibration.difference_cov", _summed),
-        ),
-        Probe("fgloc.sensors.learned.joint:JointCalibration.decorrelate", called),
-        batch=True,
-    ),
-    Mechanism(
-        "gyro_rest_bias",
-        "The gyro's bias is learned while the wheels stand.",
+        "gyro_bias",
+        "The gyro's bias is learned while the wheels stand, and between two fixes of the yaw.",
         ("sensors/gyro/rate.py",),
-        (Switch(f"{_GYRO}:Gyro._watch_rest", Returns(None)),),
-        Probe(f"{_GYRO}:Gyro._watch_rest", called),
-        batch=True,
-    ),
-    Mechanism(
-        "gyro_fix_bias",
-        "The gyro's bias is learned between two fixes of the yaw.",
-        ("sensors/gyro/rate.py",),
-        (Switch(f"{_GYRO}:Gyro.fix", Returns(None)),),
-        Probe(f"{_GYRO}:Gyro.fix", called),
+        (Switch("fgloc.sensors.gyro.rate:Gyro._learn", Returns(None)),),
+        Probe("fgloc.sensors.gyro.rate:Gyro._learn", called),
         batch=True,
     ),
 )

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
 
 from benchmarks.mechanisms_switch import (
     Argument,
-    Function,
     Mechanism,
     Probe,
     Returns,
     Switch,
-    called,
     not_none,
     something,
 )
@@ -22,37 +18,6 @@ _GATE = "fgloc.robust.association"
 _POSE_FIT = "fgloc.relocalization.pose_fit"
 _MODES = "fgloc.robust.landmark_modes:LandmarkModes"
 _NO_KERNEL = 1e6  # sigmas
-
-
-def _linear_nis(real: Function) -> Function:
-    """`correct` for the test of joint compatibility alone."""
-
-    def correct(*args: Any) -> Any:
-        return real(*args) if _linear_nis.testing else None  # type: ignore[attr-defined]
-
-    return correct
-
-
-def _testing(real: Function) -> Function:
-    def agreed(*args: Any) -> Any:
-        _linear_nis.testing = True  # type: ignore[attr-defined]
-        try:
-            return real(*args)
-        finally:
-            _linear_nis.testing = False  # type: ignore[attr-defined]
-
-    return agreed
-
-
-_linear_nis.testing = False  # type: ignore[attr-defined]
-
-
-def _unblurred(real: Function) -> Function:
-    def corner(*args: Any) -> Any:
-        m = real(*args)
-        return None if m is None else replace(m, blur_s=0.0)
-
-    return corner
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
@@ -67,13 +32,6 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
         ("robust/association.py",),
         (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
-        batch=True,
-    ),
-    Mechanism(
-        "corrected_nis",
-        "Far from linear the NIS is taken at the pose that prediction and sighting make likeliest.",
-        ("robust/association.py", "graph/joint.py"),
-        (Switch(f"{_GATE}:correct", _linear_nis), Switch(f"{_GATE}:Association._agreed", _testing)),
         batch=True,
     ),
     Mechanism(
@@ -105,14 +63,6 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         ("robust/association.py", "robust/sighting_judge.py"),
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
-        batch=True,
-    ),
-    Mechanism(
-        "blur_noise",
-        "Noise of corners grows with the speed of the image.",
-        ("sensors/markers/measure.py", "graph/corner_batch.py"),
-        (Switch("fgloc.sensors.markers.measure:CornerMeasurer._corner", _unblurred),),
-        Probe("fgloc.sensors.markers.measure:CornerMeasurer._corner", called),
         batch=True,
     ),
 )

@@ -6,7 +6,6 @@ from typing import Any
 
 from benchmarks.mechanisms_switch import (
     Constant,
-    Function,
     Mechanism,
     Probe,
     Returns,
@@ -21,10 +20,6 @@ _SEARCH = "fgloc.relocalization.place_search"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
-
-
-def _at_prediction(real: Function) -> Function:
-    return lambda self, frame: frame.belief
 
 
 def _never(real: Any) -> property:
@@ -103,18 +98,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         ("graph/isam2.py",),
         (Switch(f"{_WINDOW}._relinearize", Returns(None)),),
         Probe(f"{_WINDOW}._relinearize", called),
-        batch=True,
-    ),
-    Mechanism(
-        "corrected_linearisation",
-        "Far from linear a keyframe is first linearized at the pose that its sightings give.",
-        ("graph/isam2.py", "graph/joint.py"),
-        (Switch(f"{_WINDOW}._linearization", _at_prediction),),
-        Probe(
-            f"{_WINDOW}._linearization",
-            lambda belief, before, self, frame: belief is not before,
-            lambda self, frame: frame.belief,
-        ),
         batch=True,
     ),
     Mechanism(

@@ -17,6 +17,7 @@ from fgloc.files.section import SHIPPED
 from fgloc.files.section import Section as Section
 from fgloc.files.settings_file import Settings
 from fgloc.sensors import registry
+from fgloc.stats import GATE
 
 _Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
 _Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
@@ -145,7 +146,7 @@ class EstimatorConfig(Section):
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
     initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = (0.05, 0.05, 0.05)
     initialise_s: float = Field(5.0, ge=0.01, le=1e5, description="how long to collect sightings for the first pose")
-    gate_probability: float = Field(0.9999, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
+    gate_probability: float = Field(GATE, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
     dead_reckoning_after_s: float = Field(2.0, gt=0, le=1e6, description="without a fix for this long: DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
         "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
@@ -173,9 +174,6 @@ class WeightsConfig(Section):
     distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")
     window_s: float = Field(
         2.0, ge=0.01, le=1e3, description="the motion sources are compared over windows of up to this long"
-    )
-    alarm: float = Field(
-        30.0, gt=0, le=1e9, description="squared Mahalanobis distance of two sources that flags a disagreement"
     )
     release_s: float = Field(0.6, gt=0, le=1e4, description="agreement for this long ends it")
     quarantine_after: int = Field(

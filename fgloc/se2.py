@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Triple = Sequence[float] | FloatArray
 _SMALL = 1e-9
+DOF = 3  # of a pose or motion
 
 
 def wrap(angle: float) -> float:
@@ -65,6 +66,15 @@ def exp(twist: Triple) -> FloatArray:
     else:
         a, b = math.sin(t) / t, (1.0 - math.cos(t)) / t
     return np.array([a * x - b * y, b * x + a * y, wrap(t)])
+
+
+def exp_array(twists: FloatArray) -> FloatArray:
+    """`exp` of twists ``(n, 3)``."""
+    x, y, t = twists.T
+    small = np.abs(t) < _SMALL
+    safe = np.where(small, 1.0, t)
+    a, b = np.where(small, 1.0, np.sin(safe) / safe), np.where(small, 0.5 * t, (1.0 - np.cos(safe)) / safe)
+    return np.stack([a * x - b * y, b * x + a * y, wrap_array(t)], axis=1)
 
 
 def log(pose: Triple) -> FloatArray:

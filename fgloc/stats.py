@@ -1,13 +1,41 @@
-"""Quantiles that decide: one place for what "unlikely" means."""
+"""Quantiles that decide: one place for what "unlikely" means.
+
+There are three levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm an hour of a
+monitor (`alarm_bound`), and the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is
+named to the user.
+"""
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
-from scipy.special import gammaincinv  # scipy.stats takes half a second to load
+GATE = 0.9999  # a measurement that is less likely than one minus this is not fused
+_ALARM_EVERY_S = 3600.0  # where nothing is wrong
 
 
-@lru_cache(maxsize=256)
+@lru_cache
 def chi2_bound(probability: float, dof: int) -> float:
     """χ² quantile: a sum of ``dof`` squared standard normal variables exceeds it with one minus this probability."""
+    from scipy.special import gammaincinv  # not where the configuration alone is needed; scipy.stats takes longer still
+
     return float(2.0 * gammaincinv(0.5 * dof, probability))
+
+
+def alarm_bound(seconds: float, tests: int, dof: int) -> float:
+    """χ² quantile that raises at most one false alarm an hour (Bonferroni).
+
+    Args:
+        seconds: after which it is tested again.
+        tests: how many statistics are held against it each time.
+        dof: of each of them.
+    """
+    return chi2_bound(1.0 - seconds / (tests * _ALARM_EVERY_S), dof)
+
+
+def evidence_bound(probability: float, hypotheses: int) -> float:
+    """Twice the log-likelihood ratio of one of several hypotheses to "none" that is seldom reached if none is right.
+
+    Source: the likelihood ratio exceeds x with a probability of at most 1/x (Ville 1939), for each of them.
+    """
+    return 2.0 * math.log(hypotheses / (1.0 - probability))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -34,6 +35,7 @@ from fgloc.types import (
 )
 
 _LINEARIZATIONS = 6
+_LARGEST_LOG = math.log(sys.float_info.max) - 1.0
 _STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
 _STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
 
@@ -283,7 +285,7 @@ def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:
     for factor in sighting.factors:
         error = factor.error(values)
         k2 = None if sighting.cauchy_k is None else sighting.cauchy_k**2
-        total += 2.0 * error if k2 is None else k2 * math.expm1(min(2.0 * error / k2, 700.0))
+        total += 2.0 * error if k2 is None else k2 * math.expm1(min(2.0 * error / k2, _LARGEST_LOG))
     return total
 
 

@@ -30,7 +30,7 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_key
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
-from fgloc.graph.joint import correct, is_linear
+from fgloc.graph.joint import LINEAR_RAD, correct
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.uneven import ground_factors, ground_prior, is_level_known, step_of
 from fgloc.types import (
@@ -41,7 +41,6 @@ from fgloc.types import (
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
-_TURNED_RAD = 0.02  # a correction of the yaw from which on linear motion factors are made anew
 _MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
 
 
@@ -66,7 +65,7 @@ class IncrementalEstimator(Estimator):
             graph, values = self._graph_of(frame, initial, frame.prior)
             self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
             frame.belief = self._newest(frame.k)
-            if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > _TURNED_RAD and frame.prior is None:
+            if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > LINEAR_RAD and frame.prior is None:
                 self._relinearize(frame)
         except _GTSAM_ERRORS:
             frame.belief = predicted  # which the sightings have no part in
@@ -98,11 +97,9 @@ class IncrementalEstimator(Estimator):
         newest.belief = self._replayed([*window, newest], newest.belief)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
-        """Where to linearize: at the prediction or, far from linear, at the most probable pose with the sightings."""
-        if not frame.sightings or not self.factors.known:
-            return frame.belief
+        """Where to linearize: at the prediction or, while roll and pitch are not known, where the sightings put it."""
         known = frame.belief.installation or self.installed
-        if is_linear(frame.belief) and is_level_known(known, self.installation):
+        if not frame.sightings or not self.factors.known or is_level_known(known, self.installation):
             return frame.belief
         measurements = [s.measurement for s in frame.sightings]
         corrected = correct(frame.belief, known, measurements, self.factors)

@@ -21,7 +21,7 @@ from fgloc.graph.noise_models import sighting_whitening
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 _MOST_STEPS = 6
-_LINEAR_M, _LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
+_LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
 _STILL = 1e-3  # sigmas: a step of Gauss-Newton this small is the last one
 
 
@@ -115,7 +115,7 @@ def joint_cov(belief: PoseWithCovariance, known: InstallationEstimate) -> FloatA
 
 def innovation(P: FloatArray, lines: Sequence[Linearized]) -> Innovation:
     """The innovation of sightings, linearized at the belief whose joint covariance ``P`` is."""
-    residual, J, H, noise = stacked(lines, len(P) - 3)
+    residual, J, H, noise = stacked(lines, len(P) - se2.DOF)
     both = np.hstack([J, H])
     return Innovation(residual, both, noise, both @ P @ both.T + noise)
 
@@ -177,4 +177,4 @@ def correct(
 def is_linear(belief: PoseWithCovariance) -> bool:
     """Whether sightings are as good as linear over what the pose may be."""
     cov = belief.cov
-    return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < _LINEAR_RAD**2)
+    return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < LINEAR_RAD**2)

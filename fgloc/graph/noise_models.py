@@ -12,6 +12,23 @@ from fgloc.types import (
     FloatArray,
 )
 
+_SAME_STAMP_S = 0.01  # sightings nearer than this are one
+
+
+def repetition(correlation_s: float, last_ns: int | None, stamp_ns: int) -> float:
+    """Scale on the covariance of a sighting by how soon it follows the last one of its landmark.
+
+    Errors last for a time: what is seen again within it has its information in common with what was seen before.
+
+    Args:
+        correlation_s: that time [s].
+        last_ns: stamp of the last one; None: there was none.
+        stamp_ns: of this one.
+    """
+    if last_ns is None:
+        return 1.0
+    return max(1.0, correlation_s / max(abs(stamp_ns - last_ns) * 1e-9, _SAME_STAMP_S))
+
 
 def gaussian(cov: FloatArray) -> gtsam.noiseModel.Base:
     """Noise model of a covariance, which is checked because GTSAM does not.

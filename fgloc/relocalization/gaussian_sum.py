@@ -19,6 +19,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise_models import repetition
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
 _RING = 24  # pieces of a ring, 15 degrees apart
@@ -28,7 +29,7 @@ _OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was m
 _UNIFORM = 1.0 / (2.0 * math.pi * 10.0)  # ... which may be seen in any direction [1/rad] and up to 10 m away [1/m]
 _NEGLIGIBLE = 12.0  # in log weight: less probable than e^-12 of the most probable
 _AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
-_SAME = np.array([0.05, 0.05, 0.03])  # m, m, rad: two hypotheses this near are one
+_SAME = 0.05  # m, rad: two hypotheses this near are one
 
 
 class GaussianSum:
@@ -70,11 +71,17 @@ class GaussianSum:
             return None
         weights = np.exp(self.log_weights - self.log_weights.max())
         weights /= weights.sum()
-        spread = np.asarray(np.linalg.cholesky(self.covs + 1e-12 * np.eye(3)) * math.sqrt(3.0), dtype=np.float64)
+        variances, axes = np.linalg.eigh(self.covs)
+        spread = axes * np.sqrt(se2.DOF * np.maximum(variances, 0.0))[:, None, :]
         points = np.stack(
-            [_moved(self.poses, np.asarray(sign * spread[:, :, j])) for j in range(3) for sign in (-1.0, 1.0)], 1
+            [
+                se2.compose_array(self.poses, se2.exp_array(sign * spread[:, :, j]))
+                for j in range(se2.DOF)
+                for sign in (-1.0, 1.0)
+            ],
+            1,
         )
-        share = np.repeat(weights / 6.0, 6)
+        share = np.repeat(weights / (2 * se2.DOF), 2 * se2.DOF)
         x, y, yaw = points.reshape(-1, 3).T
         middle = math.atan2(float(share @ np.sin(yaw)), float(share @ np.cos(yaw)))
         mean = np.array([share @ x, share @ y, middle])
@@ -91,15 +98,7 @@ class GaussianSum:
         return PoseWithCovariance(self.poses[best], self.covs[best])
 
     def _predict(self, motion: FloatArray, cov: FloatArray) -> None:
-        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        x, y, yaw = motion
-        self.poses = np.column_stack(
-            [
-                self.poses[:, 0] + c * x - s * y,
-                self.poses[:, 1] + s * x + c * y,
-                se2.wrap_array(self.poses[:, 2] + yaw),
-            ]
-        )
+        self.poses = se2.compose_array(self.poses, np.broadcast_to(motion, self.poses.shape))
         ad = se2.adjoint(se2.inverse(motion))
         self.covs = ad @ self.covs @ ad.T + cov
 
@@ -131,7 +130,7 @@ class GaussianSum:
         fits = math.log((1.0 - _OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
         good = fits > outlier
         gain = np.linalg.solve(S, PJ.transpose(0, 2, 1)).transpose(0, 2, 1)
-        poses = _moved(self.poses, np.einsum("nij,nj->ni", gain, residual))
+        poses = se2.compose_array(self.poses, se2.exp_array(np.einsum("nij,nj->ni", gain, residual)))
         kept = np.eye(3) - gain @ J
         covs = kept @ self.covs @ kept.transpose(0, 2, 1) + gain @ R @ gain.transpose(0, 2, 1)
         self.poses = np.where(good[:, None], poses, self.poses)
@@ -142,10 +141,7 @@ class GaussianSum:
         """Of the sighting: with the errors that it shares with the last one of its landmark, and with all others."""
         config = self._config
         cov = m.cov + np.diag([config.bearing_bias_sigma_rad**2, (config.range_scale_sigma * m.range_m) ** 2])
-        last = self._last_ns.get(m.landmark_id)
-        if last is None:
-            return cov
-        return cov * max(1.0, config.repeat_s / max((m.stamp_ns - last) * 1e-9, 0.01))
+        return cov * repetition(config.repeat_s, self._last_ns.get(m.landmark_id), m.stamp_ns)
 
     def _prune(self) -> None:
         """Merge what has become the same, and drop what is negligible."""
@@ -193,16 +189,3 @@ def _residuals(poses: FloatArray, place: FloatArray, m: PointMeasurement) -> tup
     J[:, 0] = np.column_stack([y / r**2, -x / r**2, -np.ones_like(r)])
     J[:, 1] = np.column_stack([-x / r, -y / r, np.zeros_like(r)])
     return residual, J
-
-
-def _moved(poses: FloatArray, twists: FloatArray) -> FloatArray:
-    """``T ∘ Exp(ξ)``, row by row."""
-    x, y, t = twists.T
-    small = np.abs(t) < 1e-9
-    safe = np.where(small, 1.0, t)
-    a, b = np.where(small, 1.0, np.sin(safe) / safe), np.where(small, 0.5 * t, (1.0 - np.cos(safe)) / safe)
-    px, py = a * x - b * y, b * x + a * y
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    return np.column_stack(
-        [poses[:, 0] + c * px - s * py, poses[:, 1] + s * px + c * py, se2.wrap_array(poses[:, 2] + t)]
-    )

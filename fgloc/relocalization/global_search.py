@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,8 +27,9 @@ from fgloc.types import (
     Step,
 )
 
-_WEAK_PRIOR = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: the sightings determine the pose
-ORIGIN = np.diag([1e-6, 1e-6, 1e-6])  # of a first pose that is the origin by definition
+_FAR_M2 = 100.0  # m²: variance of a place before it is known
+ANYWHERE = np.diag([_FAR_M2, _FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
+ORIGIN = 1e-6 * np.eye(se2.DOF)  # of a first pose that is the origin by definition
 _MAX_STEPS = 400
 _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
@@ -163,7 +165,7 @@ class GlobalSearch:
     def _start(self, newest: PoseWithCovariance) -> InitialPose:
         self.initializing = False
         steps = (*self._earlier, *self._steps)
-        first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), _WEAK_PRIOR.copy())
+        first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), ANYWHERE.copy())
         self.forget()
         return InitialPose(steps, first, newest)
 

@@ -9,8 +9,8 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, PoseConsensus, apart
-from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose, sighting_costs
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, WHOLE_SHARE, PoseConsensus, apart
+from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
 from fgloc.types import (
     FloatArray,
@@ -24,16 +24,13 @@ from fgloc.types import (
 
 _LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
 _TRIMS = 3
-_CHECKABLE = 3  # beacons of a map, from which on one of them can be left out
+_DETERMINE = 2  # beacons that determine a pose: of more on the map, one can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
 _MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
-_UNLIKELY = 1e3  # cost of a sighting that a place does not explain at all
-_MAX_PLACES = 4  # that are fitted to the end
-_ITERATIONS, _ROUGH_ITERATIONS = 16, 4
-_LASTING = 0.8  # of the time that is collected
+_ROUGH_ITERATIONS = 4
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
 _YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
 
@@ -58,14 +55,14 @@ class PlaceSearch:
             return None  # one landmark alone may have been moved, or misread
         fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
         candidates = sorted(
-            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], _UNLIKELY).sum())
+            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], UNEXPLAINED).sum())
         )
         rough = [fit for c in candidates[:_MAX_CANDIDATES] if (fit := fit_few.solve(c, _ROUGH_ITERATIONS)) is not None]
         if known and all(fit.cost > _HOPELESS * MAX_COST_PER_DOF * fit.dof for fit in rough):
             return None
         places: list[FloatArray] = []
         for fit in sorted(rough, key=lambda fit: fit.cost):
-            if len(places) < _MAX_PLACES and all(apart(fit.pose, other) for other in places):
+            if all(apart(fit.pose, other) for other in places):
                 places.append(fit.pose)
         found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
         if not found:
@@ -82,18 +79,18 @@ class PlaceSearch:
         agreeing = [
             m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
         ]
-        few = self._map is not None and len(self._map) < _CHECKABLE
+        few = self._map is not None and len(self._map) <= _DETERMINE
         if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
             return True
         for landmark_id in best.agreeing:
-            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id], _ITERATIONS)
+            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id])
             if fit is None or (np.sqrt(np.diag(fit.cov)) > MAX_SIGMA).any() or apart(fit.pose, best.fit.pose):
                 return False
         return True
 
     def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
-        fit = self._fit(place, sightings, _ITERATIONS)
+        fit = self._fit(place, sightings)
         if fit is None:
             return None
         agreeing = list(sightings)
@@ -102,7 +99,7 @@ class PlaceSearch:
             agreeing = self._explained(fit.pose, sightings)
             if len(agreeing) == len(before):
                 break
-            trimmed = self._fit(fit.pose, agreeing, _ITERATIONS) if agreeing else None
+            trimmed = self._fit(fit.pose, agreeing) if agreeing else None
             if trimmed is None:
                 return None
             fit = trimmed
@@ -121,7 +118,7 @@ class PlaceSearch:
             fit,
             share,
             len(residuals),
-            sum(residuals.values()) - 3,
+            sum(residuals.values()) - se2.DOF,
             frozenset(information_of),
             frozenset(m.landmark_id for m in outliers) - frozenset(information_of),
             frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
@@ -134,8 +131,8 @@ class PlaceSearch:
         explained = (costs < MAX_COST_PER_DOF * dofs).tolist()
         return [m for m, kept in zip(sightings, explained, strict=True) if kept]
 
-    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement], iterations: int) -> Fit | None:
-        return fit_pose(start, sightings, self._factors, self._config, iterations)
+    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> Fit | None:
+        return fit_pose(start, sightings, self._factors, self._config)
 
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:
@@ -169,7 +166,7 @@ def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
     """Whether a place follows from registered sensors alone for most of a time."""
     stamps = [m.stamp_ns for m in sightings]
     by_sensors = all(isinstance(m, PoseMeasurement) for m in sightings)
-    return bool(stamps) and by_sensors and max(stamps) - min(stamps) > _LASTING * window_ns
+    return bool(stamps) and by_sensors and max(stamps) - min(stamps) > WHOLE_SHARE * window_ns
 
 
 def _information(m: LandmarkMeasurement) -> float:

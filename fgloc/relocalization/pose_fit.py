@@ -19,8 +19,9 @@ from fgloc.graph.pose_batch import PoseBatch
 from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
-_GAUSS_NEWTON_STEPS = 4
-_BEHIND_COST = 1e3  # of a marker that was seen although it is behind the camera
+_ITERATIONS = 16
+_CONVERGED, _RANK = 1e-6, 1e-9  # relative: of the cost, and of the least eigenvalue of the information
+UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
 _TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
 
 
@@ -36,7 +37,7 @@ class Fit:
     @property
     def redundancy(self) -> int:
         """How many residuals there are more than are needed for a pose."""
-        return self.dof - 3
+        return self.dof - se2.DOF
 
     def bound(self, probability: float) -> float:
         """What the cost exceeds as seldom as one minus this."""
@@ -48,7 +49,6 @@ def fit_pose(
     sightings: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
     config: Config,
-    iterations: int = 4 * _GAUSS_NEWTON_STEPS,
 ) -> Fit | None:
     """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
 
@@ -56,7 +56,7 @@ def fit_pose(
     installation is taken for noise of each sighting by itself.
     """
     fitted = PoseFit(sightings, factors, config)
-    return fitted.solve(start, iterations)
+    return fitted.solve(start)
 
 
 class PoseFit:
@@ -68,21 +68,21 @@ class PoseFit:
         self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
-    def solve(self, start: FloatArray, iterations: int) -> Fit | None:
+    def solve(self, start: FloatArray, iterations: int = _ITERATIONS) -> Fit | None:
         """As `fit_pose`."""
         pose, previous = start, math.inf
         for step in range(iterations):
-            normal, pull, cost, dof = np.zeros((3, 3)), np.zeros(3), 0.0, 0
+            normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
             for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
                 square = np.einsum("ni,ni->n", r, r)
                 weight = np.where(behind, 0.0, k**2 / (k**2 + 2.0 * square / d))  # as if of two-dimensional sightings
-                cost += float(np.where(behind, _BEHIND_COST, _robust_costs(square, d, k)).sum())
+                cost += float(np.where(behind, UNEXPLAINED, _robust_costs(square, d, k)).sum())
                 dof += int(d.sum())
                 normal += np.einsum("n,nij,nik->jk", weight, J, J)
                 pull += np.einsum("n,nij,ni->j", weight, J, r)
-            if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
+            if np.linalg.matrix_rank(normal, rtol=_RANK) < se2.DOF:
                 return None
-            if abs(previous - cost) < 1e-6 * max(cost, 1e-9):
+            if abs(previous - cost) <= _CONVERGED * cost:
                 break
             previous = cost
             pose = se2.compose(pose, se2.exp(np.asarray(np.linalg.solve(normal, -pull), dtype=np.float64)))

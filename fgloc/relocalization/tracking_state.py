@@ -12,7 +12,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.relocalization.global_search import ORIGIN, GlobalSearch, InitialPose
+from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.robust.association import NEAR_M, NEAR_RAD
 from fgloc.types import (
     Decision,
@@ -31,7 +31,6 @@ CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
 _KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
 _WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misread, each independently
-_ANYWHERE = np.diag([100.0, 100.0, 10.0])  # m², m², rad²: how far the robot may be after a jump of the clock
 
 
 class Tracking:
@@ -88,7 +87,7 @@ class Tracking:
         return (
             PoseWithCovariance(np.zeros(3), ORIGIN.copy())
             if last is None
-            else PoseWithCovariance(last.pose, _ANYWHERE.copy())
+            else PoseWithCovariance(last.pose, ANYWHERE.copy())
         )
 
     def advance_time(self, seconds: float) -> None:
@@ -165,8 +164,7 @@ class Tracking:
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
             return np.zeros((3, 3))
         kidnapped = _KIDNAPPED / (_KIDNAPPED + _WRONG**contradicting)
-        spread = np.mean((self._places - belief.pose[:2]) ** 2)
-        return np.asarray(kidnapped * np.diag([spread, spread, math.pi**2 / 3.0]))
+        return kidnapped * self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
         """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map.
@@ -175,8 +173,14 @@ class Tracking:
         """
         if self.is_unlocalized(belief):
             return np.zeros((3, 3))
-        spread = np.mean((self._places - belief.pose[:2]) ** 2) if len(self._places) else _ANYWHERE[0, 0]
-        return np.diag([spread, spread, math.pi**2 / 3.0])
+        return self._spread_of_map(belief)
+
+    def _spread_of_map(self, belief: PoseWithCovariance) -> FloatArray:
+        """Covariance ``(3, 3)`` about a pose of a robot that may be where any landmark is."""
+        around = ANYWHERE.copy()
+        if len(self._places):
+            around[:2, :2] = np.eye(2) * np.mean((self._places - belief.pose[:2]) ** 2)
+        return around
 
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""

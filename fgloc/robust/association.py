@@ -12,6 +12,8 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.noise_models import repetition
+from fgloc.relocalization.pose_consensus import REDUNDANT
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
@@ -23,7 +25,6 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-REDUNDANT = 4  # residuals more than a pose has coordinates, from which an agreement of sightings is no accident
 # Sightings of one step whose agreement is searched, those of the least NIS: more than an image shows come in a burst.
 # The others are held against what these agree on. The work grows with the square.
 _MOST_JOINT = 16
@@ -56,9 +57,7 @@ class Association:
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Sort sightings into accepted and rejected, with the decision on each.
 
-        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
-        the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
-        because after dead reckoning the linear one is far too large.
+        The NIS is that of the prediction, with what is not known of the installation.
         """
         accepted, rejected, decisions = [], [], []
         judged = self._judge(measurements, predicted)
@@ -175,18 +174,16 @@ class Association:
         lines = self._factors.linearize(measurements, predicted.pose)
         known = predicted.installation or self._factors.estimated
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
-        uncertain = not is_linear(predicted)
         judged = []
-        for m, one, nis in zip(measurements, lines, found, strict=True):
+        for one, nis in zip(lines, found, strict=True):
             dof = len(one.residual)
             if one.behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
-            bound = self._gate(dof)
-            if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
-                nis = min(nis, corrected[1])
-            judged.append((nis, dof, "gate" if nis > bound else ""))
-        return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
+            judged.append((nis, dof, "gate" if nis > self._gate(dof) else ""))
+        if is_linear(predicted) or not self._config.weights.adaptive:
+            return judged
+        return self._agreed(measurements, predicted, judged)
 
     def _agreed(
         self,
@@ -270,12 +267,10 @@ class Association:
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
-        correlation_s = self._config.landmarks.repeat_s
-        last = self._last_used_ns.get(m.landmark_id)
-        if correlation_s == 0.0 or last is None or isinstance(m, PixelMeasurement | PoseMeasurement):
+        if isinstance(m, PixelMeasurement | PoseMeasurement):
             return m, 1.0
-        apart = max((m.stamp_ns - last) * 1e-9, 0.01)
-        scale = max(1.0, correlation_s / apart)
+        last = self._last_used_ns.get(m.landmark_id)
+        scale = repetition(self._config.landmarks.repeat_s, last, m.stamp_ns)
         return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
 
     @property

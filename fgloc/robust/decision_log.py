@@ -55,7 +55,7 @@ def motion_decisions(
             if reading is not readings.wheels:
                 nis = float(difference @ np.linalg.solve(reference.cov + reading.cov, difference))
         weight = 0.0 if why else 1.0 / budget.scales.get(source, 1.0)
-        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, 3, weight, why, threshold, shift))
+        rows.append(Decision(k, reading.stamp_ns, source, -1, nis**0.5, nis, se2.DOF, weight, why, threshold, shift))
     return rows
 
 
@@ -67,7 +67,7 @@ def place_decision(
     nis = float(miss @ np.linalg.solve(estimated.cov + place.cov, miss))
     weight = 1.0 if reason in (JUMP, OVERRULED) else 0.0
     shift = math.hypot(miss[0], miss[1])
-    return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, 3, weight, reason, shift_m=shift)
+    return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, se2.DOF, weight, reason, shift_m=shift)
 
 
 def mode_decisions(k: int, stamp_ns: int, mode: Mode, since_fix_s: float, after_s: float) -> tuple[Decision, ...]:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgloc import se2
 from fgloc.config import WeightsConfig
+from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import FloatArray
 
-_CALM = 0.6  # of the alarm: below it the newest window agrees
 _LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
 _LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
 _LEAST_LEVEL = 0.25  # covariances are taken to be given too large by at most four times
-_DOF = 3.0  # expected of one window
 _ADAPTS = 0.1  # share by which a step moves the quantile
 
 
@@ -28,6 +28,7 @@ class GlrResult:
         since: on the step that raises the flag, how many of the newest steps (this one included) the disagreement
             spans; else 0.
         nis: largest NIS of any window that ends with this step, over what is usual.
+        bound: above which it raises the flag.
         span: the number of that window's steps.
         scale: factor on the sources' covariances: the NIS over its expectation, or the usual level if that is larger.
     """
@@ -35,6 +36,7 @@ class GlrResult:
     flagged: bool
     since: int
     nis: float
+    bound: float
     span: int = 1
     scale: float = 1.0
 
@@ -92,17 +94,19 @@ class GlrTest:
             self._low *= math.exp(_ADAPTS * ((nis > self._low) - (1.0 - _LOW)))
             self._low = min(max(self._low, _LEAST_LEVEL * _LOW_EXPECTED), _LOW_EXPECTED)
         nis /= self._level
+        bound = alarm_bound(dt, len(self._steps), se2.DOF)
         if not self.flagged:
-            if nis <= self._config.alarm:
-                return GlrResult(False, 0, nis, span, max(self._level, nis / _DOF))
+            if nis <= bound:
+                return GlrResult(False, 0, nis, bound, span, max(self._level, nis / se2.DOF))
             self.flagged, self._calm_s = True, 0.0
-            return GlrResult(True, span, nis, span)
-        self._calm_s = self._calm_s + dt if self._newest_nis() / self._level < _CALM * self._config.alarm else 0.0
+            return GlrResult(True, span, nis, bound, span)
+        agrees = self._newest_nis() / self._level < chi2_bound(GATE, se2.DOF)
+        self._calm_s = self._calm_s + dt if agrees else 0.0
         if self._calm_s >= self._config.release_s:
             self.flagged = False
             self._steps.clear()
             self._length_s = 0.0
-        return GlrResult(self.flagged, 0, nis, span)
+        return GlrResult(self.flagged, 0, nis, bound, span)
 
     @property
     def _level(self) -> float:

@@ -24,14 +24,13 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import innovation, joint_cov, transition
 from fgloc.graph.linearized import Linearized
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.noise_models import sighting_whitening
+from fgloc.graph.noise_models import repetition, sighting_whitening
 from fgloc.graph.observation import Observations
-from fgloc.stats import chi2_bound
+from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
 _MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
-ALARM = 24.0  # evidence, twice the log-likelihood ratio to "in place", that names a landmark ...
-_MARGIN = 7.0  # ... and to another landmark's displacement as the cause of the same sightings
+_MARGIN = 7.0  # twice the log-likelihood ratio to another landmark's displacement as the cause of the same sightings
 _LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
 _MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
 _PROVEN = 2  # other landmarks that have to be in place
@@ -48,12 +47,14 @@ class LandmarkModes:
 
     Attributes:
         displacements: of the landmarks that were found to be moved ``(2,)`` [m] in the map.
+        alarm: evidence, twice the log-likelihood ratio to "in place", that names a landmark.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
         self._factors, self._gate = factors, config.estimator.gate_probability
         self._least, self._repeat_s = config.weights.quarantine_after, config.landmarks.repeat_s
         n = min(len(factors.landmarks), _MOST) if config.weights.adaptive else 0
+        self.alarm = evidence_bound(self._gate, max(n, 1))
         self._rows: dict[int, int] = {}  # of landmarks, the one seen last last
         self._ids, self._places = np.zeros(n, dtype=np.int64), np.full((n, 2), np.inf)
         self._M = np.zeros((n, 3 + len(factors.installation), 2))
@@ -121,7 +122,7 @@ class LandmarkModes:
             if m.stamp_ns - self._fused_ns < _STILL_RIGHT_NS and not self.excludes(m.landmark_id):
                 self._contradicted(P, belief, m)
         self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*seen, *against)})
-        self._reset(self._evidence.sum(1) < -0.5 * ALARM)  # it was in place; it may be moved from now on
+        self._reset(self._evidence.sum(1) < -self.alarm)  # it was in place; it may be moved from now on
         return self._certain() if seen or against else None
 
     def exclude(self, landmark_id: int, belief: PoseWithCovariance) -> tuple[PoseWithCovariance, float]:
@@ -239,16 +240,15 @@ class LandmarkModes:
 
     def _shared(self, m: LandmarkMeasurement) -> float:
         """Scale on the sigma of a rejected sighting, as errors of one landmark are correlated for some time."""
-        last = self._last_ns.get(m.landmark_id)
-        if last is None or isinstance(m, PixelMeasurement):
+        if isinstance(m, PixelMeasurement):
             return 1.0
-        return math.sqrt(max(1.0, self._repeat_s / max(abs(m.stamp_ns - last) * 1e-9, 1e-3)))
+        return math.sqrt(repetition(self._repeat_s, self._last_ns.get(m.landmark_id), m.stamp_ns))
 
     def _certain(self) -> int | None:
         """A landmark that was moved, if no other one explains the sightings."""
         evidence = self._evidence.sum(1)
         for row in np.argsort(-evidence):
-            if evidence[row] < ALARM:
+            if evidence[row] < self.alarm:
                 break
             margins = ((self._evidence[row] - self._evidence) * (self._evidence[row] > 0.0)).sum(1)
             margins[row] = np.inf  # the others' are of what this one explains

@@ -17,21 +17,17 @@ from collections import deque
 
 import numpy as np
 
-from fgloc.stats import chi2_bound
-from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
+from fgloc.sensors.rest import commanded_to_move, is_standing
+from fgloc.stats import alarm_bound
+from fgloc.types import Decision, MotionReadings, Step
 
-_FALSE_PER_S = 1.0 / 3600.0  # of each test
 _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
 _PARTS = 10  # windows that are looked at in each step: these tenths of it
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
 _LEARN_S = 2.0  # before the first test
 _LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
-_STANDS_NS = 1_000_000_000  # how long no command has moved the robot before its turn is not its own
-_STANDS_M, _STANDS_RAD = 1e-3, 1e-3  # motion of standing wheels in a second: quantization
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
-_CARRIED_SPEED = 0.7  # m/s: sigma of each axis; a person walks at 1 m/s
-_CARRIED_TURN = 0.7  # rad/s: sigma, where no gyro measures the turn
 _ONSET_S = 0.5  # from the start of a lift to its alarm
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
 _LONGEST_S = 10.0  # ... and without sightings it has been set down by then
@@ -79,18 +75,10 @@ class LiftMonitor:
             told = [Decision(k, step.stamp_ns, "lift", -1, math.nan, math.nan, 0, 0.0, "carried")]
         return told
 
-    def motion(self, step: Step, readings: MotionReadings) -> MotionMeasurement:
-        """What is known of the motion of a carried robot: that a person is not fast, and the turn if there is a gyro.
-
-        Its way goes on in one direction, so that sigma grows with the time since the last fix.
-        """
+    def carried_s(self, step: Step) -> float:
+        """How long before a step that it is carried over the robot was fixed last [s]."""
         before, self._since_fix_s = self._since_fix_s, self._since_fix_s + step.dt
-        cov: FloatArray = np.diag(np.square([_CARRIED_SPEED, _CARRIED_SPEED, _CARRIED_TURN]))
-        cov = cov * (self._since_fix_s**2 - before**2)
-        motion, gyro = np.zeros(3), readings.gyro
-        if gyro is not None:
-            motion[2], cov[2, 2] = gyro.motion[2], gyro.cov[2, 2]
-        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov)
+        return before
 
     def fix(self) -> None:
         """Sightings have fixed the pose."""
@@ -141,7 +129,7 @@ class _RiseTest:
         ends = np.searchsorted(spans, np.linspace(1.0 / _PARTS, 1.0, _PARTS) * spans[-1] - 1e-9)
         sigmas = np.sqrt(np.maximum(self._variance * spans[ends] / _WINDOW_S, _LEAST_SIGMA**2))
         nis = np.where(np.abs(rises[ends]) > _LEAST_RISE, (rises[ends] / sigmas) ** 2, 0.0)
-        bound = chi2_bound(1.0 - _FALSE_PER_S * dt / _PARTS, 1)
+        bound = alarm_bound(dt, _PARTS, 1)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)
@@ -159,9 +147,10 @@ class _TurnTest:
 
     def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
         """Squared ratio of turn and standard deviation since the robot stands, and its bound."""
-        bound = chi2_bound(1.0 - _FALSE_PER_S * max(step.dt, 1e-3), 1)
+        bound = alarm_bound(step.dt, 1, 1)
         wheels, gyro = readings.wheels, readings.gyro
-        if wheels is None or gyro is None or not _told_to_stand(step) or not _stand(wheels.motion, step.dt):
+        told_to_stand = commanded_to_move(step) is False
+        if wheels is None or gyro is None or not told_to_stand or not is_standing(wheels.motion, step.dt):
             self._turned = self._variance = 0.0
             return 0.0, bound
         self._turned += float(gyro.motion[2])
@@ -169,14 +158,3 @@ class _TurnTest:
         if abs(self._turned) < _LEAST_TURN:
             return 0.0, bound
         return self._turned**2 / self._variance, bound
-
-
-def _told_to_stand(step: Step) -> bool:
-    """Whether all commands of the last second are zero, and there are some."""
-    recent = [c for c in step.controls if c.stamp_ns >= step.start_ns - _STANDS_NS]
-    return bool(recent) and all(c.v == 0.0 and c.omega == 0.0 for c in recent)
-
-
-def _stand(motion: FloatArray, dt: float) -> bool:
-    x, y, yaw = motion
-    return math.hypot(x, y) < _STANDS_M * max(dt, 0.1) and abs(yaw) < _STANDS_RAD * max(dt, 0.1)

@@ -88,7 +88,7 @@ class MotionFaultMonitor:
         self._travelled(step.dt, readings)
         if not verdict.flagged:
             budget = NoiseBudget(rejected, verdict.scale)
-            return FaultVerdict(budget, verdict.span, verdict.nis, self._config.alarm)
+            return FaultVerdict(budget, verdict.span, verdict.nis, verdict.bound)
         if verdict.since:
             self._reason = "slip"
         reason = self._failure(verdict.since)
@@ -98,7 +98,7 @@ class MotionFaultMonitor:
                 self.flags -= Counter({f"{registry.motion_names().odometer}.{self._reason}": 1})
             self._reason = reason
         budget = NoiseBudget({registry.motion_names().odometer: reason, **rejected})
-        return FaultVerdict(budget, max(verdict.since, 1), verdict.nis, self._config.alarm)
+        return FaultVerdict(budget, max(verdict.since, 1), verdict.nis, verdict.bound)
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9

@@ -103,7 +103,7 @@ class MotionJudge:
     ) -> list[MotionMeasurement]:
         """Factors of a step: of the sources, or of a robot that is carried, or of one whose motion nothing measures."""
         if self._lift.carried:
-            return [self._lift.motion(step, readings)]
+            return [self.sources.unknown(step, readings, self._lift.carried_s(step))]
         made = (budget or NoiseBudget()).combine(readings, self.sources.rules)
         return made or [self.sources.unknown(step, readings)]
 

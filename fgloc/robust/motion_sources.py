@@ -17,12 +17,13 @@ from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
+_LEAST_S = 0.01  # of a step without a motion source: its covariance is not singular
 _SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
-_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 
 
 class MotionSources:
@@ -82,9 +83,7 @@ class MotionSources:
         gyro = self._turn = None
         if self.gyro is not None:
             without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
-            turn = self.gyro.measure(
-                step, None if wheels is None or _is_commanded_to_move(step) else motion, without_yaw_s
-            )
+            turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
             if turn is not None:
                 cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
                 name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
@@ -147,15 +146,25 @@ class MotionSources:
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
         return self._installed(m, self._learned.derivatives(m.motion), *by_turn)
 
-    def unknown(self, step: Step, readings: MotionReadings | None = None) -> MotionMeasurement:
+    def unknown(
+        self, step: Step, readings: MotionReadings | None = None, carried_s: float | None = None
+    ) -> MotionMeasurement:
         """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
 
         A gyro, if there is one, still measures the turn.
+
+        Args:
+            step: over which.
+            readings: of it.
+            carried_s: since when the robot is carried, so that its wheels do not measure [s]; None: it is not.
         """
-        before, self._silent_s = self._silent_s, self._silent_s + max(step.dt, 0.01)
+        before = self._silent_s if carried_s is None else carried_s
+        after = before + max(step.dt, _LEAST_S)
+        if carried_s is None:
+            self._silent_s = after
         gate = self._config.gate
         speed, turn = _LIKELY * gate.max_speed, _LIKELY * gate.max_yaw_rate
-        cov = np.diag(np.square([speed, speed, turn])) * (self._silent_s**2 - before**2)
+        cov = np.diag(np.square([speed, speed, turn])) * (after**2 - before**2)
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
             motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
@@ -204,17 +213,11 @@ class MotionSources:
         """
         if self.gyro is None or self._turn is None:
             return 0.0
-        noise, bias = self._turn.noise_density, self.gyro.bias_variance
-        return 2.0 * variance / (noise + math.sqrt(noise**2 + 4.0 * bias * variance))
+        noise, bias = 0.5 * self._turn.noise_density, self.gyro.bias_variance
+        return variance / (noise + math.sqrt(noise**2 + bias * variance))
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of what happened in between."""
         self._silent_s = self._yaw_indirect_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
-
-
-def _is_commanded_to_move(step: Step) -> bool:
-    """Whether a command of the step, or the one it began with, is not to stand: still wheels may then be dead ones."""
-    since = step.start_ns - _COMMANDED_NS
-    return any((c.v != 0.0 or c.omega != 0.0) and c.stamp_ns >= since for c in step.controls)

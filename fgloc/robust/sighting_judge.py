@@ -20,7 +20,7 @@ from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
 from fgloc.robust.association import Association
 from fgloc.robust.decision_log import OVERRULED, moved_notes, place_decision
-from fgloc.robust.landmark_modes import ALARM, LandmarkModes
+from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.motion_judge import JudgedMotion
 from fgloc.types import Decision, LandmarkMeasurement, PoseMeasurement, Step
 
@@ -154,5 +154,7 @@ class SightingJudge:
         without, nis = self.modes.exclude(moved, belief)
         if without is not belief:
             self._estimator.correct(without, moved)
-        row = Decision(k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", ALARM)
+        row = Decision(
+            k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", self.modes.alarm
+        )
         return [row], without is not belief

@@ -100,8 +100,8 @@ def test_a_rise_is_told_within_half_a_second_and_ends_with_a_fix():
     rising = [step(100, 10.6 + rng.normal(0.0, 0.4, 20)), step(101, 10.9 + rng.normal(0.0, 0.4, 20))]
     assert "vertical_velocity" in alarms(monitor, [(s, readings(s)) for s in rising])[-1]
     assert monitor.carried
-    sigma = [math.sqrt(monitor.motion(rising[-1], readings(rising[-1])).cov[0, 0]) for _ in range(2)]
-    assert sigma[1] > sigma[0] > 0.1
+    since_s = [monitor.carried_s(rising[-1]) for _ in range(2)]
+    assert since_s[1] > since_s[0] > 0.1
     monitor.fix()
     assert monitor.carried  # still in the hands
     later = [step(k, 9.78 + rng.normal(0.0, 0.4, 20)) for k in range(102, 125)]

@@ -32,6 +32,7 @@ from fgloc.sensors.learned.config import MotionConfig
 from fgloc.sensors.learned.joint import JointCalibration
 from fgloc.sensors.learned.source import LearnedMotion
 from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.stats import GATE, chi2_bound
 from fgloc.types import ControlEvent, MotionMeasurement, MotionReadings, Step, by_class
 
 W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2
@@ -131,7 +132,7 @@ def test_the_reference_source_may_change_from_step_to_step(tmp_path):
     step = Step(0, 0, START_NS, START_NS + 10**8, {})
     faults.begin(step)
     for readings in (MotionReadings(wheels, None, gyro), MotionReadings(wheels, learned, gyro)) * 3:
-        assert faults.judge(step, readings).nis < settings.weights.alarm
+        assert faults.judge(step, readings).nis < chi2_bound(GATE, 3)
 
 
 def test_sources_that_disagree_are_known_less_well_together(tmp_path):

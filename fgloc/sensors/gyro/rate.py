@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fgloc.sensors.base import Turn
 from fgloc.sensors.gyro import installation
 from fgloc.sensors.gyro.config import GyroConfig
+from fgloc.sensors.rest import is_standing
 from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
@@ -20,7 +21,6 @@ _STILL_RATE = 0.03  # rad/s on top of what the bias may be: a robot that turns f
 _STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
 _GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
 _APART_S = 2.0  # ... and another one after at least this long
-_REST_M, _REST_RAD = 1e-3, 1e-3  # of wheel motion a second: quantization is no motion
 
 
 class Gyro:
@@ -129,10 +129,7 @@ class Gyro:
         self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
 
     def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
-        stands = False
-        if wheels is not None:
-            x, y, yaw = np.asarray(wheels, dtype=float)
-            stands = math.hypot(x, y) < _REST_M * max(dt, 0.1) and abs(yaw) < _REST_RAD * max(dt, 0.1)
+        stands = wheels is not None and is_standing(np.asarray(wheels, dtype=float), dt)
         still = abs(rate - self.bias) < _STILL_RATE + 3.0 * math.sqrt(self.bias_variance)
         self._standing_s = self._standing_s + dt if stands and still else 0.0
         if self._standing_s > _AT_REST_S:
