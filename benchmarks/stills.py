@@ -166,7 +166,10 @@ def _timed(seconds: FloatArray, search_s: FloatArray, which: int) -> Iterator[No
         edges_s += time.thread_time() - start
         return found
 
-    with patch("fgloc.sensors.markers.detector.refine_all", timed):
+    with (
+        patch("fgloc.sensors.markers.detector.refine_all", timed),
+        patch("fgloc.sensors.markers.coarse.refine_all", timed),
+    ):
         start = time.thread_time()
         yield
         taken = time.thread_time() - start

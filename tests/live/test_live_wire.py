@@ -18,6 +18,7 @@ from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.intake import Intake
 from fgloc.live.wire.names import dds_topic, dds_type, ros_topic, ros_type
 from fgloc.live.wire.participant import Participant, Publication, Sample
+from fgloc.live.wire.participant import Writer as WireWriter
 from fgloc.live.wire.play import Player
 from fgloc.recording.cdr import Messages
 from fgloc.recording.decode import converters_of
@@ -31,6 +32,7 @@ def _quick(monkeypatch):
 
 
 TWIST = "geometry_msgs/msg/Twist"
+IMAGE = "sensor_msgs/msg/Image"
 
 
 def test_names_are_those_of_ros2():
@@ -92,6 +94,34 @@ def test_what_was_written_before_reaches_late_readers_of_a_latched_topic_only():
         told = [(s.topic, other.messages.decode(TWIST, s.cdr).linear.x) for s in heard]
         assert sorted(told) == [("/cmd_vel", 9.0), *(("/tf_static", x) for x in (0.0, 1.0, 2.0, 9.0))]
         assert heard[-1].source_ns == 123
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_fault_69_publishers_of_any_quality_of_service_are_heard(reliable):
+    """Best effort or reliable; and static transforms from a publisher that keeps none for late readers."""
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+
+    events = []
+    names = ("/odom", "nav_msgs/msg/Odometry"), ("/image_raw", IMAGE), ("/tf_static", "tf2_msgs/msg/TFMessage")
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        quality = Policy.Reliability.Reliable(10**9) if reliable else Policy.Reliability.BestEffort
+        qos = Qos(quality, Policy.Durability.Volatile, Policy.DataRepresentation(use_cdrv0_representation=True))
+        topics = [one._topic(name, kind, one.messages) for name, kind in names]
+        writers = [WireWriter(DataWriter(one._participant, topic, qos=qos), topic.data_type) for topic in topics]
+        intake_ = Intake(other, WireClock(other), RecordingConfig(), lambda event, publisher: events.append(event))
+        assert wait_until(lambda: not intake_.find() and bool(intake_.roles))
+        assert wait_until(lambda: bool(intake_.subscribe() or True) and all(w.readers for w in writers))
+        turn = {"rotation": {"w": 1.0}}
+        frames = {"transforms": [{"header": {"frame_id": "base"}, "child_frame_id": "imu", "transform": turn}]}
+        contents = ({"child_frame_id": "base"}, {}, frames)
+
+        def heard():
+            for writer, (_, kind), content in zip(writers, names, contents, strict=True):
+                writer.write(one.messages.encode(kind, content))
+            return intake_.received.keys() >= {name for name, _ in names}
+
+        assert wait_until(heard)
 
 
 def test_leaving_is_noticed_and_quick():

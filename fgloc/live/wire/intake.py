@@ -20,6 +20,7 @@ SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 LOOK: tuple[Role, ...] = ("image", "sightings")
 _TF_TOPICS = ("/tf", "/tf_static")
+_LATCHED = frozenset({"/tf_static"})
 
 
 class Intake:
@@ -41,6 +42,7 @@ class Intake:
         self._config = config
         self._push = push
         self._role_of: dict[str, Role | None] = {}
+        self._also: set[str] = set()  # latched topics that are read from publishers that do not latch, too
         self._found: tuple[Publication, ...] = ()
         self._changed_s = time.monotonic()
         self.roles: dict[Role, str] = {}
@@ -78,7 +80,10 @@ class Intake:
         for topic in _TF_TOPICS:
             if self.roles and types.get(topic) in TF_TYPES and topic not in self._role_of:
                 self._role_of[topic] = None
-                self._participant.read(topic, types[topic], self._on_sample, latched=topic == "/tf_static")
+                self._participant.read(topic, types[topic], self._on_sample, latched=topic in _LATCHED)
+            if topic in self._role_of and topic in _LATCHED - self._also and self._participant.has_volatile(topic):
+                self._also.add(topic)
+                self._participant.read(topic, types[topic], self._on_sample)
         new = [(role, topic) for role, topic in self.roles.items() if topic not in self._role_of and topic in types]
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:

@@ -129,6 +129,7 @@ class Participant:
             raise WireError(f"DDS does not start in domain {domain}: {error.msg}") from error
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._publications: dict[object, Publication] = {}
+        self._volatile: set[str] = set()
         self._topics: dict[str, Any] = {}
         self._readers: list[_Reader] = []
         self._entering: list[_Reader] = []
@@ -169,6 +170,7 @@ class Participant:
         if self._failure is not None:
             raise WireError(f"a message could not be taken in: {self._failure!r}") from self._failure
         from cyclonedds.core import InstanceState
+        from cyclonedds.qos import Policy
 
         for endpoint in self._found.take(1000):
             key = endpoint.sample_info.instance_handle
@@ -178,7 +180,13 @@ class Participant:
                 topic, kind = ros_topic(endpoint.topic_name), ros_type(endpoint.type_name)
                 if topic is not None and kind is not None:
                     self._publications[key] = Publication(topic, kind)
+                    if endpoint.qos[Policy.Durability] == Policy.Durability.Volatile:
+                        self._volatile.add(topic)
         return tuple(sorted(set(self._publications.values()), key=lambda p: (p.topic, p.message_type)))
+
+    def has_volatile(self, topic: str) -> bool:
+        """Whether one of the topic's publishers keeps nothing for late readers: latched reading does not hear it."""
+        return topic in self._volatile
 
     def writer(self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None) -> Writer:
         """A reliable writer; a latched one gives late readers what was written before (transient local)."""

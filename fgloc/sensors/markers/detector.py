@@ -13,6 +13,8 @@ from cv2.typing import MatLike
 from fgloc.config import Config
 from fgloc.errors import ConfigError
 from fgloc.sensors.detection import Detector, RememberingDetector
+from fgloc.sensors.markers.aruco import ALL_WINDOWS, SMALLEST, Found, in_order, inside, pairs, parameters, subpixel
+from fgloc.sensors.markers.coarse import CoarseSearch
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.dictionaries import load_dictionary, suggest, turned_by_180
 from fgloc.sensors.markers.edges import refine_all
@@ -20,10 +22,6 @@ from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.types import FloatArray, LandmarkMap
 
-_SMALLEST = 0.03  # perimeter of the smallest marker, in units of the image's longer side
-_SUBPIX_WINDOW_PX, _SUBPIX_SHARE = 10, 0.5  # half the window of a corner: at most, and as a share of a cell
-_SUBPIX_STOP = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.01)
-_ALL_WINDOWS, _ONE_WINDOW = (3, 23, 10), (7, 7, 10)  # of the adaptive threshold [px]: smallest, largest, step
 _LEAST_SIDE_PX = 16  # of an image
 _SECOND_LOOKS = 12  # small unreadable squares of an image that are enlarged and read again
 _SECOND_LOOK_SIDE_PX = (6.0, 32.0)  # smaller ones cannot be read, larger ones needed no enlarging
@@ -60,11 +58,8 @@ class MarkerDetector:
         self._dictionary = load_dictionary(dictionary)
         self._cells = int(self._dictionary.markerSize) + 2
         self._turn = 2 if turned_by_180(dictionary) else 0
-        self._passes = {
-            windows: cv2.aruco.ArucoDetector(self._dictionary, _parameters(windows))
-            for windows in (_ALL_WINDOWS, _ONE_WINDOW)
-        }
-        enlarged = _parameters(_ALL_WINDOWS, smallest=1.0)
+        self._whole = cv2.aruco.ArucoDetector(self._dictionary, parameters(ALL_WINDOWS))
+        enlarged = parameters(ALL_WINDOWS, smallest=1.0)
         enlarged.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._second = cv2.aruco.ArucoDetector(self._dictionary, enlarged)
 
@@ -73,6 +68,10 @@ class MarkerDetector:
         from fgloc.sensors.markers.tracking import TrackingDetector
 
         return TrackingDetector(self)
+
+    def coarse(self) -> CoarseSearch:
+        """A faster search, for images between those that this one searches."""
+        return CoarseSearch(self._dictionary, self._turn)
 
     def remembering(self, detector: Detector, file: Path | None, known: Any, note: bool = True) -> RememberingDetector:
         """A detector that asks another one only about images that are not known, from a file or an earlier run."""
@@ -96,67 +95,46 @@ class MarkerDetector:
         sightings = tuple(MarkerCorners(i, corners) for i, corners in found)
         return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
 
-    def find(self, image: GrayImage) -> list[tuple[int, FloatArray]]:
+    def find(self, image: GrayImage) -> Found:
         """Id and corners ``(4, 2)`` of each marker in a gray image, ordered by id, then from the left."""
         return self.read(image)[0]
 
-    def read(self, image: GrayImage) -> tuple[list[tuple[int, FloatArray]], int]:
+    def read(self, image: GrayImage) -> tuple[Found, int]:
         """What `find` finds, and how many squares there were that could have been markers."""
-        found, squares = self._search(image, None, _ALL_WINDOWS)
+        found, squares = self._search(image, None)
         return self._refined(image, found), squares
 
-    def find_fast(self, image: GrayImage) -> list[tuple[int, FloatArray]]:
-        """As `find`, with one threshold instead of three: a third of the time, and some markers more or less.
-
-        The corners of a marker that both find are the same to the last bit, unless the thresholds draw its outline
-        differently.
-        """
-        return self._refined(image, self._search(image, None, _ONE_WINDOW)[0])
-
-    def find_within(self, image: GrayImage, box: Box) -> list[tuple[int, FloatArray]]:
+    def find_within(self, image: GrayImage, box: Box) -> Found:
         """As `find`, of a part of the image: markers in it that are wholly some ten pixels from its borders."""
-        found, _ = self._search(image, box, _ALL_WINDOWS)
-        known = {i for i, _ in found}
-        found += [(i, c) for i, c in self._search(image, box, _ONE_WINDOW)[0] if i not in known]
-        return self._refined(image, found)
+        return self._refined(image, self._search(image, box)[0])
 
-    def _search(
-        self, image: GrayImage, box: Box | None, windows: tuple[int, int, int]
-    ) -> tuple[list[tuple[int, FloatArray]], int]:
+    def _search(self, image: GrayImage, box: Box | None) -> tuple[Found, int]:
         """Ids with corners in the whole image's pixels, not refined by their edges, and the number of squares."""
         left, top, right, bottom = box or (0, 0, image.shape[1], image.shape[0])
         part = np.ascontiguousarray(image[top:bottom, left:right])
         if min(part.shape) < _LEAST_SIDE_PX:
             return [], 0
-        detector = self._passes[windows]
+        detector = self._whole
         if box is not None:
-            detector = cv2.aruco.ArucoDetector(
-                self._dictionary, _parameters(windows, _SMALLEST * max(image.shape) / max(part.shape))
-            )
+            smallest = SMALLEST * max(image.shape) / max(part.shape)
+            detector = cv2.aruco.ArucoDetector(self._dictionary, parameters(ALL_WINDOWS, smallest))
         corners, ids, rejected = detector.detectMarkers(part)
-        at = np.array([left, top], dtype=np.float32)
+        at = np.array([left, top], dtype=float)
         # From here on in the whole image, so that a part of it gives the same numbers.
-        found = [(i, self._subpixel(image, c + at)) for i, c in _pairs(ids, corners)]
+        found: Found = []
+        if ids is not None:
+            exact = subpixel(image, np.concatenate(corners) + at, self._cells)
+            found = [(int(i), c) for i, c in zip(ids.ravel(), exact, strict=True)]
         found += self._look_again(image, [square + at for square in rejected], found)
         return found, len(corners) + len(rejected)
 
-    def _subpixel(self, image: GrayImage, corners: FloatArray) -> FloatArray:
-        """Corners ``(4, 2)``, given in whole pixels, as OpenCV's detector itself refines them.
-
-        The window of half a cell (at most 10 pixels) is the largest that never reaches the next cell's edge.
-        """
-        cell = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).sum()) / (4 * self._cells)
-        half = min(_SUBPIX_WINDOW_PX, max(1, round(_SUBPIX_SHARE * cell)))
-        start = corners.astype(np.float32).reshape(4, 1, 2)
-        return np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), _SUBPIX_STOP), float).reshape(4, 2)
-
-    def _refined(self, image: GrayImage, found: Sequence[tuple[int, FloatArray]]) -> list[tuple[int, FloatArray]]:
+    def _refined(self, image: GrayImage, found: Found) -> Found:
         """Corners from the markers' edges, in the order of `find`."""
         if not found:
             return []
         refined = refine_all(image, np.array([c for _, c in found]), self._cells)
         turned = [(i, np.roll(c, self._turn, axis=0)) for (i, _), c in zip(found, refined, strict=True)]
-        return sorted(turned, key=lambda f: (f[0], *f[1].mean(axis=0)))
+        return in_order(turned)
 
     def diagnose(self, image: GrayImage) -> list[str]:
         """Hints, one sentence each, on an image in which fewer markers are found than there should be."""
@@ -170,14 +148,12 @@ class MarkerDetector:
             hints.append("The markers are seen inverted, white on black: print them black on white.")
         return hints
 
-    def _look_again(
-        self, image: GrayImage, rejected: Sequence[MatLike], found: Sequence[tuple[int, FloatArray]]
-    ) -> list[tuple[int, FloatArray]]:
+    def _look_again(self, image: GrayImage, rejected: Sequence[MatLike], found: Found) -> Found:
         """Markers among the small squares that could not be read."""
-        more: list[tuple[int, FloatArray]] = []
+        more: Found = []
         for square in _small_squares(rejected):
             center = square.mean(axis=0)
-            if any(_inside(c, center) for _, c in [*found, *more]):
+            if any(inside(c, center) for _, c in [*found, *more]):
                 continue
             reach = np.ptp(square, axis=0).max()
             low = np.maximum(np.floor(center - reach), 0).astype(int)
@@ -185,9 +161,9 @@ class MarkerDetector:
             part = image[low[1] : high[1], low[0] : high[0]]
             large = cv2.resize(part, None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC)
             corners, ids, _ = self._second.detectMarkers(large)
-            for i, c in _pairs(ids, corners):
+            for i, c in pairs(ids, corners):
                 original = (c + 0.5) / _ENLARGE - 0.5 + low
-                if not any(_inside(k, original.mean(axis=0)) for _, k in [*found, *more]):
+                if not any(inside(k, original.mean(axis=0)) for _, k in [*found, *more]):
                     more.append((i, original))
         return more
 
@@ -217,32 +193,6 @@ def configured_detector(config: Config, landmark_map: LandmarkMap | None) -> Mar
     return MarkerDetector(dictionary, config.markers)
 
 
-def _parameters(windows: tuple[int, int, int], smallest: float = _SMALLEST) -> cv2.aruco.DetectorParameters:
-    """Detection settings.
-
-    Cells are sampled 8 pixels wide without the outer quarters, where blur mixes them with their neighbours.
-
-    Args:
-        windows: of the adaptive threshold [px]: smallest, largest, step.
-        smallest: least perimeter of a marker, in units of the image's longer side.
-    """
-    p = cv2.aruco.DetectorParameters()
-    p.adaptiveThreshWinSizeMin, p.adaptiveThreshWinSizeMax, p.adaptiveThreshWinSizeStep = windows
-    p.minMarkerPerimeterRate = smallest
-    p.cornerRefinementWinSize = _SUBPIX_WINDOW_PX
-    p.relativeCornerRefinmentWinSize = _SUBPIX_SHARE
-    p.cornerRefinementMinAccuracy = _SUBPIX_STOP[2]
-    p.perspectiveRemovePixelPerCell = 8
-    p.perspectiveRemoveIgnoredMarginPerCell = 0.25
-    return p
-
-
-def _pairs(ids: MatLike | None, corners: Sequence[MatLike]) -> list[tuple[int, FloatArray]]:
-    if ids is None:
-        return []
-    return [(int(i), np.asarray(c, dtype=np.float64).reshape(4, 2)) for i, c in zip(ids.ravel(), corners, strict=True)]
-
-
 def _small_squares(rejected: Sequence[MatLike]) -> list[FloatArray]:
     """Squares ``(4, 2)`` worth a second look, largest first."""
     low, high = _SECOND_LOOK_SIDE_PX
@@ -250,7 +200,3 @@ def _small_squares(rejected: Sequence[MatLike]) -> list[FloatArray]:
     sides = [np.linalg.norm(s - np.roll(s, 1, axis=0), axis=1) for s in squares]
     kept = [(float(e.sum()), s) for e, s in zip(sides, squares, strict=True) if low < e.min() and e.max() < high]
     return [s for _, s in sorted(kept, key=lambda item: -item[0])[:_SECOND_LOOKS]]
-
-
-def _inside(corners: FloatArray, point: FloatArray) -> bool:
-    return bool(cv2.pointPolygonTest(corners.astype(np.float32), (float(point[0]), float(point[1])), False) >= 0)

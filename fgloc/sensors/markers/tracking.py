@@ -1,41 +1,47 @@
-"""Markers followed from image to image: a fast search of the whole image, and a thorough one where it missed a marker.
+"""Markers followed from image to image: a coarse search of the whole image, then parts of it at full resolution.
 
-The thorough search is repeated for the whole image whenever the fast one finds nothing, and every few images.
+Read closely are the parts where the coarse search saw a square that it could not read, and where a marker was in the
+last image that it did not find. The whole image is searched at full resolution where this finds nothing although there
+were markers, and every so many images.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Iterable
 
 import numpy as np
 
+from fgloc.sensors.markers.aruco import Found, in_order
 from fgloc.sensors.markers.detector import Box, MarkerDetector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import GrayImage, decode
 from fgloc.types import FloatArray
 
-Found = list[tuple[int, FloatArray]]
-
-_EVERY = 10  # images from one thorough search of the whole image to the next
+_EVERY = 30  # images from one search of the whole image at full resolution to the next
+_EVERY_WITHOUT = 4  # likewise, while there are no markers
+_MOST_SHARE = 0.5  # of the image that is read in parts; beyond that, all of it costs no more
 _MAX_GAP_NS = 1_000_000_000  # markers that were seen longer ago are not looked for
 _ROOM_PX = 16.0  # around a marker, for the detector's widest threshold and contours that touch the part's border
 _ROOM_SHARE = 0.5  # of its side, for motion that differs from that of the other markers
-_BORDER_PX = 4.0  # markers that come nearer to the image's border are about to leave it
+_MARGIN_PX = 12.0  # of that room: for the widest threshold alone
+_BORDER_PX = 2.0  # squares that come nearer to the image's border are cut by it
 
 
 class TrackingDetector:
     """Finds the markers of a camera's images, which have to come in their order.
 
     Attributes:
-        counts: images searched thoroughly ("whole"), fast ("fast"), and markers looked for where they had been
-            ("missing").
+        counts: images searched at full resolution ("whole"), coarsely ("coarse"), and the latter's parts that were read
+            at full resolution ("parts").
     """
 
     def __init__(self, detector: MarkerDetector) -> None:
         """Take a detector, which may be used elsewhere too."""
         self.counts: Counter[str] = Counter()
         self._detector = detector
+        self._coarse = detector.coarse()
         self._last: Found = []
         self._last_ns = -math.inf
         self._shape: tuple[int, ...] = ()
@@ -53,56 +59,71 @@ class TrackingDetector:
 
     def find(self, image: GrayImage, stamp_ns: int) -> Found:
         """Id and corners ``(4, 2)`` of each marker in a gray image, ordered by id, then from the left."""
-        known = self._last if 0 <= stamp_ns - self._last_ns <= _MAX_GAP_NS and image.shape == self._shape else []
+        known = self._last if image.shape == self._shape else []
+        follows = image.shape == self._shape and 0 <= stamp_ns - self._last_ns <= _MAX_GAP_NS
         self._since_whole += 1
-        found: Found = []
-        if known and self._since_whole < _EVERY:
-            self.counts["fast"] += 1
-            found = self._detector.find_fast(image)
-        if not found:
+        found = None
+        if follows and self._since_whole < (_EVERY if known else _EVERY_WITHOUT):
+            self.counts["coarse"] += 1
+            found = self._coarsely(image, known)
+        if found is None:
             self.counts["whole"] += 1
             self._since_whole = 0
             found = self._detector.find(image)
-        if known and found:
-            found = self._with_missing(image, known, found)
         self._last, self._last_ns, self._shape = found, stamp_ns, image.shape
         return found
 
-    def _with_missing(self, image: GrayImage, known: Found, found: Found) -> Found:
-        """What was found, and markers of the last image that were not found but may still be in view."""
-        missing, shift = _compare(known, found)
-        more: Found = []
-        for marker_id, corners in missing:
-            box = _box_around(corners + shift, image.shape)
-            if box is None:
-                continue
-            self.counts["missing"] += 1
-            for i, c in self._detector.find_within(image, box):
-                if i == marker_id and not any(i == j and _near(c, d) for j, d in (*found, *more)):
-                    more.append((i, c))
-        return sorted([*found, *more], key=lambda f: (f[0], *f[1].mean(axis=0))) if more else found
+    def _coarsely(self, image: GrayImage, known: Found) -> Found | None:
+        """What a coarse search and a close look at some parts find; None if the whole image is to be searched."""
+        found, squares = self._coarse.find(image)
+        missing, moved = _compare(known, found)
+        if missing:
+            shift = np.median(moved, axis=0) if moved else np.zeros(2)
+            squares += [corners + shift for corners in missing]
+        parts = _parts(squares, found, image.shape) if squares else []
+        if sum((right - left) * (bottom - top) for left, top, right, bottom in parts) > _MOST_SHARE * image.size:
+            return None
+        for part in parts:
+            self.counts["parts"] += 1
+            read = self._detector.find_within(image, part)
+            found += [(i, c) for i, c in read if not any(i == j and _near(c, d) for j, d in found)]
+        return None if known and not found else in_order(found)
 
 
-def _compare(known: Found, found: Found) -> tuple[Found, FloatArray]:
-    """Markers that are missing now, and how far those that are not have moved ``(2,)``."""
+def _compare(known: Found, found: Found) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Corners of the last image's markers that are missing now, and how far those that are not have moved ``(2,)``."""
     left: dict[int, deque[FloatArray]] = {}
     for i, corners in found:
         left.setdefault(i, deque()).append(corners)
     missing, moved = [], []
     for i, corners in known:
         if left.get(i):
-            moved.append(left[i].popleft().mean(axis=0) - corners.mean(axis=0))
+            moved.append(left[i].popleft()[0] - corners[0])
         else:
-            missing.append((i, corners))
-    return missing, np.median(moved, axis=0) if moved else np.zeros(2)
+            missing.append(corners)
+    return missing, moved
 
 
-def _box_around(corners: FloatArray, shape: tuple[int, ...]) -> Box | None:
-    """The part of an image around a marker; None if it is about to leave the image."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
+def _parts(squares: Iterable[FloatArray], found: Found, shape: tuple[int, ...]) -> list[Box]:
+    """The parts of an image in which squares are to be read, but for those of markers that were found."""
     size = np.array([shape[1], shape[0]])
-    if (low < _BORDER_PX).any() or (high > size - 1.0 - _BORDER_PX).any():
-        return None
+    parts: list[Box] = []
+    for square in squares:
+        low, high = square.min(axis=0), square.max(axis=0)
+        leaves = (low < _BORDER_PX).any() or (high > size - 1.0 - _BORDER_PX).any()
+        if leaves or any(_near(c, square) for _, c in found) or any(_contains(p, low, high) for p in parts):
+            continue
+        parts.append(_box_around(low, high, size))
+    return parts
+
+
+def _contains(part: Box, low: FloatArray, high: FloatArray) -> bool:
+    """Whether a part holds a square with the room that a search of it needs."""
+    return bool((low - part[:2] >= _MARGIN_PX).all() and (part[2:] - high > _MARGIN_PX).all())
+
+
+def _box_around(low: FloatArray, high: FloatArray, size: FloatArray) -> Box:
+    """The part of an image around a square."""
     room = _ROOM_PX + _ROOM_SHARE * float((high - low).max())
     left, top = np.maximum(np.floor(low - room), 0).astype(int).tolist()
     right, bottom = np.minimum(np.ceil(high + room) + 1, size).astype(int).tolist()
