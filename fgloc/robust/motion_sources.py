@@ -144,7 +144,7 @@ class MotionSources:
         if m is None:
             return None
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
-        return self._installed(m, self._learned.derivatives(m), *by_turn)
+        return self._installed(m, self._learned.derivatives(m.motion), *by_turn)
 
     def unknown(
         self, step: Step, readings: MotionReadings | None = None, carried_s: float | None = None

@@ -139,7 +139,7 @@ class MotionPredictor(Protocol):
         """Predict the step, for this robot."""
         ...
 
-    def derivatives(self, m: MotionMeasurement) -> dict[str, FloatArray]:
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
         """Of a predicted motion by what the model is off by."""
         ...
 

@@ -46,13 +46,6 @@ class MotionConfig(Section):
     scale_sigma: float = Field(
         0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
     )
-    slowdown_sigma: float = Field(
-        0.02,
-        ge=0,
-        le=1,
-        description="s/rad: how far this robot's speed may be off the model's, as a share for each rad/s of turning; "
-        "estimated",
-    )
     correlation: Literal["joint", "independent"] = Field(
         "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
     )

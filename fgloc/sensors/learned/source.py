@@ -113,9 +113,9 @@ class LearnedMotion:
             return m
         return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
 
-    def derivatives(self, m: MotionMeasurement) -> dict[str, FloatArray]:
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
         """Of a motion of this source by what it is off by."""
-        return installation.derivatives(m)
+        return installation.derivatives(motion)
 
     def _unusable(self, step: Step) -> str:
         for command in reversed(step.controls):
