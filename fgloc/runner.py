@@ -63,7 +63,7 @@ def run(
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
-        replay = _replayed(recording, parts, mode, wrong, progress, options)
+        replay = _replayed(recording, parts, mode, progress, options)
         outcome = Outcome.of(recording, parts, replay, wrong)
     if not replay.estimates:
         raise EstimatorError(outcome.failed(never_found(replay, outcome.rejections)))
@@ -112,16 +112,15 @@ def _replayed(
     recording: Recording,
     parts: Assembly,
     mode: RunMode,
-    wrong: Mistakes,
     progress: Progress | None,
     options: RunOptions,
 ) -> Replay:
     """Run all events through the localizer."""
     memory, file = None, options.get("detections")
     if parts.detector is not None:
-        # What a file remembers must not depend on which images came before.
+        # What a file remembers must not depend on which images came before; without one they are followed, as live.
         detector = parts.detector.following() if file is None else parts.detector
-        memory = parts.detector.remembering(detector, file, wrong.detections, note=file is not None)
+        memory = parts.detector.remembering(detector, file, None, note=file is not None)
     replay = Replay(parts, recording, memory, progress, options)
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:

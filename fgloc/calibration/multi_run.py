@@ -87,8 +87,9 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
     gain = next((s for s in result.found.settings if s.name == odometer.distance_gain), None)
     if not result.found.wheels or gain is None or gain.sigma > _UNSEEN * gain.prior_sigma:
         raise EstimatorError(
-            f"{bag}: no messages of wheels, or of commands in their place, between sightings: see wheels.source "
-            f"and `fgloc info {bag}`"
+            f"{bag}: the gains of the wheels cannot be determined: between sightings there are no messages of wheels, "
+            f"or of commands in their place (see wheels.source and `fgloc info {bag}`), or gains so far off that the "
+            "sightings contradict every motion (begin with nearer ones)"
         )
     return result
 

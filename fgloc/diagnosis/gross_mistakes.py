@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +35,12 @@ class Mistakes:
         sentences: one for each mistake, with the line to be set; none on a sound set-up.
         config: with the mistakes undone.
         landmark_map: likewise; None: the file is taken as it is.
-        detections: of the images that were searched.
         undone: whether ``config`` and ``landmark_map`` are not as they were given.
     """
 
     sentences: tuple[str, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
-    detections: Mapping[bytes, Any] = field(default_factory=dict)
     undone: bool = False
 
     @property
@@ -67,7 +64,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     found = _Search(path, map_path, config)
     found.run()
     undone = found.config != config or found.landmark_map is not None
-    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, found.detections, undone)
+    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, undone)
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:

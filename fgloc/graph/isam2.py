@@ -30,7 +30,7 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_key
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
-from fgloc.graph.joint import LINEAR_RAD, correct
+from fgloc.graph.joint import LINEAR_RAD, correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.uneven import ground_factors, ground_prior, is_level_known, step_of
 from fgloc.types import (
@@ -97,9 +97,10 @@ class IncrementalEstimator(Estimator):
         newest.belief = self._replayed([*window, newest], newest.belief)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
-        """Where to linearize: at the prediction or, while roll and pitch are not known, where the sightings put it."""
+        """Where to linearize: at the prediction or, while a pose in space is not yet known, where sightings put it."""
         known = frame.belief.installation or self.installed
-        if not frame.sightings or not self.factors.known or is_level_known(known, self.installation):
+        near = is_level_known(known, self.installation) and (is_linear(frame.belief) or not self.installation.ground)
+        if not frame.sightings or not self.factors.known or near:
             return frame.belief
         measurements = [s.measurement for s in frame.sightings]
         corrected = correct(frame.belief, known, measurements, self.factors)

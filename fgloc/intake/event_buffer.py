@@ -35,10 +35,11 @@ class EventBuffer(Generic[E]):
         self._events.insert(at, event)
         return True
 
-    def window(self, start_ns: int, end_ns: int) -> tuple[E, ...]:
-        """Events inside, the last one at or before the start, and the first one at or after the end."""
+    def window(self, start_ns: int, end_ns: int, beyond: bool = True) -> tuple[E, ...]:
+        """Events inside, the last one at or before the start and, if ``beyond``, the first one at or after the end."""
         first = max(bisect_right(self.stamps, start_ns) - 1, 0)
-        return tuple(self._events[first : bisect_left(self.stamps, end_ns) + 1])
+        last = bisect_left(self.stamps, end_ns) + 1 if beyond else bisect_right(self.stamps, end_ns)
+        return tuple(self._events[first:last])
 
     def after(self, stamp_ns: int) -> int | None:
         """The first stamp later than this."""

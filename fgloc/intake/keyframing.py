@@ -255,7 +255,8 @@ class KeyframeBuilder:
             start_ns=start,
             stamp_ns=stamp_ns,
             motion={
-                kind: buffer.window(start - self._back_ns(kind), stamp_ns) for kind, buffer in self._motion.items()
+                kind: buffer.window(start - self._back_ns(kind), stamp_ns, beyond=not issubclass(kind, ControlEvent))
+                for kind, buffer in self._motion.items()
             },
             sightings=tuple(e for e in self._pending[:handed] if not isinstance(e, SensorEvent)),
             sensed=(

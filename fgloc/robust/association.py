@@ -57,7 +57,9 @@ class Association:
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Sort sightings into accepted and rejected, with the decision on each.
 
-        The NIS is that of the prediction, with what is not known of the installation.
+        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and a
+        pose in space is not known well, it is taken again at the pose that best explains prediction and sighting
+        together, because the linear one is far too large.
         """
         accepted, rejected, decisions = [], [], []
         judged = self._judge(measurements, predicted)
@@ -174,16 +176,19 @@ class Association:
         lines = self._factors.linearize(measurements, predicted.pose)
         known = predicted.installation or self._factors.estimated
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
+        uncertain = not is_linear(predicted)
         judged = []
-        for one, nis in zip(lines, found, strict=True):
+        for m, one, nis in zip(measurements, lines, found, strict=True):
             dof = len(one.residual)
             if one.behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
-            judged.append((nis, dof, "gate" if nis > self._gate(dof) else ""))
-        if is_linear(predicted) or not self._config.weights.adaptive:
-            return judged
-        return self._agreed(measurements, predicted, judged)
+            bound = self._gate(dof)
+            in_space = uncertain and self._factors.installation.ground
+            if nis > bound and in_space and (corrected := correct(predicted, known, [m], self._factors)):
+                nis = min(nis, corrected[1])
+            judged.append((nis, dof, "gate" if nis > bound else ""))
+        return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
 
     def _agreed(
         self,
