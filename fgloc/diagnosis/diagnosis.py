@@ -14,7 +14,7 @@ from fgloc.diagnosis.floor import FloorWatch
 from fgloc.diagnosis.frame_checks import first_pose_sentence
 from fgloc.diagnosis.hypotheses import explanation
 from fgloc.diagnosis.pool import Pool, Pooled
-from fgloc.diagnosis.turning import GyroWitness, Turning
+from fgloc.diagnosis.turning import GyroComparison, Turning
 from fgloc.diagnosis.window import PRIOR_SIGMAS, PRIOR_SIGMAS_NO_MAP, Fault, Fit, Window, fit_window
 from fgloc.sensors import registry
 from fgloc.sensors.landmarks import LandmarkSensor
@@ -77,7 +77,7 @@ class Diagnosis:
         self._cutter = WindowCutter()
         self._faults = Pool(PRIOR_SIGMAS if landmark_map is not None else PRIOR_SIGMAS_NO_MAP)
         self._seen_by = seen_by
-        self._gyro = GyroWitness(imu_up)
+        self._gyro = GyroComparison(imu_up)
         self._gross: list[Window] = []
         self._gross_count = 0
         self._tried = 0

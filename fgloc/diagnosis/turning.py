@@ -27,7 +27,7 @@ class Turning(IntEnum):
     SCALE = 1  # wheel rotation per gyro rotation
 
 
-class GyroWitness:
+class GyroComparison:
     """Compares yaw angles of gyro and wheels, window by window."""
 
     def __init__(self, up: FloatArray | None) -> None:

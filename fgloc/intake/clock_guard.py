@@ -14,7 +14,7 @@ _CONFIRM_NS = 250_000_000  # ... over this span confirm it ...
 _CONFIRM_BACK_NS = 100_000_000  # ... and, of an earlier time, received over this: late messages come in a burst
 _GIVE_UP_NS = 5_000_000_000  # after this span without motion messages, sightings alone confirm
 _WINDOW_NS = 60_000_000_000  # events within it may agree with each other
-_MAX_SUSPECTS = 1024
+_MAX_UNCONFIRMED = 1024
 
 
 class ClockVerdict(Enum):
@@ -29,7 +29,7 @@ class ClockGuard:
     """Sorts events by whether their stamps fit the running clock.
 
     A stamp far ahead of the newest or far behind it is kept in a bounded queue until others agree with it (the clock
-    has jumped, or all sensors had a gap) or until one arrives that fits the running clock (then it was a stray).
+    has jumped, or all sensors had a gap) or until one arrives that fits the running clock (then it was an outlier).
     Depends on the order of events alone, so that a replay decides as the live run did.
     """
 
@@ -40,7 +40,7 @@ class ClockGuard:
         self._jump_ns = int(config.clock_jump_s * 1e9)
         self._usual_ns = 0.0  # running mean of the newest stamp's advances
         self._motion = False  # a motion message has arrived on the running clock
-        self._suspects: deque[Event] = deque()
+        self._unconfirmed: deque[Event] = deque()
         self._newest_of: dict[str, int] = {}  # by topic, on the running clock
 
     def judge(self, event: Event) -> list[tuple[ClockVerdict, Event]]:
@@ -48,14 +48,14 @@ class ClockGuard:
         ahead = event.stamp_ns - self._newest_ns
         overtaken = ahead < 0 and event.stamp_ns > self._newest_of.get(event.topic, event.stamp_ns)
         if not self._started or overtaken or -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns):
-            strays = [(ClockVerdict.OUTLIER, suspect) for suspect in self._suspects]
-            self._suspects.clear()
+            outliers = [(ClockVerdict.OUTLIER, other) for other in self._unconfirmed]
+            self._unconfirmed.clear()
             if not overtaken:
                 self._advance_to(event)
             self._newest_of[event.topic] = max(event.stamp_ns, self._newest_of.get(event.topic, 0))
-            return [*strays, (ClockVerdict.FITS, event)]
-        self._suspects.append(event)
-        group = [e for e in self._suspects if self._agree(e, event)]
+            return [*outliers, (ClockVerdict.FITS, event)]
+        self._unconfirmed.append(event)
+        group = [e for e in self._unconfirmed if self._agree(e, event)]
         span = max(e.stamp_ns for e in group) - min(e.stamp_ns for e in group)
         moves = not self._motion or any(isinstance(e, MotionEvent) for e in group)
         enough = span >= (_CONFIRM_NS if moves else _GIVE_UP_NS) and (
@@ -63,20 +63,20 @@ class ClockGuard:
         )
         if len(group) >= _CONFIRM_COUNT and enough:
             return self._accept(group)
-        if len(self._suspects) > _MAX_SUSPECTS:
-            return [(ClockVerdict.OUTLIER, self._suspects.popleft())]
+        if len(self._unconfirmed) > _MAX_UNCONFIRMED:
+            return [(ClockVerdict.OUTLIER, self._unconfirmed.popleft())]
         return []
 
     def flush(self) -> list[tuple[ClockVerdict, Event]]:
         """Verdicts on all that still waits: two that agree are accepted, as nothing more will come."""
         verdicts: list[tuple[ClockVerdict, Event]] = []
-        while self._suspects:
-            last = self._suspects[-1]
-            group = [e for e in self._suspects if self._agree(e, last)]
+        while self._unconfirmed:
+            last = self._unconfirmed[-1]
+            group = [e for e in self._unconfirmed if self._agree(e, last)]
             if len(group) > 1:
                 verdicts += self._accept(group)
             else:
-                verdicts.append((ClockVerdict.OUTLIER, self._suspects.pop()))
+                verdicts.append((ClockVerdict.OUTLIER, self._unconfirmed.pop()))
         return verdicts
 
     def _agree(self, event: Event, latest: Event) -> bool:
@@ -87,8 +87,8 @@ class ClockGuard:
     def _accept(self, group: list[Event]) -> list[tuple[ClockVerdict, Event]]:
         """Move the clock to the first of the group, and judge again all that waited."""
         first = min(group, key=lambda e: e.stamp_ns)
-        waiting = [e for e in self._suspects if e is not first]
-        self._suspects.clear()
+        waiting = [e for e in self._unconfirmed if e is not first]
+        self._unconfirmed.clear()
         jumped = not 0 <= first.stamp_ns - self._newest_ns <= self._jump_ns
         if jumped:
             self._motion = False

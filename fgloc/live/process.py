@@ -22,11 +22,11 @@ from typing import Any, TypeAlias
 
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.anchors import Anchor, Outlet
+from fgloc.live.anchors import Outlet
 from fgloc.live.estimation import Settings
 from fgloc.live.reception import role_of
 from fgloc.live.status import LiveStatus
-from fgloc.types import Estimate, Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
+from fgloc.types import Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
@@ -184,9 +184,9 @@ class EstimationProcess:
             except OSError:  # the process has ended: `_receive` tells
                 return
 
-    def _has_come(self, _: Anchor, estimate: Estimate) -> None:
+    def _has_come(self, estimated_ns: int) -> None:
         with self._changed:
-            if self._awaited_ns is not None and estimate.stamp_ns >= self._awaited_ns:
+            if self._awaited_ns is not None and estimated_ns >= self._awaited_ns:
                 self._awaited_ns = None
 
     def _receive(self, outlet: Outlet) -> None:
@@ -201,7 +201,7 @@ class EstimationProcess:
                 outlet.built(*content)
             elif kind == "estimated":
                 outlet.estimated(*content)
-                self._has_come(*content)
+                self._has_come(content[1].stamp_ns)
             elif kind == "failed":
                 self._fail(*content)
             else:

@@ -102,8 +102,8 @@ class When(Section):
         intervals = list(self.intervals)
         if self.bursts:
             half = 0.5 * self.burst_s
-            room = max(0.0, scene.duration_s - self.after_s - self.burst_s)
-            centers = self.after_s + half + room * scene.rng.uniform(size=self.bursts)
+            free_s = max(0.0, scene.duration_s - self.after_s - self.burst_s)
+            centers = self.after_s + half + free_s * scene.rng.uniform(size=self.bursts)
             intervals += [(float(c) - half, float(c) + half) for c in centers]
         elif not intervals:
             intervals = [(-np.inf, np.inf)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,9 +19,7 @@ from fgloc.sensors.learned.signals import Signals, signals_of
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Step
-
-_E = TypeVar("_E", bound=Event)
+from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, MotionEvent, Step
 
 _STEP_NS = 200_000_000  # of the gyro's filter
 _NO_FIX_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
@@ -58,20 +56,12 @@ class SensorRecord:
         config = Config() if config is None else config
         self.wheels: WheelsConfig = config.wheels
         self.imu_up = imu_up
-        self._commands: EventBuffer[ControlEvent] = EventBuffer()
-        self._imu: EventBuffer[ImuEvent] = EventBuffer()
-        self._joints: EventBuffer[JointsEvent] = EventBuffer()
-        self._odometry: EventBuffer[OdometryEvent] = EventBuffer()
+        kinds = (ControlEvent, ImuEvent, JointsEvent, OdometryEvent)
+        self._buffers: dict[type[MotionEvent], EventBuffer[Any]] = {kind: EventBuffer() for kind in kinds}
         for event in events:
-            if isinstance(event, ControlEvent):
-                self._commands.insert(event)
-            elif isinstance(event, ImuEvent):
-                self._imu.insert(event)
-            elif isinstance(event, JointsEvent):
-                self._joints.insert(event)
-            elif isinstance(event, OdometryEvent):
-                self._odometry.insert(event)
-        self.commands = _all(self._commands)
+            if isinstance(event, kinds):
+                self._buffers[type(event)].insert(event)
+        self.commands: tuple[ControlEvent, ...] = self._all(ControlEvent)
         self._biases = self._gyro_biases(config.gyro, truth)
 
     @property
@@ -79,12 +69,13 @@ class SensorRecord:
         """Whether wheel odometry comes from wheels, not from commands."""
         if self.wheels.source in ("command", "none"):
             return False
-        return bool(self._odometry.stamps) or (bool(self._joints.stamps) and self.wheels.left_radius is not None)
+        by_joints = bool(self._stamps(JointsEvent)) and self.wheels.left_radius is not None
+        return by_joints or bool(self._stamps(OdometryEvent))
 
     @property
     def joints(self) -> WheelJoints | None:
         """The wheels by name and size; None if there are no joints."""
-        if not self._joints.stamps:
+        if not self._stamps(JointsEvent):
             return None
         w = self.wheels
         return WheelJoints(
@@ -103,10 +94,10 @@ class SensorRecord:
             start_ns=start_ns,
             stamp_ns=end_ns,
             motion={
-                OdometryEvent: self._odometry.window(start_ns, end_ns),
-                ControlEvent: self._commands.window(start_ns - round(history_s * 1e9), end_ns),
-                JointsEvent: self._joints.window(start_ns, end_ns),
-                ImuEvent: self._imu.window(start_ns, end_ns),
+                kind: buffer.window(start_ns - round(history_s * 1e9), end_ns, beyond=False)
+                if kind is ControlEvent
+                else buffer.window(start_ns, end_ns)
+                for kind, buffer in self._buffers.items()
             },
         )
 
@@ -114,16 +105,23 @@ class SensorRecord:
         """What was known of the gyro's bias [rad/s] 10 s before a time, as after 10 s of dead reckoning."""
         if not len(self._biases):
             return 0.0
-        return float(self._biases[max(0, int(np.searchsorted(self._imu.stamps, stamp_ns, "right")) - 1)])
+        return float(self._biases[max(0, int(np.searchsorted(self._stamps(ImuEvent), stamp_ns, "right")) - 1)])
 
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
-        events = {InertialEvent: _all(self._imu), JointsEvent: _all(self._joints)}
+        events = {InertialEvent: self._all(ImuEvent), JointsEvent: self._all(JointsEvent)}
         return signals_of(wanted, events.__getitem__, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
+
+    def _stamps(self, kind: type[MotionEvent]) -> list[int]:
+        return self._buffers[kind].stamps
+
+    def _all(self, kind: type[MotionEvent]) -> tuple[Any, ...]:
+        stamps = self._stamps(kind)
+        return self._buffers[kind].window(stamps[0], stamps[-1]) if stamps else ()
 
     def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
         """What the localizer's own filter knew of the bias some time before each IMU message."""
-        stamps = self._imu.stamps
+        stamps = self._stamps(ImuEvent)
         if not stamps:
             return np.zeros(0)
         gyro, wheels = Gyro(config, self.imu_up), WheelMotion(self.wheels) if self.has_wheels else None
@@ -152,7 +150,3 @@ def _yaw_at(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: int) -> floa
         return None
     share = (at_ns - stamps_ns[k]) / (stamps_ns[k + 1] - stamps_ns[k])
     return float(poses[k, 2] + share * math.remainder(poses[k + 1, 2] - poses[k, 2], math.tau))
-
-
-def _all(buffer: EventBuffer[_E]) -> tuple[_E, ...]:
-    return buffer.window(buffer.stamps[0], buffer.stamps[-1]) if buffer.stamps else ()

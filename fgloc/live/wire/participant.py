@@ -25,7 +25,7 @@ _LOOPBACK = """<CycloneDDS><Domain>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""ROS 2 does the same when told to stay on one machine (32: its rmw's limit of processes that find one another)."""
+"""As ROS 2 does where it is set to stay on one machine (32: its rmw's limit of processes that find one another)."""
 
 _SENT_DEPTH = 200  # messages of a topic that wait for readers: 1 s of a fast sensor
 _READ_DEPTH = 2000  # messages of a topic that wait for the reading thread: 10 s of it, on a busy machine
@@ -185,7 +185,7 @@ class Participant:
         return tuple(sorted(set(self._publications.values()), key=lambda p: (p.topic, p.message_type)))
 
     def has_volatile(self, topic: str) -> bool:
-        """Whether one of the topic's publishers keeps nothing for late readers: latched reading does not hear it."""
+        """Whether one of the topic's publishers keeps nothing for late readers: a latched reader does not match it."""
         return topic in self._volatile
 
     def writer(self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None) -> Writer:
@@ -277,7 +277,7 @@ class Participant:
         for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):
             try:
                 on_sample(sample)
-            except Exception as error:  # told by the next call; the other topics go on
+            except Exception as error:  # raised by the next call; the other topics go on
                 self._failure = self._failure or error
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from fgloc.sensors.markers.edges import cross
 from fgloc.sensors.markers.images import GrayImage
 from fgloc.types import FloatArray
 
@@ -66,9 +66,9 @@ class Codes:
         corners = np.ascontiguousarray(squares, dtype=np.float64).view(np.complex128)[..., 0]
         first, second, third, fourth = corners.T
         along, down, skew = second - third, fourth - third, first - second + third - fourth
-        area = _cross(along, down)
+        area = cross(along, down)
         area += area == 0.0
-        g, h = _cross(skew, down) / area, _cross(along, skew) / area
+        g, h = cross(skew, down) / area, cross(along, skew) / area
         above = np.array([second - first + g * second, fourth - first + h * fourth, first]).T
         below = np.array([g, h, np.ones(len(g))]).T
         samples = self._samples.reshape(3, -1)
@@ -91,8 +91,3 @@ def _otsu(levels: FloatArray) -> tuple[FloatArray, FloatArray]:
     split = np.argmax(apart * apart * (below * (n - below)), axis=1)
     rows = np.arange(len(ordered))
     return 0.5 * (ordered[rows, split] + ordered[rows, split + 1])[:, None], apart[rows, split]
-
-
-def _cross(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> FloatArray:
-    """Cross product of vectors of the plane."""
-    return np.asarray((a.conj() * b).imag)

@@ -92,10 +92,10 @@ def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
 def _meeting_points(origins: ComplexArray, directions: ComplexArray) -> tuple[ComplexArray, BoolArray]:
     """Where lines ``(m, 4, 2)``, of two ends of four edges, meet: corners ``(m, 4)``, and of which markers ``(m,)``."""
     first, second = directions[:, :, 0], directions[:, _WITH_PREVIOUS, 1]
-    crossing = _cross(first, second)
+    crossing = cross(first, second)
     least = _MIN_CROSSING * np.abs(first) * np.abs(second)
     clear = np.asarray((np.abs(crossing) >= least).all(axis=1))
-    steps = _cross(origins[:, _WITH_PREVIOUS, 1] - origins[:, :, 0], second) / np.where(clear[:, None], crossing, 1.0)
+    steps = cross(origins[:, _WITH_PREVIOUS, 1] - origins[:, :, 0], second) / np.where(clear[:, None], crossing, 1.0)
     return origins[:, :, 0] + first * steps, clear
 
 
@@ -127,6 +127,6 @@ def _lines(image: GrayImage, places: ComplexArray, across: ComplexArray) -> tupl
     return offset, slope, sharp.all(axis=(1, 2))
 
 
-def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:
+def cross(a: ComplexArray, b: ComplexArray) -> FloatArray:
     """Cross product of vectors of the plane."""
     return np.asarray((a.conj() * b).imag)
