@@ -100,12 +100,4 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         Probe(f"{_WINDOW}._relinearize", called),
         batch=True,
     ),
-    Mechanism(
-        "batch_learned_again",
-        "Batch: the learned motion is evaluated again at the smoothed velocities.",
-        ("replay/smoothing.py",),
-        (Switch("fgloc.replay.smoothing:_measure_again", Returns({})),),
-        Probe("fgloc.replay.smoothing:_measure_again", something),
-        batch=True,
-    ),
 )

@@ -30,7 +30,6 @@ from fgloc.types import (
     FloatArray,
     IntArray,
     Landmark,
-    MotionMeasurement,
     PixelMeasurement,
 )
 
@@ -54,7 +53,7 @@ class Smoothed:
 
 
 class BatchSmoother:
-    """Solves the whole log, as often as what depends on the solution is measured again.
+    """Solves the whole log.
 
     It holds the sightings that were accepted online. Of an unknown map, sightings that the first solution finds less
     likely than ``1 - gate_probability`` are left out.
@@ -84,7 +83,7 @@ class BatchSmoother:
         self._probability = gate_probability
         self.accepted = {frame.k: frame.sightings for frame in self.frames}
         self._on_ground = GroundMotions(self.frames, factors.installation) if factors.installation.ground else None
-        self._motions = self._new_motions()
+        self._motions = None if self._on_ground is not None else BatchMotions(self.frames, factors.installation)
         self._sightings = None
         if factors.known:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
@@ -111,16 +110,6 @@ class BatchSmoother:
         if self._factors.known:  # then no other pose is among the values
             return np.asarray(gtsam.utilities.extractPose2(self._values))
         return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
-
-    def replace_motions(self, motions: Mapping[int, tuple[MotionMeasurement, ...]]) -> None:
-        """Take other motion measurements for these keyframes, and solve again from the last solution."""
-        for frame in self.frames:
-            frame.motions = motions.get(frame.k, frame.motions)
-        self._motions = self._new_motions()
-        self._optimize()
-
-    def _new_motions(self) -> BatchMotions | None:
-        return None if self._on_ground is not None else BatchMotions(self.frames, self._factors.installation)
 
     def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found; on uneven ground with that under the last keyframe."""

@@ -65,13 +65,12 @@ class MotionSources:
     def _learned_has_gyro(self) -> bool:
         return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
 
-    def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
+    def read(self, step: Step, since_fix_s: float = 0.0) -> MotionReadings:
         """Read every source once.
 
         Args:
             step: its events.
             since_fix_s: time before the step without a fix.
-            velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
         if step.dt <= 0.0:
             return MotionReadings()
@@ -92,7 +91,7 @@ class MotionSources:
                 self._turn = turn
                 if reported is not None and wheels is not None:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
-        learned = self._with_drift(self._measure_learned(step, velocity), step)
+        learned = self._with_drift(self._measure_learned(step), step)
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
         readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
@@ -133,14 +132,10 @@ class MotionSources:
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
 
-    def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
-        """The readings with the learned motion evaluated at a better velocity."""
-        return replace(readings, learned=self._measure_learned(step, velocity))
-
-    def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+    def _measure_learned(self, step: Step) -> MotionMeasurement | None:
         if self._learned is None:
             return None
-        m = self._learned.measure_scaled(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        m = self._learned.measure_scaled(step, 0.0 if self.gyro is None else self.gyro.bias)
         if m is None:
             return None
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
