@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
@@ -23,6 +22,7 @@ from fgloc.graph.factors import (
     prior_factor,
 )
 from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.joint import MOST_STEPS
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
@@ -33,10 +33,8 @@ from fgloc.types import (
     PixelMeasurement,
 )
 
-_LINEARIZATIONS = 6
 _LARGEST_LOG = math.log(sys.float_info.max) - 1.0
-_STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
-_STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
+_CONVERGED = 1e-7  # relative change of the error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,23 +205,21 @@ class BatchSmoother:
         return np.asarray(self._values.atVector(INSTALLATION)) if n else np.zeros(0)
 
     def _optimize(self) -> None:
-        """Linearize the sightings anew and solve, until poses and installation stay where they are."""
+        """Linearize the sightings anew and solve, until the error stays what it is."""
         self._solved = None
-        for _ in range(_LINEARIZATIONS):
-            poses, theta = self.poses(), self._theta()
+        previous = math.inf
+        for _ in range(MOST_STEPS):
             self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
             graph = self._linearized()
             start = self._values if self._factors.known else without_orphans(self._values, graph)
             values = self._solve(graph, start)
-            if not np.isfinite(graph.error(values)):
+            error = graph.error(values)
+            if not np.isfinite(error):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
             self._values, self._graph = values, graph
-            moved = np.abs(self.poses() - poses)
-            moved[:, 2] = np.abs(se2.wrap_array(moved[:, 2]))
-            still = bool((moved < _STILL).all())
-            sigmas = self._factors.installation.sigmas[: len(theta)]
-            if still and (np.abs(self._theta() - theta) < _STILL_SIGMAS * sigmas).all():
+            if abs(previous - error) <= _CONVERGED * error:
                 break
+            previous = error
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
@@ -264,7 +260,7 @@ class BatchSmoother:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self._config.max_iterations)
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
-        params.setRelativeErrorTol(1e-7)
+        params.setRelativeErrorTol(_CONVERGED)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 

@@ -20,7 +20,11 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
-_MOST_STEPS = 6
+FAR_M2 = 1e2  # m²: variance of a position that nothing tells
+# Sightings of one step that are weighed together, of which the work grows with the square: more than an image shows
+# come in a burst. Of more, those of the least NIS are; the others are held against what these agree on.
+MOST_JOINT = 16
+MOST_STEPS = 6  # of Gauss-Newton: it has arrived after two or three, or does not
 _LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
 _STILL = 1e-3  # sigmas: a step of Gauss-Newton this small is the last one
 
@@ -147,7 +151,7 @@ def correct(
     n = len(known.mean)
     x = np.zeros(3 + n)  # tangent of the belief
     pose, theta = belief.pose, known.mean
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         lines = observed.linearize(pose, theta)
         if any(one.behind for one in lines):
             return None

@@ -22,7 +22,7 @@ from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 _ITERATIONS = 16
 _CONVERGED, _RANK = 1e-6, 1e-9  # relative: of the cost, and of the least eigenvalue of the information
 UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
-_TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
+_TELLS_NOTHING = 1.0 / _RANK  # times its own: variance by the installation of a sighting next to the image plane
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -68,10 +68,10 @@ class PoseFit:
         self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
-    def solve(self, start: FloatArray, iterations: int = _ITERATIONS) -> Fit | None:
+    def solve(self, start: FloatArray) -> Fit | None:
         """As `fit_pose`."""
         pose, previous = start, math.inf
-        for step in range(iterations):
+        for step in range(_ITERATIONS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
             for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
                 square = np.einsum("ni,ni->n", r, r)

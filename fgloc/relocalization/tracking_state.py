@@ -25,7 +25,6 @@ from fgloc.types import (
     Step,
 )
 
-_NAMED = 3  # jumps
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
@@ -58,7 +57,7 @@ class Tracking:
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._confirming = self._contradicting = 0  # sightings
-        self._jumps: list[FloatArray] = []  # the first few ...
+        self._jump: FloatArray | None = None  # the first one ...
         self._jump_count = 0  # ... of so many
         self._reported = False  # whether an unconfirmed pose was reported
         places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
@@ -263,17 +262,18 @@ class Tracking:
     def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was estimated at."""
         self._jump_count += 1
-        if self._jump_count <= _NAMED:
-            self._jumps.append(se2.between(estimated.pose, place.pose))
+        if self._jump is None:
+            self._jump = se2.between(estimated.pose, place.pose)
         self.lost = self._given = False
         self._search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know, one sentence each."""
-        sentences = [f"sightings contradicted the estimated pose: jumped by {_far(miss)}" for miss in self._jumps]
-        if self._jump_count > _NAMED:
-            sentences.append(f"... and {self._jump_count - _NAMED} times more")
+        sentences = []
+        if self._jump is not None:
+            more = f", and {self._jump_count - 1} times more" if self._jump_count > 1 else ""
+            sentences.append(f"sightings contradicted the estimated pose: jumped by {_far(self._jump)}{more}")
         if self._never_found:
             sentences.append(
                 "the sightings never determined where on the map the robot is: its poses are LOST, and right relative "

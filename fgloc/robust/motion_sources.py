@@ -12,6 +12,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import planar_turn
+from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
@@ -21,7 +22,6 @@ from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _LEAST_S = 0.01  # of a step without a motion source: its covariance is not singular
-_SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 
@@ -84,7 +84,7 @@ class MotionSources:
             without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
             turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
             if turn is not None:
-                cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
+                cov = np.diag([FAR_M2, FAR_M2, turn.variance])
                 name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
