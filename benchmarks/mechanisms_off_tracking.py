@@ -81,7 +81,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
         ("relocalization/place_search.py",),
-        (Switch(f"{_SEARCH}:_TRIMS", Constant(0)),),
+        (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
     ),
     Mechanism(
         "jump_compelling",

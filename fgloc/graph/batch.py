@@ -22,7 +22,7 @@ from fgloc.graph.factors import (
     prior_factor,
 )
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import MOST_STEPS
+from fgloc.graph.joint import CONVERGED, MOST_STEPS
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
@@ -34,7 +34,6 @@ from fgloc.types import (
 )
 
 _LARGEST_LOG = math.log(sys.float_info.max) - 1.0
-_CONVERGED = 1e-7  # relative change of the error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,7 +216,7 @@ class BatchSmoother:
             if not np.isfinite(error):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
             self._values, self._graph = values, graph
-            if abs(previous - error) <= _CONVERGED * error:
+            if abs(previous - error) <= CONVERGED * error:
                 break
             previous = error
 
@@ -260,7 +259,7 @@ class BatchSmoother:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self._config.max_iterations)
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
-        params.setRelativeErrorTol(_CONVERGED)
+        params.setRelativeErrorTol(CONVERGED)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import MOST_STEPS
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -22,7 +23,6 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-_TRIMS = 3
 _DETERMINE = 2  # beacons that determine a pose: of more on the map, one can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_SEEDS = 24, 6  # sightings for the fit; places to start from, and sightings that tell them
@@ -85,7 +85,7 @@ class PlaceSearch:
     def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
         agreeing = list(sightings)
-        for _ in range(_TRIMS):
+        for _ in range(MOST_STEPS):
             before = agreeing
             agreeing = self._explained(fit.pose, sightings)
             if len(agreeing) == len(before):
