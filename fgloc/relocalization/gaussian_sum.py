@@ -25,7 +25,7 @@ from fgloc.stats import GATE
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
 _RING = 24  # pieces of a ring, 15 degrees apart
-OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
+_OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
 _UNIFORM = 1.0 / (2.0 * math.pi * math.sqrt(FAR_M2))  # ... seen in any direction [1/rad], as far as that [1/m]
 _NEGLIGIBLE = -math.log(1.0 - GATE)  # in log weight, below that of the most probable
 _AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
@@ -106,14 +106,14 @@ class GaussianSum:
         R = self._cov(m)
         seen_before = m.landmark_id in self._last_ns
         self._last_ns[m.landmark_id] = m.stamp_ns
-        outlier = math.log(OUTLIER * _UNIFORM)
+        outlier = math.log(_OUTLIER * _UNIFORM)
         if len(self.poses):
             self._update(m, R, outlier)
         if not seen_before:  # and everything before it may have been wrong
             poses, covs = _ring(self._places[m.landmark_id], m, R)
             off = poses[:, :2] - self._middle
             near = -0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off)
-            born = near + self._none + math.log((1.0 - OUTLIER) * _UNIFORM / _RING)
+            born = near + self._none + math.log((1.0 - _OUTLIER) * _UNIFORM / _RING)
             self.poses = np.concatenate([self.poses, poses])
             self.covs = np.concatenate([self.covs, covs])
             self.log_weights = np.concatenate([self.log_weights, born])
@@ -127,7 +127,7 @@ class GaussianSum:
         S = J @ PJ + R
         weighed = np.linalg.solve(S, residual[:, :, None])[:, :, 0]
         nis = np.einsum("ni,ni->n", residual, weighed)
-        fits = math.log((1.0 - OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
+        fits = math.log((1.0 - _OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
         good = fits > outlier
         gain = np.linalg.solve(S, PJ.transpose(0, 2, 1)).transpose(0, 2, 1)
         poses = se2.compose_array(self.poses, se2.exp_array(np.einsum("nij,nj->ni", gain, residual)))

@@ -12,7 +12,6 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.relocalization.gaussian_sum import OUTLIER
 from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.robust.association import NEAR_M, NEAR_RAD
 from fgloc.types import (
@@ -29,9 +28,8 @@ from fgloc.types import (
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
-_KIDNAPPED = (
-    1e-3  # prior probability that a robot was carried away where sightings contradict its pose; or each is an outlier
-)
+_KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
+_WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misread, each independently
 
 
 class Tracking:
@@ -164,7 +162,7 @@ class Tracking:
         """
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
             return np.zeros((3, 3))
-        kidnapped = _KIDNAPPED / (_KIDNAPPED + OUTLIER**contradicting)
+        kidnapped = _KIDNAPPED / (_KIDNAPPED + _WRONG**contradicting)
         return kidnapped * self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
