@@ -20,7 +20,7 @@ def init(
     ] = Path("robot.yaml"),
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Write a commented robot.yaml from what a recording holds, and say what it does not tell."""
+    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning."""
     check_out(out, folder=False)
     if out.exists() and not force:
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
@@ -37,10 +37,11 @@ def init(
         warn(sentence)
     say(f"configuration: {out}")
     beside = find_beside(bag, "map.yaml")
+    seen = {"image", "sightings"} & found.roles.keys()
     next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
-    if beside is None:
+    if beside is None and seen:
         next_step(f"fgloc map {shown_path(bag)} --config {shown_path(out)} --out map.yaml", "survey the markers")
-    else:
+    elif seen:
         next_step(
             f"fgloc calibrate {shown_path(bag)} --map {shown_path(beside)} --config {shown_path(out)} "
             "--out calibrated.yaml",

@@ -24,14 +24,16 @@ def make_map(
     bags: Bags,
     out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", dir_okay=False, help="map file to be written")],
     dictionary: Annotated[
-        str | None, typer.Option("--dictionary", metavar="D", help="of the markers in images, such as DICT_4X4_50")
+        str | None, typer.Option("--dictionary", metavar="NAME", help="of the markers in images, such as DICT_4X4_50")
     ] = None,
     size: Annotated[
         float | None, typer.Option("--size", metavar="M", help="side of the markers' black square in metres")
     ] = None,
     anchor: Annotated[
         Path | None,
-        typer.Option("--anchor", metavar="MAP", help="markers that are known: they make the frame, and are refined"),
+        typer.Option(
+            "--anchor", metavar="MAP.yaml", help="markers that are known: they make the frame, and are refined"
+        ),
     ] = None,
     distance: Annotated[
         list[str] | None,
@@ -40,7 +42,7 @@ def make_map(
     model: ModelOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Survey the landmarks of recordings; without --anchor the first pose is the map's origin.
+    """Survey the landmarks of recordings. Without --anchor the first pose is the map's origin.
 
     Markers in images (or their corners) are surveyed in position and orientation, from one or several recordings.
     """

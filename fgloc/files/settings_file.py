@@ -33,11 +33,11 @@ class Settings:
         self._item: Item | None = None
         self.content: dict[str, Any] = {}
         try:
-            self._item = read_document(path, ConfigError, MAX_BYTES)
+            self._item = read_document(path, ConfigError, MAX_BYTES, remedy)
         except ConfigError as error:
             if "the file is empty" in str(error):
                 return
-            raise ConfigError(f"{error}; {remedy}" if "cannot be read" in str(error) else str(error)) from error
+            raise
         try:
             content = plain(self._item.node)
         except yaml.MarkedYAMLError as error:
