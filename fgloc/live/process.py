@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Iterable
 from concurrent.futures import Future
@@ -30,11 +32,17 @@ from fgloc.types import Event, MotionEvent, RawEvent, SensorEvent, SightingsEven
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
-_STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told
+_STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told ...
+_SILENT_S = 3.0  # ... and from then on that it does not answer: an update takes milliseconds, a search of the map 1 s
 # Motion events only matter to the estimation when a sighting or a question comes, and to close a sighting's keyframe.
 _GATHER_S = 0.02  # for which they wait for one another: waking both processes costs more than sending ...
 _GATHER_BRIEFLY_S = 0.003  # ... and while the estimate of a sighting is awaited
 _END_S = 10.0  # that it may take to use what it has and to save its state
+
+_SILENT = (
+    "The process of the estimation has not answered for {:.0f} s: it hangs, or this machine has too much to do; "
+    "start again: with a state file (`--state`) it goes on from there."
+)
 
 _Question: TypeAlias = tuple[int, str, tuple[Any, ...]]  # number, method of `Estimation`, arguments
 
@@ -63,6 +71,7 @@ class EstimationProcess:
         self._numbers = itertools.count()
         self._asked: dict[int, Future[Any]] = {}
         self._status = LiveStatus()
+        self._answered_s = math.inf  # when it last did (`time.monotonic`)
         self._failed: FglocError | None = None
         self._closing = False
         self._threads: list[threading.Thread] = []
@@ -109,10 +118,16 @@ class EstimationProcess:
 
     def status(self) -> LiveStatus:
         """As `Estimation.status`; what is known already if the process is busy or has ended."""
+        notes: tuple[str, ...] = ()
         if not self._closing and self._failed is None:
             with suppress(TimeoutError, FglocError):
                 self._status = self._ask("status").result(_STATUS_S)
-        return replace(self._status, dropped=dict(self._dropped + Counter(self._status.dropped)))
+                self._answered_s = time.monotonic()
+            silent_s = time.monotonic() - self._answered_s
+            if silent_s > _SILENT_S:
+                notes = (_SILENT.format(silent_s),)
+        dropped = dict(self._dropped + Counter(self._status.dropped))
+        return replace(self._status, dropped=dropped, notes=notes + self._status.notes)
 
     def save(self, path: Path) -> bool:
         """As `Estimation.save`."""
@@ -196,6 +211,7 @@ class EstimationProcess:
             except (EOFError, OSError):
                 return self._ended()
             if kind == "ready":
+                self._answered_s = time.monotonic()
                 continue
             if kind == "built":
                 outlet.built(*content)

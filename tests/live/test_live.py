@@ -128,6 +128,23 @@ def test_an_estimation_process_that_ends_or_fails_is_told():
             live.pose_at()
 
 
+def test_fault_24_an_estimation_process_that_hangs_is_told(monkeypatch):
+    monkeypatch.setattr("fgloc.live.process._SILENT_S", 0.8)
+    world = World(beacons(), seconds=2.0)
+    with live_in(world, process=True) as live:
+        feed(live, world.events())
+        before = live.status()
+        child = live._estimation._child.pid
+        os.kill(child, signal.SIGSTOP)
+        said = [live.status() for _ in range(2)][-1]
+        os.kill(child, signal.SIGCONT)
+        assert live.wait(PATIENCE_S)
+        after = live.status()
+    assert "has not answered for 1 s: it hangs" in said.notes[0]
+    assert said.keyframes == before.keyframes
+    assert after.notes == before.notes
+
+
 def test_poses_between_keyframes_are_as_good_as_their_covariance_says():
     world = World(room(), seed=3, seconds=12.0, rate=5)
     told = []

@@ -88,7 +88,7 @@ class Intake:
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:
             self._role_of[topic] = role
-            self._participant.read(topic, types[topic], self._on_sample, urgent=role not in MOTION)
+            self._participant.read(topic, types[topic], self._on_sample)
         return new
 
     def _missing(self, roles: Mapping[Role, str]) -> str:

@@ -26,7 +26,7 @@ from fgloc.recording.standard_messages import MAP_FRAME
 from fgloc.types import Estimate, Event, LandmarkMap
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
-_ASKED_EVERY = 2  # turns: the motion sources are asked at 25 Hz, which is most of the work; between, the twist is held
+_ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most of the work; between, the speed is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
 _INITIAL_POSE = "/initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"

@@ -36,7 +36,6 @@ _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static t
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
 _MOST_PASSES = 20  # over the readers before their messages are delivered
 _WAIT_S = 60.0  # the reading thread waits this long for messages, then again
-_GATHER_S = 0.008  # for which messages that are not urgent wait for one another: waking costs more than reading
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 _domains_lock = threading.Lock()
@@ -72,7 +71,6 @@ class _Reader:
     unread: Any  # the condition that it has unread messages
     publication: Publication
     on_sample: OnSample
-    urgent: bool
 
 
 class Writer:
@@ -137,9 +135,8 @@ class Participant:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._changed = GuardCondition(self._participant)
-        self._waiting, self._urgent = WaitSet(self._participant), WaitSet(self._participant)
-        for conditions in (self._waiting, self._urgent):
-            conditions.attach(self._changed)
+        self._waiting = WaitSet(self._participant)
+        self._waiting.attach(self._changed)
         self._thread = threading.Thread(target=self._read, name="fgloc-wire", daemon=True)
         self._thread.start()
 
@@ -159,7 +156,7 @@ class Participant:
         self._readers.clear()
         self._entering.clear()
         self._topics.clear()
-        del self._waiting, self._urgent, self._changed, self._found, self._participant, self._domain
+        del self._waiting, self._changed, self._found, self._participant, self._domain
 
     def publications(self) -> tuple[Publication, ...]:
         """What others publish now, by name.
@@ -203,13 +200,11 @@ class Participant:
         )
         return Writer(DataWriter(self._participant, entity, qos=qos), entity.data_type)
 
-    def read(
-        self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False, urgent: bool = True
-    ) -> None:
+    def read(self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False) -> None:
         """Deliver a topic's messages from now on, in a thread of this object's.
 
         Quality of service is that of sensor data (best effort), which every publisher offers; of a latched topic
-        reliable and transient local. Messages that are not urgent may wait 8 ms for others.
+        reliable and transient local.
         """
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.qos import Policy, Qos
@@ -226,7 +221,7 @@ class Participant:
         reader = DataReader(self._participant, entity, qos=qos)
         unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
         with self._lock:
-            self._entering.append(_Reader(reader, unread, Publication(topic, message_type), on_sample, urgent))
+            self._entering.append(_Reader(reader, unread, Publication(topic, message_type), on_sample))
         self._changed.set(True)
 
     def _topic(self, topic: str, message_type: str, messages: Messages) -> Any:
@@ -247,11 +242,8 @@ class Participant:
                 entering, self._entering = self._entering, []
             for entry in entering:
                 self._waiting.attach(entry.unread)
-                if entry.urgent:
-                    self._urgent.attach(entry.unread)
                 self._readers.append(entry)
             self._waiting.wait(round(_WAIT_S * 1e9))
-            self._urgent.wait(round(_GATHER_S * 1e9))
             self._changed.take()
             self._deliver()
 

@@ -13,7 +13,7 @@ from fgloc.live import LivePose
 from fgloc.types import FloatArray
 
 SPAN_S = 0.1  # the twist is the mean over this long: five messages
-_AHEAD_NS = 50_000_000  # over which the twist is held; 1 m/s² moves the pose by 2.5 mm from that in this time
+_AHEAD_NS = 50_000_000  # over which the last speed is held; 1 m/s² moves the pose by 2.5 mm from that in this time
 _LEAST_S = 0.03  # between two poses whose covariances tell how fast the covariance grows
 _LEAST_VARIANCE = 1e-8  # (m/s)², (rad/s)²: no motion is known better
 
@@ -54,17 +54,17 @@ class RecentPoses:
         seconds = _seconds(first, last)
         if seconds == 0.0:
             return np.zeros(3), np.zeros((3, 3))
-        twist = se2.log(se2.between(first.pose, last.pose)) / seconds
+        twist = _motion(first, last) / seconds
         variances, axes = np.linalg.eigh(self._growth / seconds)
         return twist, axes @ np.diag(np.maximum(variances, _LEAST_VARIANCE)) @ axes.T
 
     def ahead(self, stamp_ns: int) -> LivePose | None:
-        """The newest pose, propagated by the twist to a time soon after it; None if there is none soon before."""
-        if not self._poses or not 0 < stamp_ns - self._poses[-1].stamp_ns <= _AHEAD_NS:
+        """The newest pose, propagated by the speed of the last two to a time soon after; None if there is none."""
+        if len(self._poses) < 2 or not 0 < stamp_ns - self._poses[-1].stamp_ns <= _AHEAD_NS:
             return None
-        last = self._poses[-1]
+        before, last = self._poses[-2], self._poses[-1]
         seconds = (stamp_ns - last.stamp_ns) * 1e-9
-        motion = se2.exp(self.twist()[0] * seconds)
+        motion = se2.exp(_motion(before, last) * seconds / _seconds(before, last))
         ad, pose = se2.adjoint(se2.inverse(motion)), se2.compose(last.pose, motion)
         cov = ad @ _body_cov(last) @ ad.T + self._growth * seconds
         return replace(last, stamp_ns=stamp_ns, pose=pose, cov=se2.rotate_cov(cov, float(pose[2])))
@@ -92,6 +92,10 @@ class RecentPoses:
 
 def _seconds(first: LivePose, last: LivePose) -> float:
     return (last.stamp_ns - first.stamp_ns) * 1e-9
+
+
+def _motion(first: LivePose, last: LivePose) -> FloatArray:
+    return se2.log(se2.between(first.pose, last.pose))
 
 
 def _body_cov(pose: LivePose) -> FloatArray:

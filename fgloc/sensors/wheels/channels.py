@@ -50,7 +50,7 @@ def _pairs(events: Sequence[JointsEvent], joints: WheelJoints, what: str) -> tup
             stamps += [stamp for stamp, _ in reported]
             values.append(np.array([found for _, found in reported])[:, at])
     both = np.concatenate(values)
-    known = np.flatnonzero(np.isfinite(both).all(axis=1))
+    known = np.flatnonzero(np.isfinite(both).all(axis=1)).tolist()
     return [stamps[k] for k in known], both[known].T
 
 
