@@ -1,4 +1,4 @@
-"""``fgloc init``: the first step with a robot of one's own."""
+"""``fgloc init``: the first step with a new robot."""
 
 from __future__ import annotations
 
