@@ -96,7 +96,7 @@ def _captions(result: RunResult, compared: bool) -> Mapping[str, str]:
         "timeline": f"{_TIMELINE}{'; the true errors' if compared else ''}.",
         "installation": _INSTALLATION,
         "space": "The path in space; heights are drawn larger than they are.",
-        "height": "Height, pitch and roll over the way, with their 3σ bands.",
+        "height": "Height, pitch and roll over the distance travelled, with their 3σ bands.",
     }
 
 

@@ -117,6 +117,11 @@ def _draw_way(axes: Axes, result: RunResult, matched: Matched | None, extent: fl
     return handles
 
 
+def travelled(poses: FloatArray) -> FloatArray:
+    """Distance travelled ``(n,)`` [m] at each of the poses ``(n, 3)``."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+
+
 def relocated(result: RunResult) -> IntArray:
     """Indices of poses to which no motion leads: the robot was relocated there."""
     stamps = [d.stamp_ns for d in result.decisions if d.kind == "place" and d.reason in _JUMPS and d.weight > 0.0]
@@ -165,9 +170,9 @@ def _direction(poses: FloatArray, k: int, shortest: float) -> float | None:
 def _draw_ellipses(axes: Axes, estimate: Trajectory, extent: float) -> list[Artist]:
     """3σ ellipses, spread evenly over the distance travelled; large ones as outlines, and only some of them."""
     assert estimate.covs is not None
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(estimate.poses[:, :2], axis=0).T))])
-    spacing = max(0.04 * extent, travelled[-1] / _MAX_ELLIPSES, 1e-6)
-    chosen = np.unique(np.searchsorted(travelled, np.arange(0.0, travelled[-1] + spacing, spacing)))
+    way = travelled(estimate.poses)
+    spacing = max(0.04 * extent, way[-1] / _MAX_ELLIPSES, 1e-6)
+    chosen = np.unique(np.searchsorted(way, np.arange(0.0, way[-1] + spacing, spacing)))
     chosen = chosen[chosen < len(estimate)]
     values, _ = np.linalg.eigh(estimate.covs[chosen, :2, :2])
     sizes = 6.0 * np.sqrt(np.maximum(values[:, 1], 0.0))  # full axes: twice 3σ

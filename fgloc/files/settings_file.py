@@ -59,11 +59,10 @@ class Settings:
             return model.model_validate(self.content)
         except ValidationError as error:
             found = error.errors()
-            lines = [
-                f"  {self.path}:{self._line(e['loc'])}: {text}"
-                for e, text in zip(found, sentences(error, model), strict=False)
-            ]
-            raise ConfigError(f"{self.path}: {len(found)} wrong value(s)\n" + "\n".join(lines)) from error
+            told = sorted((self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False))
+            lines = [f"  {self.path}:{line}: {text}" for line, text in told]
+            count = "1 wrong value" if len(found) == 1 else f"{len(found)} wrong values"
+            raise ConfigError(f"{self.path}: {count}\n" + "\n".join(lines)) from error
 
     def _line(self, loc: Sequence[int | str]) -> int:
         """Line of a value, or of the innermost thing around it that there is."""

@@ -97,6 +97,18 @@ def test_a_pipe_gets_a_line_every_ten_seconds_with_the_time_left():
     assert LINE_S == 10.0
 
 
+def test_no_time_left_is_told_of_work_that_has_just_begun():
+    now, lines = [0.0], []
+    with progress.told_to(Lines(lines.append, lambda: now[0])):
+        now[0] = 12.0  # imports took long
+        progress.tell("batch", 0, 60.0, "s")
+        now[0] = 12.01
+        progress.tell("batch", 0.2, 60.0, "s")
+        now[0] = 14.0
+        progress.tell("batch", 20.0, 60.0, "s")
+    assert lines == ["batch: 20 of 60 s (33 %), 4 s left"]
+
+
 def test_the_time_left_of_resumed_work_is_of_what_was_done_now():
     now, lines = [0.0], []
     with progress.told_to(Lines(lines.append, lambda: now[0])):
