@@ -17,8 +17,8 @@ from fgloc.types import Mode, RunResult
 
 _MOST_ROWS = 60  # of the table of judgements
 _JUDGED = (
-    "Steps of steps.csv that say the same are one row; its column judgement has the number. Times are seconds from the "
-    "first pose. The statistic is the one that exceeds its threshold most."
+    "A row stands for steps of steps.csv that say the same; the file's column judgement has its number. Times are "
+    "seconds from the first pose. The statistic is the one that exceeds its threshold most."
 )
 _TIMELINE = (
     "Messages received; each motion source at the height of its weight, red where it was left out; the reasons; the "

@@ -20,7 +20,6 @@ from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.style import (
     BLUE,
     DPI,
-    GAP_S,
     GREEN,
     MODE_LOOKS,
     NORMAL,
@@ -29,6 +28,7 @@ from fgloc.evaluation.style import (
     SMALL,
     TEXT,
     WIDTH,
+    after_gaps,
     broken,
     legend,
     mode_runs,
@@ -93,8 +93,7 @@ def _draw_way(axes: Axes, result: RunResult, matched: Matched | None, extent: fl
     if estimate.covs is not None:
         handles += _draw_ellipses(axes, estimate, extent)
     jumps = relocated(result)
-    gaps = np.flatnonzero(np.diff(estimate.stamps_ns) > GAP_S * 1e9) + 1
-    xy = np.insert(estimate.poses[:, :2], np.union1d(gaps, jumps), np.nan, axis=0)
+    xy = np.insert(estimate.poses[:, :2], np.union1d(after_gaps(estimate.stamps_ns), jumps), np.nan, axis=0)
     if len(jumps):
         parts = [estimate.poses[k - 1 : k + 1, :2] for k in jumps]
         axes.add_collection(LineCollection(parts, colors=RED, linewidths=1.0, linestyles=":", zorder=3))
