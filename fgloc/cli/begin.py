@@ -36,12 +36,13 @@ def init(
     for sentence in found.missing:
         warn(sentence)
     say(f"configuration: {out}")
-    beside = find_beside(bag, "map.yaml")
-    seen = {"image", "sightings"} & found.roles.keys()
     next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
-    if beside is None and seen:
+    if not {"image", "sightings"} & found.roles.keys():
+        return  # nothing to survey, or to calibrate on
+    beside = find_beside(bag, "map.yaml")
+    if beside is None:
         next_step(f"fgloc map {shown_path(bag)} --config {shown_path(out)} --out map.yaml", "survey the markers")
-    elif seen:
+    else:
         next_step(
             f"fgloc calibrate {shown_path(bag)} --map {shown_path(beside)} --config {shown_path(out)} "
             "--out calibrated.yaml",

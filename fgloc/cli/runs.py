@@ -194,6 +194,7 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
+    rows += [(name, str(path)) for name, path in (("MCAP", mcap), ("rerun", rrd)) if path is not None]
     found = remarks(result, metrics)
     for remark in found:
         if remark.kind != "note":
