@@ -81,7 +81,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
         ("relocalization/place_search.py",),
-        (Switch(f"{_SEARCH}:_TRIMS", Constant(0)),),
+        (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
     ),
     Mechanism(
         "jump_compelling",
@@ -98,14 +98,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         ("graph/isam2.py",),
         (Switch(f"{_WINDOW}._relinearize", Returns(None)),),
         Probe(f"{_WINDOW}._relinearize", called),
-        batch=True,
-    ),
-    Mechanism(
-        "batch_learned_again",
-        "Batch: the learned motion is evaluated again at the smoothed velocities.",
-        ("replay/smoothing.py",),
-        (Switch("fgloc.replay.smoothing:_measure_again", Returns({})),),
-        Probe("fgloc.replay.smoothing:_measure_again", something),
         batch=True,
     ),
 )

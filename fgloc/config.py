@@ -187,10 +187,7 @@ class WeightsConfig(Section):
 class BatchConfig(Section):
     """The batch smoother."""
 
-    outer_iterations: int = Field(
-        2, ge=1, le=20, description="learned motion is re-evaluated at the smoothed velocities"
-    )
-    max_iterations: int = Field(50, ge=1, le=1000, description="of Levenberg–Marquardt, each")
+    max_iterations: int = Field(50, ge=1, le=1000, description="of Levenberg–Marquardt")
 
 
 class LiveConfig(Section):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
@@ -23,6 +22,7 @@ from fgloc.graph.factors import (
     prior_factor,
 )
 from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.joint import CONVERGED, MOST_STEPS
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import chi2_bound
@@ -30,14 +30,10 @@ from fgloc.types import (
     FloatArray,
     IntArray,
     Landmark,
-    MotionMeasurement,
     PixelMeasurement,
 )
 
-_LINEARIZATIONS = 6
 _LARGEST_LOG = math.log(sys.float_info.max) - 1.0
-_STILL = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad: poses that move less have arrived ...
-_STILL_SIGMAS = 0.02  # ... and an installation, in units of its prior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +50,7 @@ class Smoothed:
 
 
 class BatchSmoother:
-    """Solves the whole log, as often as what depends on the solution is measured again.
+    """Solves the whole log.
 
     It holds the sightings that were accepted online. Of an unknown map, sightings that the first solution finds less
     likely than ``1 - gate_probability`` are left out.
@@ -84,7 +80,7 @@ class BatchSmoother:
         self._probability = gate_probability
         self.accepted = {frame.k: frame.sightings for frame in self.frames}
         self._on_ground = GroundMotions(self.frames, factors.installation) if factors.installation.ground else None
-        self._motions = self._new_motions()
+        self._motions = None if self._on_ground is not None else BatchMotions(self.frames, factors.installation)
         self._sightings = None
         if factors.known:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
@@ -111,16 +107,6 @@ class BatchSmoother:
         if self._factors.known:  # then no other pose is among the values
             return np.asarray(gtsam.utilities.extractPose2(self._values))
         return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
-
-    def replace_motions(self, motions: Mapping[int, tuple[MotionMeasurement, ...]]) -> None:
-        """Take other motion measurements for these keyframes, and solve again from the last solution."""
-        for frame in self.frames:
-            frame.motions = motions.get(frame.k, frame.motions)
-        self._motions = self._new_motions()
-        self._optimize()
-
-    def _new_motions(self) -> BatchMotions | None:
-        return None if self._on_ground is not None else BatchMotions(self.frames, self._factors.installation)
 
     def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found; on uneven ground with that under the last keyframe."""
@@ -218,23 +204,21 @@ class BatchSmoother:
         return np.asarray(self._values.atVector(INSTALLATION)) if n else np.zeros(0)
 
     def _optimize(self) -> None:
-        """Linearize the sightings anew and solve, until poses and installation stay where they are."""
+        """Linearize the sightings anew and solve, until the error stays what it is."""
         self._solved = None
-        for _ in range(_LINEARIZATIONS):
-            poses, theta = self.poses(), self._theta()
+        previous = math.inf
+        for _ in range(MOST_STEPS):
             self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
             graph = self._linearized()
             start = self._values if self._factors.known else without_orphans(self._values, graph)
             values = self._solve(graph, start)
-            if not np.isfinite(graph.error(values)):
+            error = graph.error(values)
+            if not np.isfinite(error):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
             self._values, self._graph = values, graph
-            moved = np.abs(self.poses() - poses)
-            moved[:, 2] = np.abs(se2.wrap_array(moved[:, 2]))
-            still = bool((moved < _STILL).all())
-            sigmas = self._factors.installation.sigmas[: len(theta)]
-            if still and (np.abs(self._theta() - theta) < _STILL_SIGMAS * sigmas).all():
+            if abs(previous - error) <= CONVERGED * error:
                 break
+            previous = error
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
@@ -275,7 +259,7 @@ class BatchSmoother:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self._config.max_iterations)
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
-        params.setRelativeErrorTol(1e-7)
+        params.setRelativeErrorTol(CONVERGED)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 

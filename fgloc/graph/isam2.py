@@ -41,7 +41,6 @@ from fgloc.types import (
 )
 
 _GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
-_MARGIN_S = 1e-3  # a keyframe this near to the end of the window may be gone
 
 
 class IncrementalEstimator(Estimator):
@@ -53,7 +52,7 @@ class IncrementalEstimator(Estimator):
         self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
-        self._slots: dict[int, tuple[float, list[int]]] = {}  # keyframe -> elapsed_s, slots of its motion factors
+        self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
 
     def _solve(self, frame: Keyframe) -> None:
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
@@ -122,7 +121,7 @@ class IncrementalEstimator(Estimator):
         newest = self.log.keyframes[self._k]
         graph, slots = gtsam.NonlinearFactorGraph(), []
         for frame in frames:
-            slots += self._slots[frame.k][1]
+            slots += self._slots[frame.k]
             for factor in self._motion_factors(frame):
                 graph.add(factor)
         try:
@@ -134,7 +133,7 @@ class IncrementalEstimator(Estimator):
             return
         for frame in frames:
             held, new = new[: len(frame.motions)], new[len(frame.motions) :]
-            self._slots[frame.k] = frame.elapsed_s, held
+            self._slots[frame.k] = held
 
     def _begin_at(self, newest: Keyframe) -> None:
         if self._config.kind == "fixed_lag":
@@ -155,17 +154,9 @@ class IncrementalEstimator(Estimator):
     def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: PoseWithCovariance | None = None) -> None:
         """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""
         if frame.prior is None and prior is None:
-            self._slots[frame.k] = frame.elapsed_s, list(slots[: len(frame.motions)])
-        if self._config.kind == "fixed_lag":
-            horizon = frame.elapsed_s - self._config.lag_s
-            while self._slots:
-                oldest = next(iter(self._slots))
-                before = self.log.keyframes.get(oldest - 1)
-                if before is not None and before.elapsed_s > horizon + _MARGIN_S:
-                    break
-                if oldest == frame.k:
-                    break
-                del self._slots[oldest]
+            self._slots[frame.k] = list(slots[: len(frame.motions)])
+        while self._slots and self._backend is not None and not self._backend.holds(next(iter(self._slots)) - 1):
+            del self._slots[next(iter(self._slots))]
 
     def _window(self, frame: Keyframe) -> list[Keyframe]:
         """Logged keyframes that are in the window together with this one: of its segment, unless all are kept."""

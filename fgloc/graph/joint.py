@@ -6,6 +6,7 @@ Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,9 +21,14 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
-_MOST_STEPS = 6
-_LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
-_STILL = 1e-3  # sigmas: a step of Gauss-Newton this small is the last one
+FAR_M2 = 1e2  # m²: variance of a position that nothing tells
+# Sightings of one step that are weighed together, of which the work grows with the square: more than an image shows
+# come in a burst. Of more, those of the least NIS are; the others are held against what these agree on.
+MOST_JOINT = 16
+MOST_STEPS = 6  # of Gauss-Newton: it has arrived after two or three, or does not
+LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
+CONVERGED = 1e-6  # relative change of a robust cost, after which a fit has arrived
+_STILL = math.sqrt(CONVERGED)  # sigmas: a step of Gauss-Newton this small is the last one
 
 
 def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
@@ -147,7 +153,7 @@ def correct(
     n = len(known.mean)
     x = np.zeros(3 + n)  # tangent of the belief
     pose, theta = belief.pose, known.mean
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         lines = observed.linearize(pose, theta)
         if any(one.behind for one in lines):
             return None
@@ -177,4 +183,4 @@ def correct(
 def is_linear(belief: PoseWithCovariance) -> bool:
     """Whether sightings are as good as linear over what the pose may be."""
     cov = belief.cov
-    return bool(max(cov[0, 0], cov[1, 1]) < _LINEAR_M**2 and cov[2, 2] < LINEAR_RAD**2)
+    return bool(max(cov[0, 0], cov[1, 1]) < LINEAR_M**2 and cov[2, 2] < LINEAR_RAD**2)

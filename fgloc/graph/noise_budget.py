@@ -18,7 +18,8 @@ from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
 _SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
-_LEARNED_BESIDE_WRONG_WHEELS = 4.0  # times its covariance: squared errors over 1 s of a slip, 2 to 5 times
+# What a motion's covariance may be off by: squared errors of the learned motion over 1 s of a slip are 2 to 5 times it.
+COVARIANCE_FACTOR = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,9 +64,9 @@ class NoiseBudget:
         """
         names = registry.motion_names()
         if names.odometer in self.rejected:
-            return {names.model: _LEARNED_BESIDE_WRONG_WHEELS}
+            return {names.model: COVARIANCE_FACTOR}
         scale = self.scale
-        learned = min(scale, _LEARNED_BESIDE_WRONG_WHEELS) if scale > 1.0 else math.sqrt(scale)
+        learned = min(scale, COVARIANCE_FACTOR) if scale > 1.0 else math.sqrt(scale)
         return {names.odometer: scale, names.model: learned}
 
     def combine(self, readings: MotionReadings, rules: FusionRules) -> list[MotionMeasurement]:
@@ -106,7 +107,7 @@ class NoiseBudget:
         """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip."""
         slips = self.rejected[wheels.source] == "slip"
         speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
-        seconds = max((wheels.stamp_ns - wheels.start_ns) * 1e-9, 1e-3)
+        seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
         speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds
         density = np.square([max(speed_of_wheels, speed), 0.3 * max(speed_of_wheels, speed), max(turned, turn)])
         return replace(wheels, cov=wheels.cov + np.diag(density * _WRONG_LASTS_S * seconds))

@@ -17,19 +17,19 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.joint import fuse
+from fgloc.graph.joint import FAR_M2, LINEAR_M, LINEAR_RAD, MOST_JOINT, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import repetition
+from fgloc.robust.landmark_modes import MOST_HYPOTHESES
+from fgloc.stats import GATE
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
 _RING = 24  # pieces of a ring, 15 degrees apart
-_MAX_HYPOTHESES = 96  # four rings; the unlikeliest go first
-_MAX_SIGHTINGS = 8  # of one step
-_OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
-_UNIFORM = 1.0 / (2.0 * math.pi * 10.0)  # ... which may be seen in any direction [1/rad] and up to 10 m away [1/m]
-_NEGLIGIBLE = 12.0  # in log weight: less probable than e^-12 of the most probable
+OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
+_UNIFORM = 1.0 / (2.0 * math.pi * math.sqrt(FAR_M2))  # ... seen in any direction [1/rad], as far as that [1/m]
+_NEGLIGIBLE = -math.log(1.0 - GATE)  # in log weight, below that of the most probable
 _AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
-_SAME = 0.05  # m, rad: two hypotheses this near are one
+_SAME = np.array([LINEAR_M, LINEAR_M, LINEAR_RAD])  # two hypotheses this near are one
 
 
 class GaussianSum:
@@ -62,7 +62,7 @@ class GaussianSum:
         if len(self.poses) and motions:
             self._predict(*fuse(motions))
         beacons = [m for m in sightings if isinstance(m, PointMeasurement) and m.landmark_id in self._places]
-        for m in beacons[:: -(-len(beacons) // _MAX_SIGHTINGS) or 1]:
+        for m in beacons[:: -(-len(beacons) // MOST_JOINT) or 1]:
             self._take(m)
 
     def belief(self) -> PoseWithCovariance | None:
@@ -106,14 +106,14 @@ class GaussianSum:
         R = self._cov(m)
         seen_before = m.landmark_id in self._last_ns
         self._last_ns[m.landmark_id] = m.stamp_ns
-        outlier = math.log(_OUTLIER * _UNIFORM)
+        outlier = math.log(OUTLIER * _UNIFORM)
         if len(self.poses):
             self._update(m, R, outlier)
         if not seen_before:  # and everything before it may have been wrong
             poses, covs = _ring(self._places[m.landmark_id], m, R)
             off = poses[:, :2] - self._middle
             near = -0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off)
-            born = near + self._none + math.log((1.0 - _OUTLIER) * _UNIFORM / _RING)
+            born = near + self._none + math.log((1.0 - OUTLIER) * _UNIFORM / _RING)
             self.poses = np.concatenate([self.poses, poses])
             self.covs = np.concatenate([self.covs, covs])
             self.log_weights = np.concatenate([self.log_weights, born])
@@ -127,7 +127,7 @@ class GaussianSum:
         S = J @ PJ + R
         weighed = np.linalg.solve(S, residual[:, :, None])[:, :, 0]
         nis = np.einsum("ni,ni->n", residual, weighed)
-        fits = math.log((1.0 - _OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
+        fits = math.log((1.0 - OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
         good = fits > outlier
         gain = np.linalg.solve(S, PJ.transpose(0, 2, 1)).transpose(0, 2, 1)
         poses = se2.compose_array(self.poses, se2.exp_array(np.einsum("nij,nj->ni", gain, residual)))
@@ -158,7 +158,7 @@ class GaussianSum:
                 if len(same):
                     weights[kept[same[0]]] = np.logaddexp(weights[kept[same[0]]], weights[i])
                     continue
-            if len(kept) < _MAX_HYPOTHESES:
+            if len(kept) < MOST_HYPOTHESES:
                 kept.append(int(i))
         self.poses, self.covs, self.log_weights = poses[kept], self.covs[kept], weights[kept]
 
@@ -174,7 +174,7 @@ def _ring(place: FloatArray, m: PointMeasurement, R: FloatArray) -> tuple[FloatA
     at = np.linalg.inv(J)  # of the point by bearing and range
     cov = np.zeros((3, 3))
     cov[:2, :2] = at @ R @ at.T
-    cov += np.outer(about, about) * (2.0 * math.pi / _RING * 0.6) ** 2
+    cov += np.outer(about, about) * (math.pi / _RING) ** 2
     return poses, np.repeat(cov[None], _RING, axis=0)
 
 
@@ -183,7 +183,7 @@ def _residuals(poses: FloatArray, place: FloatArray, m: PointMeasurement) -> tup
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = place[0] - poses[:, 0], place[1] - poses[:, 1]
     x, y = c * dx + s * dy, c * dy - s * dx
-    r = np.maximum(np.hypot(x, y), 1e-3)
+    r = np.maximum(np.hypot(x, y), LINEAR_M)
     residual = np.column_stack([se2.wrap_array(m.bearing_rad - np.arctan2(y, x)), m.range_m - r])
     J = np.zeros((len(poses), 2, 3))
     J[:, 0] = np.column_stack([y / r**2, -x / r**2, -np.ones_like(r)])

@@ -13,7 +13,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import fuse
+from fgloc.graph.joint import FAR_M2, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
@@ -27,13 +27,11 @@ from fgloc.types import (
     Step,
 )
 
-_FAR_M2 = 100.0  # m²: variance of a place before it is known
-ANYWHERE = np.diag([_FAR_M2, _FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
+ANYWHERE = np.diag([FAR_M2, FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
 ORIGIN = 1e-6 * np.eye(se2.DOF)  # of a first pose that is the origin by definition
-_MAX_STEPS = 400
 _PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
-_RETRY_NS = 800_000_000
+_RETRY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +123,7 @@ class GlobalSearch:
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
         horizon = step.stamp_ns - self._window_ns
-        while self._steps[0].step.stamp_ns < horizon or len(self._steps) > _MAX_STEPS:
+        while self._steps[0].step.stamp_ns < horizon:
             forgotten = self._steps.popleft()
             if self._keep_all and self._first:
                 self._earlier.append(forgotten)
@@ -144,7 +142,7 @@ class GlobalSearch:
         """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
         since, patience_ns = self._since_ns or stamp_ns, self._config.estimator.initialise_s * 1e9
         waited = self._tried_ns <= since + _PATIENCE * patience_ns < stamp_ns  # what counts as enough has changed
-        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_NS and not waited:
+        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_S * 1e9 and not waited:
             return False
         self._tried_ns = stamp_ns
         return True

@@ -9,6 +9,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import MOST_STEPS
 from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
 from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
@@ -22,15 +23,10 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-_LEAST_SHARE = 0.1  # of the information that the best-seen landmark gives: one that gives less counts for none
-_TRIMS = 3
 _DETERMINE = 2  # beacons that determine a pose: of more on the map, one can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
-_MAX_FITTED, _MAX_ROUGH, _MAX_SEEDS = 24, 12, 6  # sightings for the fit, for the rough fit, for places to start from
+_MAX_FITTED, _MAX_SEEDS = 24, 6  # sightings for the fit; places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
-_HOPELESS = 2.0  # times the cost that a place may have: a rough fit above it will not come below
-_MAX_CANDIDATES = 4  # places to start from, that are fitted roughly
-_ROUGH_ITERATIONS = 4
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
 _YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
 
@@ -53,18 +49,16 @@ class PlaceSearch:
         here = _spread(sightings, _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
-        fit_few = PoseFit(_spread(here, _MAX_ROUGH), self._factors, self._config)
+        fitted = PoseFit(here, self._factors, self._config)
         candidates = sorted(
-            self._candidates(here, known), key=lambda c: float(np.minimum(fit_few.costs(c)[0], UNEXPLAINED).sum())
+            self._candidates(here, known), key=lambda c: float(np.minimum(fitted.costs(c)[0], UNEXPLAINED).sum())
         )
-        rough = [fit for c in candidates[:_MAX_CANDIDATES] if (fit := fit_few.solve(c, _ROUGH_ITERATIONS)) is not None]
-        if known and all(fit.cost > _HOPELESS * MAX_COST_PER_DOF * fit.dof for fit in rough):
-            return None
-        places: list[FloatArray] = []
-        for fit in sorted(rough, key=lambda fit: fit.cost):
-            if all(apart(fit.pose, other) for other in places):
-                places.append(fit.pose)
-        found = [agreed for place in places if (agreed := self._agreed(place, here)) is not None]
+        fits = [fit for c in candidates[:_MAX_SEEDS] if (fit := fitted.solve(c)) is not None]
+        places: list[Fit] = []
+        for fit in sorted(fits, key=lambda fit: fit.cost):
+            if all(apart(fit.pose, other.pose) for other in places):
+                places.append(fit)
+        found = [agreed for fit in places if (agreed := self._agreed(fit, here)) is not None]
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
@@ -88,13 +82,10 @@ class PlaceSearch:
                 return False
         return True
 
-    def _agreed(self, place: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
+    def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
-        fit = self._fit(place, sightings)
-        if fit is None:
-            return None
         agreeing = list(sightings)
-        for _ in range(_TRIMS):
+        for _ in range(MOST_STEPS):
             before = agreeing
             agreeing = self._explained(fit.pose, sightings)
             if len(agreeing) == len(before):
@@ -107,10 +98,7 @@ class PlaceSearch:
         for m in agreeing:
             information_of[m.landmark_id] = information_of.get(m.landmark_id, 0.0) + _information(m)
         share = sum(information_of.values()) / sum(map(_information, sightings))
-        contributing = {
-            i for i, information in information_of.items() if information > _LEAST_SHARE * max(information_of.values())
-        }
-        residuals = {m.landmark_id: m.dof for m in agreeing if m.landmark_id in contributing}
+        residuals = {m.landmark_id: m.dof for m in agreeing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
         outliers = [m for m in sightings if not any(m is other for other in agreeing)]

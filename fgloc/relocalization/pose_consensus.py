@@ -17,8 +17,7 @@ _SAME_PLACE = 0.3  # m, rad: candidates nearer than this are one place
 # Of sightings of several landmarks a place has to explain more than half, as any other place explains less then: the
 # rest have wrong ids, or were moved. One that explains less than this ...
 WHOLE_SHARE = 0.8
-_PARTIAL_COST_PER_DOF = 1.5  # ... takes a better fit ...
-# ... and has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a
+# ... has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a
 # short way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SHARP_SIGMA = 0.1  # m, rad
 REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
@@ -53,8 +52,7 @@ class PoseConsensus:
             return False
         if (self.outlier_landmarks or not whole) and self.redundancy < REDUNDANT:
             return False
-        cost = MAX_COST_PER_DOF if whole else _PARTIAL_COST_PER_DOF
-        if self.fit.cost > cost * self.fit.dof or (self.by_sensors and self._sigmas[2] > _SHARP_SIGMA):
+        if self.fit.cost > MAX_COST_PER_DOF * self.fit.dof or (self.by_sensors and self._sigmas[2] > _SHARP_SIGMA):
             return False
         return bool((self._sigmas <= (MAX_SIGMA if whole else _SHARP_SIGMA)).all())
 

@@ -13,6 +13,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import CONVERGED
 from fgloc.graph.linearized import Stacked
 from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
@@ -20,9 +21,9 @@ from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
 _ITERATIONS = 16
-_CONVERGED, _RANK = 1e-6, 1e-9  # relative: of the cost, and of the least eigenvalue of the information
+_RANK = 1e-9  # of the least eigenvalue of the information, relative to the largest
 UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
-_TELLS_NOTHING = 1e12  # times its own: variance by the installation of a sighting next to the image plane
+_TELLS_NOTHING = 1.0 / _RANK  # times its own: variance by the installation of a sighting next to the image plane
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -68,10 +69,10 @@ class PoseFit:
         self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
-    def solve(self, start: FloatArray, iterations: int = _ITERATIONS) -> Fit | None:
+    def solve(self, start: FloatArray) -> Fit | None:
         """As `fit_pose`."""
         pose, previous = start, math.inf
-        for step in range(iterations):
+        for step in range(_ITERATIONS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
             for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
                 square = np.einsum("ni,ni->n", r, r)
@@ -82,7 +83,7 @@ class PoseFit:
                 pull += np.einsum("n,nij,ni->j", weight, J, r)
             if np.linalg.matrix_rank(normal, rtol=_RANK) < se2.DOF:
                 return None
-            if abs(previous - cost) <= _CONVERGED * cost:
+            if abs(previous - cost) <= CONVERGED * cost:
                 break
             previous = cost
             pose = se2.compose(pose, se2.exp(np.asarray(np.linalg.solve(normal, -pull), dtype=np.float64)))

@@ -12,6 +12,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.gaussian_sum import OUTLIER
 from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.robust.association import NEAR_M, NEAR_RAD
 from fgloc.types import (
@@ -25,12 +26,12 @@ from fgloc.types import (
     Step,
 )
 
-_NAMED = 3  # jumps
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
-_KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
-_WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misread, each independently
+_KIDNAPPED = (
+    1e-3  # prior probability that a robot was carried away where sightings contradict its pose; or each is an outlier
+)
 
 
 class Tracking:
@@ -58,7 +59,7 @@ class Tracking:
         self._clock_s = self._fix_s = 0.0
         self._given = False  # whether the first pose was given, and nothing is known yet of its worth
         self._confirming = self._contradicting = 0  # sightings
-        self._jumps: list[FloatArray] = []  # the first few ...
+        self._jump: FloatArray | None = None  # the first one ...
         self._jump_count = 0  # ... of so many
         self._reported = False  # whether an unconfirmed pose was reported
         places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
@@ -163,7 +164,7 @@ class Tracking:
         """
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
             return np.zeros((3, 3))
-        kidnapped = _KIDNAPPED / (_KIDNAPPED + _WRONG**contradicting)
+        kidnapped = _KIDNAPPED / (_KIDNAPPED + OUTLIER**contradicting)
         return kidnapped * self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
@@ -263,17 +264,18 @@ class Tracking:
     def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was estimated at."""
         self._jump_count += 1
-        if self._jump_count <= _NAMED:
-            self._jumps.append(se2.between(estimated.pose, place.pose))
+        if self._jump is None:
+            self._jump = se2.between(estimated.pose, place.pose)
         self.lost = self._given = False
         self._search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know, one sentence each."""
-        sentences = [f"sightings contradicted the estimated pose: jumped by {_far(miss)}" for miss in self._jumps]
-        if self._jump_count > _NAMED:
-            sentences.append(f"... and {self._jump_count - _NAMED} times more")
+        sentences = []
+        if self._jump is not None:
+            more = f", and {self._jump_count - 1} times more" if self._jump_count > 1 else ""
+            sentences.append(f"sightings contradicted the estimated pose: jumped by {_far(self._jump)}{more}")
         if self._never_found:
             sentences.append(
                 "the sightings never determined where on the map the robot is: its poses are LOST, and right relative "

@@ -1,12 +1,9 @@
-"""Batch smoothing of a replayed run: the graph is solved, what depends on the solution is measured again, and so on."""
+"""Batch smoothing of a replayed run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
-
-import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly
@@ -15,14 +12,9 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.uneven import ground_at
 from fgloc.types import (
     Estimate,
-    FloatArray,
     Ground,
-    IntArray,
     LandmarkMap,
-    MotionMeasurement,
 )
-
-_VELOCITY_WINDOW_S = 0.5  # velocities of the smoothed trajectory are differences over this long
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +32,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     """Smooth a run that was replayed with ``keep_all``.
 
     Args:
-        parts: the run's parts; the localizer's log is read, and its motions are replaced.
+        parts: the run's parts; the localizer's log is read.
 
     Raises:
         EstimatorError: the graph cannot be solved.
@@ -48,9 +40,6 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     localizer, config = parts.localizer, parts.config
     log = localizer.estimator.log
     solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability)
-    if parts.learned is not None and parts.learned.reads_velocity:
-        for _ in range(config.batch.outer_iterations - 1):
-            solver.replace_motions(_measure_again(parts, solver))
     notes = []
     result = solver.result()
     estimates = [
@@ -77,32 +66,3 @@ def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:
         found = ground_at(ground, whole, float(pose[2]))
         by_clock = frame.ground_clock_cov
         yield found if by_clock is None else replace(found, cov=found.cov + by_clock)
-
-
-def _measure_again(parts: Assembly, solver: BatchSmoother) -> dict[int, tuple[MotionMeasurement, ...]]:
-    """Evaluate the learned motion at the velocities of the smoothed trajectory."""
-    stamps, poses = solver.stamps_ns(), solver.poses()
-    starts = [i for i, frame in enumerate(solver.frames) if frame.prior is not None]
-    sources, again = parts.localizer.motion.sources, {}
-    for start, end in pairwise([*starts, len(stamps)]):  # no motion leads from one stretch to the next
-        velocities = smoothed_velocities(stamps[start:end], poses[start:end])
-        for frame, velocity in zip(solver.frames[start + 1 : end], velocities[1:], strict=True):
-            if frame.step is None:
-                continue
-            readings = sources.read_again(frame.readings, frame.step, velocity)
-            if motions := frame.budget.combine(readings, sources.rules):
-                again[frame.k] = tuple(motions)
-    return again
-
-
-def smoothed_velocities(stamps_ns: IntArray, poses: FloatArray) -> FloatArray:
-    """Body velocity ``(n, 2)`` (forward [m/s], yaw rate [rad/s]) at the *start* of each keyframe's step."""
-    half = round(0.5e9 * _VELOCITY_WINDOW_S)
-    at = np.concatenate([stamps_ns[:1], stamps_ns[:-1]])
-    before = np.clip(at - half, stamps_ns[0], stamps_ns[-1])
-    after = np.clip(at + half, stamps_ns[0], stamps_ns[-1])
-    span = np.maximum((after - before) * 1e-9, 1e-3)
-    start = se2.interpolate(stamps_ns, poses, before)
-    end = se2.interpolate(stamps_ns, poses, after)
-    tangents = np.array([se2.log(se2.between(a, b)) for a, b in zip(start, end, strict=True)])
-    return np.asarray(tangents[:, [0, 2]] / span[:, None])

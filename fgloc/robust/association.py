@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import correct, innovation, is_linear, joint_cov, nis_of_each
+from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition
 from fgloc.relocalization.pose_consensus import REDUNDANT
@@ -25,9 +25,6 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-# Sightings of one step whose agreement is searched, those of the least NIS: more than an image shows come in a burst.
-# The others are held against what these agree on. The work grows with the square.
-_MOST_JOINT = 16
 NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
@@ -203,7 +200,7 @@ class Association:
         Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
         """
         rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
-        candidates = rows if len(rows) <= _MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:_MOST_JOINT]
+        candidates = rows if len(rows) <= MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:MOST_JOINT]
         if len(rows) < 2 or (candidates is rows and self._compatible(rows, measurements, predicted)):
             return judged
         most = self._largest_agreeing(candidates, measurements, predicted)

@@ -10,12 +10,12 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import WeightsConfig
+from fgloc.graph.noise_budget import COVARIANCE_FACTOR
 from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import FloatArray
 
 _LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
 _LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
-_LEAST_LEVEL = 0.25  # covariances are taken to be given too large by at most four times
 _ADAPTS = 0.1  # share by which a step moves the quantile
 
 
@@ -92,7 +92,7 @@ class GlrTest:
         nis, span = self._worst()
         if not self.flagged:
             self._low *= math.exp(_ADAPTS * ((nis > self._low) - (1.0 - _LOW)))
-            self._low = min(max(self._low, _LEAST_LEVEL * _LOW_EXPECTED), _LOW_EXPECTED)
+            self._low = min(max(self._low, _LOW_EXPECTED / COVARIANCE_FACTOR), _LOW_EXPECTED)
         nis /= self._level
         bound = alarm_bound(dt, len(self._steps), se2.DOF)
         if not self.flagged:

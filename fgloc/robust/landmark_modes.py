@@ -21,7 +21,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import innovation, joint_cov, transition
+from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.linearized import Linearized
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition, sighting_whitening
@@ -29,14 +29,13 @@ from fgloc.graph.observation import Observations
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
-_MOVED_M, _TURNED_RAD = 0.5, 0.3  # prior sigmas of a displacement, on each axis, and of a marker's rotation with it
+_MOVED = 0.5  # m, rad: prior sigma of a displacement, on each axis, and of a marker's rotation with it
 _MARGIN = 7.0  # twice the log-likelihood ratio to another landmark's displacement as the cause of the same sightings
 _LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
 _MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
 _PROVEN = 2  # other landmarks that have to be in place
-_STILL_RIGHT_NS = 1_000_000_000  # after a sighting was fused, the prediction can be held against other sightings
-_ITERATIONS = 4
-_MOST = 100  # hypotheses: those of the landmarks seen last
+_STILL_RIGHT_S = 1.0  # after a sighting was fused, the prediction can be held against other sightings
+MOST_HYPOTHESES = 100  # those of the landmarks seen last
 
 Explained = tuple[FloatArray, FloatArray, FloatArray]
 """Of each hypothesis: minus twice the log-likelihood ``(L,)``, mean ``(L, 2)`` and covariance ``(L, 2, 2)`` of δ."""
@@ -53,7 +52,7 @@ class LandmarkModes:
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
         self._factors, self._gate = factors, config.estimator.gate_probability
         self._least, self._repeat_s = config.weights.quarantine_after, config.landmarks.repeat_s
-        n = min(len(factors.landmarks), _MOST) if config.weights.adaptive else 0
+        n = min(len(factors.landmarks), MOST_HYPOTHESES) if config.weights.adaptive else 0
         self.alarm = evidence_bound(self._gate, max(n, 1))
         self._rows: dict[int, int] = {}  # of landmarks, the one seen last last
         self._ids, self._places = np.zeros(n, dtype=np.int64), np.full((n, 2), np.inf)
@@ -119,7 +118,7 @@ class LandmarkModes:
             self._fused_ns = fused[0].measurement.stamp_ns
         P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
         for m in (s.alone for s in against):
-            if m.stamp_ns - self._fused_ns < _STILL_RIGHT_NS and not self.excludes(m.landmark_id):
+            if m.stamp_ns - self._fused_ns < _STILL_RIGHT_S * 1e9 and not self.excludes(m.landmark_id):
                 self._contradicted(P, belief, m)
         self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*seen, *against)})
         self._reset(self._evidence.sum(1) < -self.alarm)  # it was in place; it may be moved from now on
@@ -157,7 +156,7 @@ class LandmarkModes:
         return belief.installation or self._factors.estimated
 
     def _reset(self, rows: NDArray[np.bool_]) -> None:
-        self._M[rows], self._moved[rows], self._cov[rows] = 0.0, 0.0, _MOVED_M**2 * np.eye(2)
+        self._M[rows], self._moved[rows], self._cov[rows] = 0.0, 0.0, _MOVED**2 * np.eye(2)
         self._evidence[rows], self._seen[rows], self._explained[rows] = 0.0, 0.0, 0.0
 
     def _take(
@@ -206,7 +205,7 @@ class LandmarkModes:
         theta, moved = self._known(belief).mean, self._moved[row]
         rows = self._factors.installation.landmarks.get(int(self._ids[row]), (0, 0))
         explained = np.array([np.inf]), self._moved[row, None], self._cov[row, None]
-        for _ in range(_ITERATIONS):
+        for _ in range(MOST_STEPS):
             x, y = belief.pose[:2] - moved  # moving the landmark one way is moving the robot the other
             one = observed.linearize(np.array([x, y, belief.pose[2]]), theta)[0]
             if one.behind:
@@ -292,5 +291,5 @@ def _turned(one: Linearized, rows: tuple[int, int]) -> FloatArray:
         rows: first and number of the rows of its landmark in the installation.
     """
     of_it = (one.columns >= rows[0] + 2) & (one.columns < rows[0] + rows[1])
-    H = one.H[:, of_it] * np.array([_MOVED_M, _TURNED_RAD, _TURNED_RAD, _TURNED_RAD])[: of_it.sum()]
+    H = one.H[:, of_it] * _MOVED
     return np.asarray(H @ H.T)

@@ -22,7 +22,6 @@ from fgloc.stats import alarm_bound
 from fgloc.types import Decision, MotionReadings, Step
 
 _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
-_PARTS = 10  # windows that are looked at in each step: these tenths of it
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
 _LEARN_S = 2.0  # before the first test
@@ -126,10 +125,9 @@ class _RiseTest:
             self._level = mean
         rises = np.cumsum(((forces - self._level) * seconds)[::-1])
         spans = np.cumsum(seconds[::-1])
-        ends = np.searchsorted(spans, np.linspace(1.0 / _PARTS, 1.0, _PARTS) * spans[-1] - 1e-9)
-        sigmas = np.sqrt(np.maximum(self._variance * spans[ends] / _WINDOW_S, _LEAST_SIGMA**2))
-        nis = np.where(np.abs(rises[ends]) > _LEAST_RISE, (rises[ends] / sigmas) ** 2, 0.0)
-        bound = alarm_bound(dt, _PARTS, 1)
+        sigmas = np.sqrt(np.maximum(self._variance * spans / _WINDOW_S, _LEAST_SIGMA**2))
+        nis = np.where(np.abs(rises) > _LEAST_RISE, (rises / sigmas) ** 2, 0.0)
+        bound = alarm_bound(dt, len(spans), 1)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)

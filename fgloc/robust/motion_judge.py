@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from fgloc.config import Config
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise_budget import COVARIANCE_FACTOR, NoiseBudget
 from fgloc.robust.decision_log import flag_notes, motion_decisions
 from fgloc.robust.lift import LiftMonitor
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
@@ -22,8 +22,6 @@ from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors import registry
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
-
-_WORTH_A_REVISION = 4.0  # times the scale on its covariances: a step that disagrees more than it did is combined anew
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +175,6 @@ def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:
         if odometer in before.rejected:
             return None
         return replace(before, rejected={**before.rejected, odometer: now.rejected[odometer]})
-    if now.scale >= _WORTH_A_REVISION * max(before.scale, 1.0):
+    if now.scale >= COVARIANCE_FACTOR * max(before.scale, 1.0):
         return replace(before, scale=now.scale)
     return None

@@ -12,6 +12,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import planar_turn
+from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_budget import FusionRules, with_yaw
 from fgloc.sensors import registry
@@ -21,7 +22,6 @@ from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _LEAST_S = 0.01  # of a step without a motion source: its covariance is not singular
-_SAYS_NOTHING = 1e2  # m²: a gyro knows no position
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 
@@ -65,13 +65,12 @@ class MotionSources:
     def _learned_has_gyro(self) -> bool:
         return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
 
-    def read(self, step: Step, since_fix_s: float = 0.0, velocity: FloatArray | None = None) -> MotionReadings:
+    def read(self, step: Step, since_fix_s: float = 0.0) -> MotionReadings:
         """Read every source once.
 
         Args:
             step: its events.
             since_fix_s: time before the step without a fix.
-            velocity: ``(2,)`` at its start, if known better than by the learned model itself.
         """
         if step.dt <= 0.0:
             return MotionReadings()
@@ -85,14 +84,14 @@ class MotionSources:
             without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
             turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
             if turn is not None:
-                cov = np.diag([_SAYS_NOTHING, _SAYS_NOTHING, turn.variance])
+                cov = np.diag([FAR_M2, FAR_M2, turn.variance])
                 name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
                 if reported is not None and wheels is not None:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
-        learned = self._with_drift(self._measure_learned(step, velocity), step)
+        learned = self._with_drift(self._measure_learned(step), step)
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
         readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
@@ -133,14 +132,10 @@ class MotionSources:
         correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
         return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
 
-    def read_again(self, readings: MotionReadings, step: Step, velocity: FloatArray) -> MotionReadings:
-        """The readings with the learned motion evaluated at a better velocity."""
-        return replace(readings, learned=self._measure_learned(step, velocity))
-
-    def _measure_learned(self, step: Step, velocity: FloatArray | None) -> MotionMeasurement | None:
+    def _measure_learned(self, step: Step) -> MotionMeasurement | None:
         if self._learned is None:
             return None
-        m = self._learned.measure_scaled(step, velocity, 0.0 if self.gyro is None else self.gyro.bias)
+        m = self._learned.measure_scaled(step, 0.0 if self.gyro is None else self.gyro.bias)
         if m is None:
             return None
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []

@@ -128,14 +128,7 @@ class MotionPredictor(Protocol):
     model: Any
     rejections: Counter[str]
 
-    @property
-    def reads_velocity(self) -> bool:
-        """Whether a better velocity changes the prediction."""
-        ...
-
-    def measure_scaled(
-        self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0
-    ) -> MotionMeasurement | None:
+    def measure_scaled(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step, for this robot."""
         ...
 

@@ -13,8 +13,8 @@ from test_initializer import landmark_map, point, seen_point
 from world_bags import write_world
 
 from fgloc import se2
-from fgloc.relocalization import gaussian_sum
 from fgloc.relocalization.gaussian_sum import GaussianSum
+from fgloc.robust.landmark_modes import MOST_HYPOTHESES
 from fgloc.runner import run
 from fgloc.types import Mode, MotionMeasurement
 
@@ -77,7 +77,7 @@ def test_the_work_of_a_step_is_bounded():
     elsewhere = [point(i, *rng.uniform(-4, 4, 2)) for i in range(60)]
     times = []
     for total, _ in drive(landmarks, lambda _k: elsewhere, seconds=12.0):
-        assert len(total.poses) <= gaussian_sum._MAX_HYPOTHESES
+        assert len(total.poses) <= MOST_HYPOTHESES
         began = time.perf_counter()
         total.add([], [seen_point(TRUTH, m) for m in elsewhere])
         times.append(time.perf_counter() - began)

@@ -267,7 +267,7 @@ def step(events: tuple[ControlEvent, ...], index: int, segment: int = 0, length:
 def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of(kind, rng, tmp_path, history_s=0.1), commands(rng)
     source = LearnedMotion(model, MotionConfig())
-    first, second = (source.measure(step(events, i), None) for i in (0, 1))
+    first, second = (source.measure(step(events, i)) for i in (0, 1))
     assert first is not None
     assert second is not None
     assert (first.source, first.start_ns, second.stamp_ns) == (
@@ -279,8 +279,8 @@ def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Genera
     assert whole is not None
     np.testing.assert_allclose(se2.compose(first.motion, second.motion), whole.motion, atol=1e-6)
     again = LearnedMotion(model, MotionConfig())
-    again.measure(step(events, 0), None)
-    fresh = again.measure(step(events, 1, segment=1), None)  # a new segment: nothing carried
+    again.measure(step(events, 0))
+    fresh = again.measure(step(events, 1, segment=1))  # a new segment: nothing carried
     lone = model.predict(events, second.start_ns, second.stamp_ns, None)
     assert fresh is not None
     assert lone is not None
@@ -292,14 +292,14 @@ def test_source_carries_the_models_own_velocity(kind: str, rng: np.random.Genera
 def test_source_says_why_it_is_silent(rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of("displacement", rng, tmp_path), commands(rng)
     source = LearnedMotion(model, MotionConfig())
-    assert source.measure(step((), 0), None) is None
-    assert source.measure(step(known(events, T0 + 2 * SECOND), 0), None) is not None  # 1.2 s old: still believed
-    assert source.measure(step(known(events, T0 + SECOND), 0), None) is None
+    assert source.measure(step((), 0)) is None
+    assert source.measure(step(known(events, T0 + 2 * SECOND), 0)) is not None  # 1.2 s old: still believed
+    assert source.measure(step(known(events, T0 + SECOND), 0)) is None
     future = tuple(replace(e, stamp_ns=e.stamp_ns + 60 * SECOND) for e in events)
-    assert source.measure(step(future, 0), None) is None
+    assert source.measure(step(future, 0)) is None
     assert source.rejections == {"learned.no_commands": 2, "learned.stale_commands": 1}
     off = LearnedMotion(model, MotionConfig(use=False))
-    assert off.measure(step(events, 0), None) is None
+    assert off.measure(step(events, 0)) is None
     assert not off.rejections
 
 
@@ -313,6 +313,6 @@ def test_fault_33_network_returns_nan(kind: str, rng: np.random.Generator, tmp_p
     model, events = load_model(tmp_path / "m.safetensors"), commands(rng)
     assert model.predict(events, T0 + SECOND, T0 + 2 * SECOND, None) is None
     source = LearnedMotion(model, MotionConfig())
-    assert source.measure(step(events, 0), None) is None
-    assert source.measure(step(events, 1), None) is None
+    assert source.measure(step(events, 0)) is None
+    assert source.measure(step(events, 1)) is None
     assert source.rejections == {"learned.non_finite": 2}

@@ -114,7 +114,7 @@ def test_best_known_kinematics_carry_the_model(tmp_path: Path, rng: np.random.Ge
         (("commands", "wheels"), wheels),
         (("commands", "gyro", "effort", "wheels"), [wheels[0], 0.0, 0.45]),
     ):
-        measured = source_of(tmp_path, rng, inputs, zero=True).measure(drive(3.0, 3.2), None, gyro_bias=0.05)
+        measured = source_of(tmp_path, rng, inputs, zero=True).measure(drive(3.0, 3.2), gyro_bias=0.05)
         assert measured is not None
         np.testing.assert_allclose(measured.motion, se2.exp(0.2 * np.array(twist)), atol=1e-6)
 
@@ -129,11 +129,11 @@ def test_a_step_without_a_signal_gives_no_measurement(missing: str, tmp_path: Pa
     short = tuple(e for e in events if e.stamp_ns < T0 + 3.7 * SECOND)
     late = tuple(e for e in events if e.stamp_ns > T0 + 3.3 * SECOND)
     for left in (hole, short, late, events[:1], ()):
-        assert source.measure(with_events(whole, kind, left), None) is None
+        assert source.measure(with_events(whole, kind, left)) is None
     thin = events[::10]
-    assert source.measure(with_events(whole, kind, thin), None) is not None  # five a second will do
+    assert source.measure(with_events(whole, kind, thin)) is not None  # five a second will do
     assert source.rejections == {f"learned.no_{missing}": 5}
-    assert source_of(tmp_path, rng, ("commands",)).measure(with_events(whole, kind, ()), None) is not None
+    assert source_of(tmp_path, rng, ("commands",)).measure(with_events(whole, kind, ())) is not None
 
 
 def test_readings_that_are_not_numbers_are_holes(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -143,13 +143,13 @@ def test_readings_that_are_not_numbers_are_holes(tmp_path: Path, rng: np.random.
     mute = tuple(replace(e, effort=np.zeros(0)) for e in whole.of(JointsEvent))
     other = tuple(replace(e, names=("a", "b", "c")) for e in whole.of(JointsEvent))
     for events in (lame, mute, other):
-        assert source.measure(with_events(whole, JointsEvent, events), None) is None
+        assert source.measure(with_events(whole, JointsEvent, events)) is None
     assert source.rejections == {"learned.no_effort": 3}
     both = tuple(
         replace(e, names=("front_left_wheel", "rear_left_wheel", "right_wheel")) for e in whole.of(JointsEvent)
     )
     with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
-        source.measure(with_events(whole, JointsEvent, both), None)
+        source.measure(with_events(whole, JointsEvent, both))
 
 
 def test_contiguous_steps_remember_and_others_begin_anew() -> None:

@@ -13,12 +13,11 @@ from fgloc.sensors.base import Turn
 from fgloc.sensors.gyro import installation
 from fgloc.sensors.gyro.config import GyroConfig
 from fgloc.sensors.rest import is_standing
+from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
-_STILL_RATE = 0.03  # rad/s on top of what the bias may be: a robot that turns faster is not at rest
-_STILL_SIGMA = 2e-4  # rad/s: how well a standing robot stands
 _GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
 _APART_S = 2.0  # ... and another one after at least this long
 
@@ -130,10 +129,11 @@ class Gyro:
 
     def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
         stands = wheels is not None and is_standing(np.asarray(wheels, dtype=float), dt)
-        still = abs(rate - self.bias) < _STILL_RATE + 3.0 * math.sqrt(self.bias_variance)
+        variance = self._config.yaw_per_sqrt_s**2 / dt
+        still = (rate - self.bias) ** 2 < chi2_bound(GATE, 1) * (self.bias_variance + variance)  # or turned by hand
         self._standing_s = self._standing_s + dt if stands and still else 0.0
         if self._standing_s > _AT_REST_S:
-            self._learn(rate, self._config.yaw_per_sqrt_s**2 / dt + _STILL_SIGMA**2)
+            self._learn(rate, variance)
 
     def _learn(self, bias: float, variance: float) -> None:
         gain = self.bias_variance / (self.bias_variance + variance)

@@ -11,8 +11,9 @@ from fgloc import se2
 from fgloc.errors import CovarianceError
 from fgloc.types import FloatArray, MotionMeasurement
 
-MAX_GAIN = 0.95  # of ‖K‖: nearer to 1 the difference of the two would be blown up
-MAX_CORRELATION = 0.99  # at 1 one of the two would add no information and its covariance would be singular
+# Of the norms of the gain and of the correlation: at 1 one of the two would add no information and its covariance would
+# be singular; near it their difference would be blown up.
+MAX_GAIN = 0.95
 
 
 class JointCalibration:
@@ -43,8 +44,8 @@ class JointCalibration:
                 f"W, N and C are not a joint covariance: their correlation has norm {norm:.4g}, expected at most 1; "
                 "estimate the three from the same windows"
             )
-        if norm > MAX_CORRELATION:
-            self.correlation *= MAX_CORRELATION / norm
+        if norm > MAX_GAIN:
+            self.correlation *= MAX_GAIN / norm
         self._last: tuple[FloatArray, FloatArray, FloatArray] | None = None  # covariances and gain
 
     def gain(self, W: FloatArray, N: FloatArray) -> FloatArray:

@@ -46,12 +46,6 @@ class LearnedMotion:
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
     @property
-    def reads_velocity(self) -> bool:
-        """Whether a better velocity changes the prediction: a model of commands alone does not look at it."""
-        card = self.model.card
-        return "velocity" in card.inputs
-
-    @property
     def signals_back_ns(self) -> int:
         """How far before a step the measured signals reach that the model reads; 0: it reads none."""
         return self._reader.back_ns
@@ -74,12 +68,11 @@ class LearnedMotion:
         forked._reader, forked.rejections = self._reader.fork(events), Counter()
         return forked
 
-    def measure(self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0) -> MotionMeasurement | None:
+    def measure(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """Predict the step.
 
         Args:
             step: its commands must reach ``model.card.history_s`` back for a start from nothing.
-            velocity: ``(2,)`` body velocity v [m/s], ω [rad/s] at the start, if known better than by the model itself.
             gyro_bias: to be taken out of the IMU's yaw rate [rad/s].
 
         Returns:
@@ -94,8 +87,7 @@ class LearnedMotion:
         if isinstance(signals, str):
             self._reject(f"learned.no_{signals}")
             return None
-        if velocity is None and self._reached == (step.segment, step.start_ns):
-            velocity = self._velocity
+        velocity = self._velocity if self._reached == (step.segment, step.start_ns) else None
         prediction = self.model.predict(step.controls, step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
@@ -104,11 +96,9 @@ class LearnedMotion:
         self._reached = (step.segment, step.stamp_ns)
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
-    def measure_scaled(
-        self, step: Step, velocity: FloatArray | None, gyro_bias: float = 0.0
-    ) -> MotionMeasurement | None:
+    def measure_scaled(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
         """As `measure`, for this robot: distances are ``motion.scale`` times the model's."""
-        m, scale = self.measure(step, velocity, gyro_bias), self._scale
+        m, scale = self.measure(step, gyro_bias), self._scale
         if m is None or scale == 1.0:
             return m
         return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
