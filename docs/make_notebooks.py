@@ -41,7 +41,7 @@ figure""",
     print(f"{setting.name:24} {setting.given:7.3f} -> {setting.found:7.3f} +- {setting.sigma:.1g}")""",
     "A pose at any time, and all files of a run:",
     """stamp = int(result.trajectory.stamps_ns[100]) + 50_000_000  # ns
-print(result.trajectory.interpolate(stamp))
+print(result.trajectory.interpolate(stamp).round(3))
 result.write(Path("first-run-out"))
 sorted(file.name for file in Path("first-run-out").iterdir())""",
 ]
