@@ -30,7 +30,7 @@ demo: .venv/.base
 	$(BIN)/fgloc demo
 
 follow: .venv/.sim
-	$(BIN)/fgloc sim follow-demo --out follow-out --jobs $(JOBS)
+	$(BIN)/fgloc sim follow-demo --out follow-out --workers $(JOBS)
 
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"

@@ -33,16 +33,6 @@ def decisions() -> str:
     return "\n".join(lines) + "\n"
 
 
-def on_config(config):
-    """The tutorial of one's own robot leads the others."""
-    own = "tutorial-own-robot.md"
-    if (DOCS / own).is_file():
-        next(p["Tutorials"] for p in config.nav if isinstance(p, dict) and "Tutorials" in p).insert(
-            0, {"A robot of one's own": own}
-        )
-    return config
-
-
 def on_files(files, config):
     """Add the pages that are generated."""
     for name, content in (("reference/cli.md", command_line()), ("decisions/index.md", decisions())):

@@ -38,10 +38,10 @@ figure.set_dpi(90)
 figure""",
     "What is the installation really? Given, found, and how well it is known:",
     """for setting in result.found.settings[:8]:
-    print(f"{setting.name:24} {setting.given:9.5f} -> {setting.found:9.5f} +- {setting.sigma:.2g}")""",
+    print(f"{setting.name:24} {setting.given:7.3f} -> {setting.found:7.3f} +- {setting.sigma:.1g}")""",
     "A pose at any time, and all files of a run:",
     """stamp = int(result.trajectory.stamps_ns[100]) + 50_000_000  # ns
-print(result.trajectory.interpolate(stamp))
+print(result.trajectory.interpolate(stamp).round(3))
 result.write(Path("first-run-out"))
 sorted(file.name for file in Path("first-run-out").iterdir())""",
 ]

@@ -53,6 +53,11 @@ def rotation_of(vector: Sequence[float] | FloatArray) -> FloatArray:
     return quaternion_matrix((k * x, k * y, k * z, math.cos(half)))
 
 
+def roll_pitch(rotation: FloatArray) -> tuple[float, float]:
+    """Fixed-axis roll and pitch [rad] of a rotation matrix ``(3, 3)``."""
+    return math.atan2(rotation[2, 1], rotation[2, 2]), -math.asin(min(max(rotation[2, 0], -1.0), 1.0))
+
+
 def rpy_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Quaternion x, y, z, w of fixed-axis roll, pitch, yaw [rad]."""
     cr, sr, cp, sp, cy, sy = (f(0.5 * a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))

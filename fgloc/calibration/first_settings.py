@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from fgloc.config import Config, Role
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.files import find_beside
@@ -15,6 +17,7 @@ from fgloc.sensors import registry
 from fgloc.sensors.first_settings import FirstLook, FirstSection
 from fgloc.types import Event
 
+_OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
     "command": "commanded velocities; learned motion reads them",
@@ -45,6 +48,7 @@ class RobotFile:
 @dataclass(frozen=True, slots=True)
 class _Seen:
     info: RecordingInfo
+    has_map: bool  # beside the bag
     frames: tuple[str, ...]
     sections: tuple[FirstSection, ...]
 
@@ -58,7 +62,7 @@ def first_settings(bag: Path) -> RobotFile:
     seen = _look(bag)
     missing: list[str] = [*seen.info.problems]
     lines = [
-        f"# Robot of {bag.name}. What is commented out has to be filled in or is the default.",
+        f"# Robot of {bag}. What is commented out has to be filled in or is the default.",
         "# All keys: docs/configuration.md. `fgloc info BAG --config robot.yaml` checks it.",
         *_recording(seen, missing),
     ]
@@ -87,9 +91,10 @@ def _look(bag: Path) -> _Seen:
 
     with Recording(bag, config.recording) as recording:
         info = inspect_recording(recording, config, watch)
-        look = FirstLook(info.roles, events, recording, find_beside(bag, "map.yaml") is not None)
+        has_map = find_beside(bag, "map.yaml") is not None
+        look = FirstLook(info.roles, events, recording, has_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
-        return _Seen(info, frames, tuple(of.section(look) for of in wanted))
+        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted))
 
 
 def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
@@ -106,12 +111,24 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         yield f"  base_frame: {seen.frames[0]}"
     else:
         yield "  # base_frame: base_link  # no usual name is in tf"
+    if other := _of_other_clocks(seen.info):
+        roles = ", ".join(other)
+        yield f"  received_stamps: [{roles}]  # their header stamps are of another clock"
+        missing.append(f"the header stamps of {roles} are of another clock: receive times are used, which jitter")
     if "truth" in seen.info.roles:
         yield ""
         yield "# The truth's frame: the map's (none), or another one (se2: fitted, for evaluation only)."
-        yield "truth: {align: none}"
+        yield f"truth: {{align: {'none' if seen.has_map else 'se2'}}}"
     else:
         missing.append(
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
             "errors in the reports"
         )
+
+
+def _of_other_clocks(info: RecordingInfo) -> tuple[Role, ...]:
+    """Roles whose stamps are further from the receive times than those of most; a topic without stamps counts as 0."""
+    delays = {role: t.delay_s or 0.0 for t in info.topics for role, name in info.roles.items() if name == t.name}
+    usual = float(np.median(list(delays.values()))) if delays else 0.0
+    found = tuple(role for role, delay in delays.items() if abs(delay - usual) > _OTHER_CLOCK_S)
+    return found if len(delays) > 2 else ()  # of two, either may be wrong

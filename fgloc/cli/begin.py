@@ -1,4 +1,4 @@
-"""``fgloc init``: the first step with a robot of one's own."""
+"""``fgloc init``: the first step with a new robot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def init(
     ] = Path("robot.yaml"),
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Write a commented robot.yaml from what a recording holds, and say what it does not tell."""
+    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning."""
     check_out(out, folder=False)
     if out.exists() and not force:
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
@@ -36,8 +36,10 @@ def init(
     for sentence in found.missing:
         warn(sentence)
     say(f"configuration: {out}")
-    beside = find_beside(bag, "map.yaml")
     next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
+    if not {"image", "sightings"} & found.roles.keys():
+        return  # nothing to survey, or to calibrate on
+    beside = find_beside(bag, "map.yaml")
     if beside is None:
         next_step(f"fgloc map {shown_path(bag)} --config {shown_path(out)} --out map.yaml", "survey the markers")
     else:

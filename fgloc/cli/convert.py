@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from fgloc.cli.terminal import group, say
+from fgloc.cli.terminal import group, next_step, say, shown_path
 from fgloc.files.atomic import check_out
 
-app = group("Convert a public data set to a standard bag with robot.yaml and, where landmarks were surveyed, map.yaml.")
+app = group("Convert public data sets to bags. Each gets a robot.yaml and, where landmarks were surveyed, a map.yaml.")
 
 Storage = Annotated[str, typer.Option("--storage", help="mcap or sqlite3")]
 Download = Annotated[
@@ -29,7 +29,7 @@ def mrclam(
     dataset: Annotated[int, typer.Option(min=1, max=9, help="which one to download")] = 6,
     fit: Annotated[bool, typer.Option("--fit", help="refit the leave-one-out constants and print them")] = False,
 ) -> None:
-    """UTIAS MRCLAM: five iRobot Creates that see each other and landmarks, with Vicon."""
+    """UTIAS MRCLAM: iRobot Creates and landmarks. Five robots that see each other; truth by Vicon."""
     from fgloc.datasets import mrclam as data
     from fgloc.datasets.mrclam_run import Calibration
 
@@ -37,7 +37,7 @@ def mrclam(
     if download is not None:
         source = data.download(download, dataset)
     if source is None:
-        raise typer.BadParameter("give the folder of the unpacked set, or --download FOLDER")
+        raise typer.BadParameter("give the folder of the unpacked set, or --download FOLDER", param_hint="SRC")
     if fit:
         from fgloc.datasets.mrclam_fit import left_out
 
@@ -54,6 +54,7 @@ def mrclam(
             f"{len(run.truth_ns)} true poses; left out: {run.robots_left_out} sightings of robots, "
             f"{run.unknown_left_out} of no known barcode"
         )
+    _tell_next(folder)
 
 
 @app.command()
@@ -64,7 +65,7 @@ def pioneer(
     download: Download = None,
     name: Annotated[str, typer.Option(help="which one to download: duarte or pinto1")] = "duarte",
 ) -> None:
-    """A Pioneer with ArUco markers and motion capture."""
+    """A Pioneer with ArUco markers. Truth by motion capture."""
     from fgloc.datasets.download import fetch
     from fgloc.datasets.pioneer import REMOTES
     from fgloc.datasets.pioneer import convert as converted
@@ -72,11 +73,12 @@ def pioneer(
     check_out(out)
     if download is not None:
         if name not in REMOTES:
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(REMOTES)}")
+            raise typer.BadParameter(f"{name!r} is not one of {', '.join(REMOTES)}", param_hint="--name")
         source = fetch(REMOTES[name], download)
     if source is None:
-        raise typer.BadParameter("give the bag, or --download FOLDER")
-    say(f"{converted(source, out, storage)} and {out / 'robot.yaml'} written")
+        raise typer.BadParameter("give the bag, or --download FOLDER", param_hint="BAG")
+    converted(source, out, storage)
+    _tell_written(out)
 
 
 @app.command()
@@ -97,17 +99,18 @@ def turtlebot3(
     from fgloc.datasets.turtlebot3 import convert_and_tell
 
     check_out(out)
-    source = _given_or_fetched(source, download, url, "the owner's address is not known; give it with --url")
+    unknown = "the set has no public address that we know; give one with --url"
+    source = _given_or_fetched(source, "BAG", download, url, unknown)
     if download is not None and source.suffix == ".zip":
         source = unpack(source, source.with_suffix(""))
         found = sorted(source.rglob("metadata.yaml"))
         source = found[0].parent if found else source
-    bag, dropped, notes = convert_and_tell(source, out, storage, landmarks)
-    say(f"{bag} and {out / 'robot.yaml'} written")
+    _, dropped, notes = convert_and_tell(source, out, storage, landmarks)
     for what, count in dropped.items():
-        say(f"left out, no definition: {count} of {what}")
+        say(f"left out: {count} messages of {what}: the definition of their type is not known")
     for note in notes:
-        say(note)
+        say(f"note: {note}")
+    _tell_written(out)
 
 
 @app.command()
@@ -120,24 +123,36 @@ def drive(
     download: Download = None,
     url: Url = None,
 ) -> None:
-    """DRIVE: a skid-steered Husky in windows of 2 s."""
+    """DRIVE: a skid-steered Husky. Windows of 2 s; truth by ICP."""
     from fgloc.datasets.drive import convert as converted
     from fgloc.datasets.drive import span
 
     check_out(out)
     unknown = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
-    source = _given_or_fetched(source, download, url, unknown)
-    say(f"{converted(source, out, storage, span(windows), span(calibration))} and {out / 'robot.yaml'} written")
+    source = _given_or_fetched(source, "CSV", download, url, unknown)
+    converted(source, out, storage, span(windows, "--windows"), span(calibration, "--calibration"))
+    _tell_written(out)
 
 
-def _given_or_fetched(source: Path | None, download: Path | None, url: str | None, unknown: str) -> Path:
-    """The recording that was given, or downloaded from an address; ``unknown``: why that has to be given."""
+def _given_or_fetched(source: Path | None, name: str, download: Path | None, url: str | None, unknown: str) -> Path:
+    """The recording that was given as the argument ``name``, or downloaded; ``unknown``: why it needs an address."""
     from fgloc.datasets.download import Remote, fetch
 
     if download is not None:
         if url is None:
-            raise typer.BadParameter(unknown)
+            raise typer.BadParameter(unknown, param_hint="--download")
         return fetch(Remote(url), download)
     if source is None:
-        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS")
+        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS", param_hint=name)
     return source
+
+
+def _tell_written(out: Path) -> None:
+    """The files of one converted recording, and what to do with them."""
+    names = [name for name in ("bag", "map.yaml", "robot.yaml", "windows.csv") if (out / name).exists()]
+    say(f"written to {out}: {', '.join(names)}")
+    _tell_next(out)
+
+
+def _tell_next(folder: Path) -> None:
+    next_step(f"fgloc smooth {shown_path(folder / 'bag')} --out {shown_path(folder / 'result')}", "localize with it")

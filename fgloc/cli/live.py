@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 _SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
 _STATUS_S = 0.5  # time between two changes of the status line
 
-DomainOption = Annotated[
-    int, typer.Option("--domain", metavar="N", envvar="ROS_DOMAIN_ID", help="DDS domain; default: 0")
-]
+DomainOption = Annotated[int, typer.Option("--domain", metavar="N", envvar="ROS_DOMAIN_ID", help="DDS domain")]
 NetworkOption = Annotated[
     bool,
     typer.Option("--network", help="on the machine's networks (or as CYCLONEDDS_URI has it), not on loopback only"),
@@ -39,9 +37,11 @@ NetworkOption = Annotated[
 
 def live(
     map_file: Annotated[
-        Path | None, typer.Option("--map", metavar="MAP", help="marker map; without one landmarks are estimated")
+        Path | None, typer.Option("--map", metavar="MAP.yaml", help="landmarks; without a map they are estimated")
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", metavar="C", help="configuration; default: none")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="ROBOT.yaml", help="configuration; default: none")
+    ] = None,
     model: ModelOption = None,
     domain: DomainOption = 0,
     network: NetworkOption = False,
@@ -49,11 +49,14 @@ def live(
         str | None, typer.Option("--initial-pose", metavar="X,Y,YAW", help="first pose in m and rad; also /initialpose")
     ] = None,
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="kept up to date, and gone on from at the start")
+        Path | None,
+        typer.Option(
+            "--state", metavar="FILE", help="state of the run: written every second, and resumed from at the start"
+        ),
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
 ) -> None:
-    """Localise a robot on ROS 2's wire, without ROS; Ctrl-C ends with a summary."""
+    """Localize a robot on ROS 2's wire. ROS need not be installed; Ctrl-C ends with a summary."""
     need("live", "fgloc live")
     if view:
         need("view", "fgloc live --view")
@@ -89,7 +92,7 @@ def play(
     domain: DomainOption = 0,
     network: NetworkOption = False,
 ) -> None:
-    """Publish a recording on ROS 2's wire with its recorded timing, and /clock."""
+    """Publish a recording on ROS 2's wire. It has its recorded timing; /clock is published too."""
     need("live", "fgloc play")
     from fgloc.live.wire.participant import Participant
     from fgloc.live.wire.play import Player

@@ -20,17 +20,18 @@ Out = Annotated[
     Path, typer.Option("--out", metavar="DIR", file_okay=False, help="folder for the results; made if missing")
 ]
 MapOption = Annotated[
-    Path | None, typer.Option("--map", metavar="MAP", help="marker map; default: map.yaml beside the bag, else none")
+    Path | None,
+    typer.Option("--map", metavar="MAP.yaml", help="landmarks; default: map.yaml beside the bag, else none"),
 ]
 ModelOption = Annotated[
     Path | None,
     typer.Option(
-        "--model", metavar="M", help="learned motion: a .safetensors, or shipped:NAME; default: the configuration's"
+        "--model", metavar="MODEL", help="learned motion: a .safetensors, or shipped:NAME; default: the configuration's"
     ),
 ]
 ConfigOption = Annotated[
     Path | None,
-    typer.Option("--config", metavar="C", help="configuration; default: robot.yaml beside the bag, else none"),
+    typer.Option("--config", metavar="ROBOT.yaml", help="configuration; default: robot.yaml beside the bag, else none"),
 ]
 RrdOption = Annotated[
     Path | None, typer.Option("--rrd", metavar="FILE", dir_okay=False, help="also write the run for rerun's viewer")

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from fgloc.replay.options import Progress
 
 LINE_S = 10.0  # between two lines on a pipe; shorter work says nothing
+_RATE_S = 1.0  # work has to have gone on for this long before a rate, and so the time left, can be told
 
 
 @contextmanager
@@ -65,7 +66,7 @@ class Lines:
             return
         now = self._clock()
         began, before = self._began.setdefault(of.label, (now, of.done))
-        if now - self._last < LINE_S or now == began or of.done == of.total:
+        if now - self._last < LINE_S or now - began < _RATE_S or of.done == of.total:
             return
         self._last = now
         self._write(_line(of, now - began, before))

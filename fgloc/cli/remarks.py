@@ -15,6 +15,7 @@ _MOST_NEES = 3.0  # NEES/3: errors of √3 = 1.7 times what the covariance says;
 _MOST_DROPPED = 0.2  # share of a sensor's messages
 _FEWEST = 20  # dropped ones
 _GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees")
+_SIGMAS = {"camera": "position_sigma_m", "landmarks": "range_scale_sigma", "wheels": "scale_sigma"}  # by section
 _SETTINGS = {  # of a sensor whose messages are dropped
     "odometry": "gate.max_speed, gate.max_yaw_rate or recording.received_stamps",
     "joints": "gate.max_wheel_rate or recording.received_stamps",
@@ -48,8 +49,8 @@ def _warnings(result: RunResult, metrics: Metrics) -> Iterator[str]:
     if nees is not None and nees > _MOST_NEES:
         yield (
             f"NEES/3 is {nees:.1f}, expected about 1: the errors are {nees**0.5:.1f} times what the covariance says. "
-            "Something is off by more than its sigma: see what looks wrong in the report, and raise "
-            "map.position_sigma_m, camera.position_sigma_m or wheels.scale_sigma to what your installation really is"
+            "Something is off by more than its sigma: see what the report judged wrong, and raise "
+            f"{_prior_sigmas(result)} to what your installation really is"
         )
     dropped: Counter[str] = Counter()
     for reason, count in metrics.rejections.items():
@@ -62,6 +63,14 @@ def _warnings(result: RunResult, metrics: Metrics) -> Iterator[str]:
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
             reasons = ", ".join(f"{r} {n}" for r, n in metrics.rejections.items() if r.startswith(f"{sensor}."))
             yield f"{count} messages of {sensor} were dropped ({reasons}); look at {_SETTINGS[sensor]}"
+
+
+def _prior_sigmas(result: RunResult) -> str:
+    """The settings that say how far off this run's installation may be."""
+    found = [] if result.found is None else [s.name for s in result.found.settings]
+    names = [f"{section}.{key}" for section, key in _SIGMAS.items() if any(n.startswith(f"{section}.") for n in found)]
+    names = ["map.position_sigma_m"] * (result.found is not None and result.found.landmarks is not None) + names
+    return " or ".join(names or ["wheels.scale_sigma"])
 
 
 def _setting_names() -> re.Pattern[str]:

@@ -66,13 +66,13 @@ def demo(
         "demo-out"
     ),
 ) -> None:
-    """Smooth the bundled recording and replay it online; say where the reports are."""
+    """Run the bundled recording, batch and online. Says where the reports are."""
     runs: list[tuple[str, Metrics]] = []
     code = 0
     for mode, command in (("batch", "smooth"), ("online", "online")):
         folder = out / mode
         text = shlex.join(["fgloc", command, str(SAMPLE), "--out", str(folder)])
-        result = _localise(
+        result = _localize(
             SAMPLE, None, configured(SAMPLE, None, None), folder, "batch" if mode == "batch" else "online"
         )
         runs.append((mode, _write(result, SAMPLE, folder, text)))
@@ -98,7 +98,7 @@ def smooth(
     mcap: McapOption = None,
     figures: FiguresOption = None,
 ) -> None:
-    """Estimate the trajectory from the whole recording at once; several bags get a folder each in DIR."""
+    """Estimate the trajectory of a whole recording. Several bags get a folder each in DIR."""
     if len(bags) > 1:
         if rrd is not None or mcap is not None or figures:
             raise ConfigError("--rrd, --mcap, --figures: expected one bag; give each its own command")
@@ -106,7 +106,7 @@ def smooth(
         return
     (bag,) = bags
     forms = figure_formats(figures)
-    result = _localise(bag, map_file, configured(bag, config, model), out, "batch")
+    result = _localize(bag, map_file, configured(bag, config, model), out, "batch")
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
@@ -121,10 +121,10 @@ def online(
     mcap: McapOption = None,
     figures: FiguresOption = None,
 ) -> None:
-    """Replay the recording as on a live robot; each pose depends only on what came before."""
+    """Replay a recording as on a live robot. Each pose depends only on what came before."""
     forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
-    result = _localise(bag, map_file, configured(bag, config, model), out, "online", pace)
+    result = _localize(bag, map_file, configured(bag, config, model), out, "online", pace)
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
@@ -136,7 +136,7 @@ def calibrate(
     map_file: MapOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Find the installation: gains of wheels or commands, camera, clocks, from what the recordings saw of a map."""
+    """Calibrate wheels, camera and clocks. Recordings on a known map, or with landmarks seen again, tell them."""
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
@@ -154,7 +154,7 @@ def calibrate(
     next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")
 
 
-def _localise(
+def _localize(
     bag: Path,
     map_file: Path | None,
     config: Config,
@@ -162,7 +162,7 @@ def _localise(
     mode: Literal["batch", "online"],
     pace: float | None = None,
 ) -> RunResult:
-    """Run one recording, once it is certain that the results can be written."""
+    """Run a recording, once it is certain that the results can be written."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
     from fgloc.recording.files import find_beside
     from fgloc.runner import run
@@ -194,6 +194,7 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
+    rows += [(name, str(path)) for name, path in (("MCAP", mcap), ("rerun", rrd)) if path is not None]
     found = remarks(result, metrics)
     for remark in found:
         if remark.kind != "note":

@@ -8,11 +8,10 @@ from typing import Annotated
 import typer
 
 from fgloc.cli.extras import need
-from fgloc.cli.terminal import group, kept_on_interrupt, say
-from fgloc.errors import ConfigError
+from fgloc.cli.terminal import group, kept_on_interrupt, next_step, say, shown_path
 from fgloc.files.atomic import check_out
 
-app = group("Record wheeled robots in a physical simulator (MuJoCo), with known truth.")
+app = group("Simulate robots, with known truth. The physics is MuJoCo's.")
 
 ScenarioArgument = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="of the bundled suite by name, or a YAML file")
@@ -24,7 +23,7 @@ Corners = Annotated[
 
 @app.callback()
 def needed() -> None:
-    """Record wheeled robots in a physical simulator (MuJoCo), with known truth."""
+    """Simulate robots, with known truth. The physics is MuJoCo's."""
     need("sim", "fgloc sim")
 
 
@@ -43,10 +42,10 @@ def record(
     perfect: Annotated[
         bool, typer.Option("--perfect", help="all is as written, whatever the scenario installs")
     ] = False,
-    jobs_: Annotated[int, typer.Option("--jobs", min=1, help="processes, for a suite")] = 1,
-    longest: Annotated[float | None, typer.Option(metavar="S", min=0.5, help="cut runs to this length")] = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="processes, for a suite")] = 1,
+    longest: Annotated[float | None, typer.Option(metavar="S", min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
-    """Record one run of a scenario, or all that is missing of a suite."""
+    """Record a scenario, or a suite of them. Of a suite only what is missing is recorded."""
     from fgloc.datasets.sim.record import record as record_run
     from fgloc.datasets.sim.suite import BUNDLED, find_scenario, jobs, load_suite, record_suite
 
@@ -57,14 +56,16 @@ def record(
     todo = jobs(suite, longest)
     if (from_file and todo) or what == "suite":
         with kept_on_interrupt(f"the recordings that are finished stay in {out}; the same command records the others"):
-            count = record_suite(todo, out, camera, jobs_)
+            count = record_suite(todo, out, camera, workers)
         say(f"{count} recorded, {len(todo) - count} were there: {out}")
         return
     scenario = find_scenario(what)
     scenario = scenario.model_copy(update={"installation": None}) if perfect else scenario
     if longest is not None:
         scenario = scenario.model_copy(update={"duration_s": min(longest, scenario.duration_s)})
-    say(str(record_run(scenario, seed, out, camera)))
+    bag = record_run(scenario, seed, out, camera)
+    say(f"recorded: {bag}")
+    next_step(f"fgloc smooth {shown_path(bag)} --out {shown_path(out / 'result')}", "localize with it")
 
 
 @app.command(name="follow")
@@ -75,7 +76,11 @@ def follow_path(
         str, typer.Option(help="a bundled path by name (grid30, grid20, eight, slalom, tour, ramp), or a file")
     ],
     pose: Annotated[
-        str, typer.Option(help="what guides the robot: fgloc, truth, wheels, learned, fgloc-no-model and others")
+        str,
+        typer.Option(
+            help="what guides the robot: fgloc, fgloc-no-model, fgloc-no-model-no-gyro, fgloc-constant, wheels, "
+            "learned or truth"
+        ),
     ] = "fgloc",
     seed: Annotated[int, typer.Option(min=0)] = 1,
     failure: Annotated[
@@ -86,7 +91,7 @@ def follow_path(
     ] = None,
     corners: Corners = False,
 ) -> None:
-    """Let the robot drive itself along waypoints, guided by a pose that is estimated while it drives."""
+    """Let the robot drive itself along waypoints. Its guide is a pose that is estimated while it drives."""
     from fgloc.datasets.sim.following.failing import read_failures
     from fgloc.datasets.sim.following.figures import draw_drives, table
     from fgloc.datasets.sim.following.loop import Drive, follow, seen_by
@@ -97,7 +102,7 @@ def follow_path(
     check_out(out)
     known = {name: name for name in POSES}
     if pose not in known:
-        raise ConfigError(f"pose '{pose}' is not known; expected one of {', '.join(POSES)}")
+        raise typer.BadParameter(f"{pose!r} is not one of {', '.join(POSES)}", param_hint="--pose")
     drive = Drive(
         find_scenario(scenario), load_path(path), known[pose], seed, read_failures(failure or []),
         seen_by(corners),
@@ -110,15 +115,15 @@ def follow_path(
 @app.command()
 def follow_demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder of following.png and following.txt")],
-    jobs_: Annotated[int, typer.Option("--jobs", min=1, help="processes")] = 2,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="processes")] = 2,
     corners: Corners = False,
 ) -> None:
-    """Six drives: flat, on ice, with sensors that fail; a picture and a table."""
+    """Six drives, with a picture and a table. Flat, on ice, with sensors that fail."""
     from fgloc.datasets.sim.following.demo import PICTURE, demonstrate
     from fgloc.datasets.sim.following.loop import seen_by
 
     check_out(out)
-    say(demonstrate(out, jobs_, seen_by(corners)))
+    say(demonstrate(out, workers, seen_by(corners)))
     say(f"\n{out / PICTURE}")
 
 
@@ -127,7 +132,7 @@ def figures(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the pictures")],
 ) -> None:
-    """Draw a run: trajectory, controls, slip and, if it has images, a contact sheet with detections."""
+    """Draw a recorded run. Trajectory, controls, slip and, if it has images, a contact sheet with detections."""
     from fgloc.datasets.sim.figures import draw
 
     check_out(out)

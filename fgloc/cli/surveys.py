@@ -24,14 +24,16 @@ def make_map(
     bags: Bags,
     out: Annotated[Path, typer.Option("--out", metavar="MAP.yaml", dir_okay=False, help="map file to be written")],
     dictionary: Annotated[
-        str | None, typer.Option("--dictionary", metavar="D", help="of the markers in images, such as DICT_4X4_50")
+        str | None, typer.Option("--dictionary", metavar="NAME", help="of the markers in images, such as DICT_4X4_50")
     ] = None,
     size: Annotated[
         float | None, typer.Option("--size", metavar="M", help="side of the markers' black square in metres")
     ] = None,
     anchor: Annotated[
         Path | None,
-        typer.Option("--anchor", metavar="MAP", help="markers that are known: they make the frame, and are refined"),
+        typer.Option(
+            "--anchor", metavar="MAP.yaml", help="markers that are known: they make the frame, and are refined"
+        ),
     ] = None,
     distance: Annotated[
         list[str] | None,
@@ -40,7 +42,7 @@ def make_map(
     model: ModelOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Survey the landmarks of recordings; without --anchor the first pose is the map's origin.
+    """Survey the landmarks of recordings. Without --anchor the first pose is the map's origin.
 
     Markers in images (or their corners) are surveyed in position and orientation, from one or several recordings.
     """
@@ -59,7 +61,7 @@ def make_map(
                 f"{bags[0]}: no images and no corners of markers; from other sightings only one recording is surveyed, "
                 "without --anchor and --distance"
             )
-        _of_points(bags[0], out, settings)
+        _of_points(bags[0], out, settings, config)
         return
     distances = [_distance(text) for text in distance or ()]
     with run_bar("map") as progress:
@@ -78,17 +80,18 @@ def _tell_next(bags: list[Path], out: Path, config: Path | None) -> None:
     )
 
 
-def _of_points(bag: Path, out: Path, settings: Config) -> None:
-    """A map of points, from ranges and bearings or marker poses."""
+def _of_points(bag: Path, out: Path, settings: Config, config: Path | None) -> None:
+    """A map of points, from ranges and bearings or marker poses; ``config``: the file that was given."""
     from fgloc.runner import run
     from fgloc.sensors.maps import write_map
 
-    with run_bar(bag.name) as progress:
+    with run_bar("map") as progress:
         result = run(bag, None, settings, "batch", progress)
     if result.landmarks is None or not len(result.landmarks):
         raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
     write_map(result.landmarks, out)
     say(f"{len(result.landmarks)} landmarks in {out}")
+    _tell_next([bag], out, config)
     exit_unless_trusted(result)
 
 

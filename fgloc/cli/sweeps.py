@@ -19,13 +19,15 @@ if TYPE_CHECKING:
 
 
 def ablate(
-    suite: Annotated[Path, typer.Argument(metavar="SUITE.yaml", help="see ablations/")],
+    suite: Annotated[
+        Path, typer.Argument(metavar="SUITE.yaml", help="recordings, failures and variants (docs/ablation.md)")
+    ],
     out: Out,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
 ) -> None:
-    """Tell what the failure of each sensor costs; a killed sweep goes on where it was."""
+    """Tell what the failure of each sensor costs. The same command goes on with a killed sweep."""
     from fgloc.ablation.jobs import make_jobs
     from fgloc.ablation.records import only_sweep
     from fgloc.ablation.report import failed, write_report

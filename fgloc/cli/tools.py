@@ -20,7 +20,7 @@ class Align(StrEnum):
 
 
 def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
-    """Tell what a recording holds: topics, rates, gaps, what would be used, what looks wrong, also with the map."""
+    """Tell what a recording holds. Topics, rates, gaps, what a run would use, what looks wrong (also with the map)."""
     from fgloc.diagnosis.gross_mistakes import inspect_all
     from fgloc.recording.files import find_beside
     from fgloc.recording.info import format_info
@@ -30,8 +30,8 @@ def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> N
 
 
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(metavar="EST.tum")],
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH.tum")],
+    estimate: Annotated[Path, typer.Argument(metavar="EST.tum", help="trajectory to be compared")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH.tum", help="reference trajectory")],
     align: Annotated[
         Align, typer.Option(help="se2: the best rigid motion between the two, without scale")
     ] = Align.NONE,

@@ -18,7 +18,12 @@ def train(
     inputs: Annotated[
         list[Path], typer.Argument(metavar="CONFIG | BAG...", help="training configuration; with --init: recordings")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the models; with --init: CONFIG")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", help="folder for the models; with --init: the configuration to be written"
+        ),
+    ],
     data: Annotated[
         Path | None,
         typer.Option(
@@ -30,14 +35,14 @@ def train(
         typer.Option(
             "--from",
             metavar="MODEL",
-            help="adapt this model to the robot of the split's training recordings, a minute of which will do",
+            help="adapt this model to the robot of the training recordings; a minute of driving is enough",
         ),
     ] = None,
     init: Annotated[
         bool, typer.Option("--init", help="write a training configuration of these bags, split by recording")
     ] = False,
 ) -> None:
-    """Identify a robot: train a model of its motion, calibrate it, judge it. A killed training goes on."""
+    """Train a motion model of a robot. It is calibrated and judged; the same command goes on with a killed training."""
     if init:
         _write_config(inputs, out)
         return
@@ -72,7 +77,7 @@ def evaluate_model(
         list[Path] | None, typer.Option("--against", metavar="MODEL", help="another model, for comparison; repeatable")
     ] = None,
 ) -> None:
-    """Let a model predict whole recordings without sightings, and compare with the truth."""
+    """Compare a motion model with the truth. It predicts whole recordings, without sightings."""
     for path, folder in ((json_file, False), (plots, True)):
         if path is not None:
             check_out(path, folder)

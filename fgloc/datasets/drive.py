@@ -207,11 +207,15 @@ def _list_windows(table: dict[str, FloatArray], stamps: IntArray) -> str:
     return text.getvalue()
 
 
-def span(text: str | None) -> range | None:
-    """Numbers of ``a-b``, both included, or of one number alone."""
+def span(text: str | None, option: str) -> range | None:
+    """Numbers of ``a-b``, both included, or of one number alone, as an option of the command line gives them.
+
+    Raises:
+        ConfigError: it is neither.
+    """
     if text is None:
         return None
     first, _, last = text.partition("-")
     if not (first.isdigit() and (last or first).isdigit()):
-        raise ConfigError(f"{text!r}: expected a span such as 0-399")
+        raise ConfigError(f"{option} {text}: expected a number, or a span such as 0-399")
     return range(int(first), int(last or first) + 1)

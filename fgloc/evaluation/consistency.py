@@ -6,12 +6,10 @@ Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fgloc.errors import CovarianceError
 from fgloc.stats import chi2_bound
-
-FloatArray = NDArray[np.float64]
+from fgloc.types import FloatArray
 
 
 def nees(errors: FloatArray, covs: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc.evaluation.error_scale import ErrorScale
 from fgloc.evaluation.matching import Matched
-from fgloc.evaluation.style import BLUE, MODE_LOOKS, mode_runs, seconds
+from fgloc.evaluation.style import BLUE, MODE_LOOKS, after_gaps, mode_runs, seconds
 from fgloc.evaluation.time_axis import TimeAxis
 from fgloc.evaluation.trajectory_plot import relocated, stands
 from fgloc.types import Decision, FloatArray, IntArray, Landmark, RunResult
@@ -26,7 +26,9 @@ def interactive(result: RunResult, matched: Matched | None) -> dict[str, Any]:
     kept = _thinned(len(trajectory))
     times = seconds(result, trajectory.stamps_ns)
     modes = [result.modes[k] for k in kept]
-    breaks = np.searchsorted(kept, relocated(result))  # no line leads to these
+    breaks = np.searchsorted(
+        kept, np.union1d(relocated(result), after_gaps(trajectory.stamps_ns))
+    )  # no line leads there
     sigma = None
     if trajectory.covs is not None:
         covs = trajectory.covs[kept]
@@ -66,17 +68,22 @@ def _rounded(values: FloatArray, digits: int) -> list[float | None]:
 
 
 def _truth(matched: Matched) -> Mapping[str, Any]:
-    kept = _thinned(len(matched.truth))
-    return {"x": _rounded(matched.truth[kept, 0], 4), "y": _rounded(matched.truth[kept, 1], 4)}
+    x, y = _thinned_columns(matched, matched.truth[:, :2])
+    return {"x": _rounded(x, 4), "y": _rounded(y, 4)}
 
 
 def _errors(result: RunResult, matched: Matched, axis: TimeAxis) -> Mapping[str, Any]:
-    kept = _thinned(len(matched.stamps_ns))
-    return {
-        "t": _rounded(axis.place(seconds(result, matched.stamps_ns[kept])), 3),
-        "position_mm": _rounded(1e3 * matched.distances[kept], 2),
-        "yaw_deg": _rounded(_DEGREES * np.abs(matched.errors[kept, 2]), 4),
-    }
+    times = axis.place(seconds(result, matched.stamps_ns))
+    yaws = _DEGREES * np.abs(matched.errors[:, 2])
+    t, position, yaw = _thinned_columns(matched, np.column_stack([times, 1e3 * matched.distances, yaws]))
+    return {"t": _rounded(t, 3), "position_mm": _rounded(position, 2), "yaw_deg": _rounded(yaw, 4)}
+
+
+def _thinned_columns(matched: Matched, rows: FloatArray) -> FloatArray:
+    """Columns of rows ``(n, m)``, some of the rows, with NaN where the truth was silent: no line leads across."""
+    kept = _thinned(len(rows))
+    gaps = np.searchsorted(kept, after_gaps(matched.stamps_ns))
+    return np.insert(rows[kept], np.unique(gaps[gaps < len(kept)]), np.nan, axis=0).T
 
 
 def _judged(d: Decision) -> bool:

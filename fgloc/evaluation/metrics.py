@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
@@ -21,10 +20,7 @@ from fgloc.config import Config
 from fgloc.evaluation.consistency import coverage, nees
 from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.evaluation.matching import FEWEST, Matched, match, matchable
-from fgloc.types import RunResult
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from fgloc.types import FloatArray, RunResult
 
 _Figure = TypeVar("_Figure")
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled

@@ -17,8 +17,8 @@ from fgloc.types import Mode, RunResult
 
 _MOST_ROWS = 60  # of the table of judgements
 _JUDGED = (
-    "Steps of steps.csv that say the same are one row; its column judgement has the number. Times are seconds from the "
-    "first pose. The statistic is the one that exceeds its threshold most."
+    "A row stands for steps of steps.csv that say the same; the file's column judgement has its number. Times are "
+    "seconds from the first pose. The statistic is the one that exceeds its threshold most."
 )
 _TIMELINE = (
     "Messages received; each motion source at the height of its weight, red where it was left out; the reasons; the "
@@ -96,7 +96,7 @@ def _captions(result: RunResult, compared: bool) -> Mapping[str, str]:
         "timeline": f"{_TIMELINE}{'; the true errors' if compared else ''}.",
         "installation": _INSTALLATION,
         "space": "The path in space; heights are drawn larger than they are.",
-        "height": "Height, pitch and roll over the way, with their 3σ bands.",
+        "height": "Height, pitch and roll over the distance travelled, with their 3σ bands.",
     }
 
 

@@ -19,9 +19,9 @@ from fgloc.recording.outputs import read_tum
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, Trajectory
 
 _MOST_BYTES = 1 << 30  # of each file
-_REMEDY = "give the folder of a finished run"
+_REMEDY = "give the folder of a finished run (--out of fgloc smooth or fgloc online)"
 _MODES = {mode.value.lower(): mode for mode in Mode}
-_UPPER = np.triu_indices(3)
+_PLANAR = (0, 1, 5)  # of x, y, z, roll, pitch, yaw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,15 +60,16 @@ def read_results(folder: Path) -> Results:
 
     if not folder.is_dir():
         raise TrajectoryError(f"{folder}: no such folder; {_REMEDY}")
-    poses = read_tum(folder / "trajectory.tum")
-    covs = _read_covariances(folder / "covariance.csv", poses)
+    if not (folder / "trajectory.tum").is_file():
+        raise TrajectoryError(f"{folder}: no trajectory.tum in it; {_REMEDY}")
+    trajectory = _read_trajectory(folder)
     decisions = _read_steps(folder / "steps.csv")
     named = {d.stamp_ns: _MODES[d.reason] for d in decisions if d.kind == "mode" and d.reason in _MODES}
     map_file = folder / "map.yaml"
     return Results(
         folder=folder,
-        trajectory=Trajectory(poses.stamps_ns, poses.poses, covs),
-        modes=tuple(named.get(stamp, Mode.OK) for stamp in poses.stamps_ns.tolist()),
+        trajectory=trajectory,
+        modes=tuple(named.get(stamp, Mode.OK) for stamp in trajectory.stamps_ns.tolist()),
         decisions=decisions,
         metrics=_read_json(folder / "metrics.json"),
         provenance=_read_json(folder / "config.json"),
@@ -76,20 +77,32 @@ def read_results(folder: Path) -> Results:
     )
 
 
+def _read_trajectory(folder: Path) -> Trajectory:
+    """Poses and covariances, on uneven ground those in space too."""
+    poses = read_tum(folder / "trajectory.tum", ground=True)
+    covs = _read_covariances(folder / "covariance.csv", poses)
+    if covs.shape[1] == 3:
+        return Trajectory(poses.stamps_ns, poses.poses, covs)
+    planar = covs[:, _PLANAR][:, :, _PLANAR]
+    return Trajectory(poses.stamps_ns, poses.poses, planar, poses.ground, covs)
+
+
 def _read_covariances(path: Path, poses: Trajectory) -> FloatArray:
-    """Covariances ``(n, 3, 3)``, whose stamps must be those of the poses."""
+    """Covariances ``(n, 3, 3)``, on uneven ground ``(n, 6, 6)``, whose stamps must be those of the poses."""
     rows = _rows(path)
     if len(rows) != len(poses):
         raise TrajectoryError(f"{path}: {len(rows)} rows, expected {len(poses)}, as many as there are poses; {_REMEDY}")
-    covs = np.zeros((len(rows), 3, 3))
+    size = 6 if rows and "roll roll" in rows[0] else 3
+    upper = np.triu_indices(size)
+    covs = np.zeros((len(rows), size, size))
     for i, (row, stamp) in enumerate(zip(rows, poses.stamps_ns.tolist(), strict=True)):
         where = f"{path}, line {i + 2}"
         if _stamp(row.get("stamp"), where) != stamp:
             raise TrajectoryError(f"{where}: stamp {row.get('stamp')} is not that of the pose; {_REMEDY}")
         values = [_number(value, where) for key, value in row.items() if key != "stamp"]
-        if len(values) != 6 or not np.isfinite(values).all():
-            raise TrajectoryError(f"{where}: expected six finite numbers after the stamp; {_REMEDY}")
-        covs[i][_UPPER] = values
+        if len(values) != len(upper[0]) or not np.isfinite(values).all():
+            raise TrajectoryError(f"{where}: expected {len(upper[0])} finite numbers after the stamp; {_REMEDY}")
+        covs[i][upper] = values
         covs[i] += np.triu(covs[i], 1).T
     return covs
 

@@ -68,10 +68,14 @@ def seconds(result: RunResult, stamps_ns: NDArray[np.int64] | Sequence[int]) -> 
     return np.asarray((np.asarray(stamps_ns, dtype=np.int64) - result.trajectory.stamps_ns[0]) * 1e-9)
 
 
+def after_gaps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices of the stamps ``(n,)`` before which there is a longer silence."""
+    return np.flatnonzero(np.diff(stamps_ns) > GAP_S * 1e9) + 1
+
+
 def broken(stamps_ns: NDArray[np.int64], columns: FloatArray) -> FloatArray:
     """Rows with a NaN row in each silence, so that no line is drawn across it."""
-    gaps = np.flatnonzero(np.diff(stamps_ns) > GAP_S * 1e9) + 1
-    return np.insert(columns, gaps, np.nan, axis=0)
+    return np.insert(columns, after_gaps(stamps_ns), np.nan, axis=0)
 
 
 def mode_runs(result: RunResult, mode: Mode) -> list[tuple[int, int]]:

@@ -20,7 +20,6 @@ from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.style import (
     BLUE,
     DPI,
-    GAP_S,
     GREEN,
     MODE_LOOKS,
     NORMAL,
@@ -29,6 +28,7 @@ from fgloc.evaluation.style import (
     SMALL,
     TEXT,
     WIDTH,
+    after_gaps,
     broken,
     legend,
     mode_runs,
@@ -93,8 +93,7 @@ def _draw_way(axes: Axes, result: RunResult, matched: Matched | None, extent: fl
     if estimate.covs is not None:
         handles += _draw_ellipses(axes, estimate, extent)
     jumps = relocated(result)
-    gaps = np.flatnonzero(np.diff(estimate.stamps_ns) > GAP_S * 1e9) + 1
-    xy = np.insert(estimate.poses[:, :2], np.union1d(gaps, jumps), np.nan, axis=0)
+    xy = np.insert(estimate.poses[:, :2], np.union1d(after_gaps(estimate.stamps_ns), jumps), np.nan, axis=0)
     if len(jumps):
         parts = [estimate.poses[k - 1 : k + 1, :2] for k in jumps]
         axes.add_collection(LineCollection(parts, colors=RED, linewidths=1.0, linestyles=":", zorder=3))
@@ -115,6 +114,11 @@ def _draw_way(axes: Axes, result: RunResult, matched: Matched | None, extent: fl
         axes.plot(*estimate.poses[index, :2], zorder=5, **look)
         handles.append(Line2D([], [], label=label, **look))
     return handles
+
+
+def travelled(poses: FloatArray) -> FloatArray:
+    """Distance travelled ``(n,)`` [m] at each of the poses ``(n, 3)``."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
 def relocated(result: RunResult) -> IntArray:
@@ -165,9 +169,9 @@ def _direction(poses: FloatArray, k: int, shortest: float) -> float | None:
 def _draw_ellipses(axes: Axes, estimate: Trajectory, extent: float) -> list[Artist]:
     """3σ ellipses, spread evenly over the distance travelled; large ones as outlines, and only some of them."""
     assert estimate.covs is not None
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(estimate.poses[:, :2], axis=0).T))])
-    spacing = max(0.04 * extent, travelled[-1] / _MAX_ELLIPSES, 1e-6)
-    chosen = np.unique(np.searchsorted(travelled, np.arange(0.0, travelled[-1] + spacing, spacing)))
+    way = travelled(estimate.poses)
+    spacing = max(0.04 * extent, way[-1] / _MAX_ELLIPSES, 1e-6)
+    chosen = np.unique(np.searchsorted(way, np.arange(0.0, way[-1] + spacing, spacing)))
     chosen = chosen[chosen < len(estimate)]
     values, _ = np.linalg.eigh(estimate.covs[chosen, :2, :2])
     sizes = 6.0 * np.sqrt(np.maximum(values[:, 1], 0.0))  # full axes: twice 3σ

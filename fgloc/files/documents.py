@@ -271,18 +271,21 @@ def read_text(path: Path, error: type[FglocError], remedy: str, max_bytes: int =
         raise error(f"{path}: not a text file: {cause}") from cause
 
 
-def read_document(path: Path, error: type[FglocError], max_bytes: int = _MAX_BYTES) -> Item:
+def read_document(
+    path: Path, error: type[FglocError], max_bytes: int = _MAX_BYTES, remedy: str = "give a YAML or JSON file"
+) -> Item:
     """Read a YAML or JSON file.
 
     Args:
         path: the file.
         error: what to raise, here and in the items' methods.
         max_bytes: a larger file is refused.
+        remedy: what to do about a file that cannot be read.
 
     Raises:
         FglocError: of the given type; the file is missing, no regular file, too large, empty, not YAML, or hostile.
     """
-    text = read_text(path, error, "give a YAML or JSON file", max_bytes)
+    text = read_text(path, error, remedy, max_bytes)
     try:
         node = parse(text, str(path))
     except yaml.YAMLError as cause:

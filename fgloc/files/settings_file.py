@@ -33,11 +33,11 @@ class Settings:
         self._item: Item | None = None
         self.content: dict[str, Any] = {}
         try:
-            self._item = read_document(path, ConfigError, MAX_BYTES)
+            self._item = read_document(path, ConfigError, MAX_BYTES, remedy)
         except ConfigError as error:
             if "the file is empty" in str(error):
                 return
-            raise ConfigError(f"{error}; {remedy}" if "cannot be read" in str(error) else str(error)) from error
+            raise
         try:
             content = plain(self._item.node)
         except yaml.MarkedYAMLError as error:
@@ -59,11 +59,10 @@ class Settings:
             return model.model_validate(self.content)
         except ValidationError as error:
             found = error.errors()
-            lines = [
-                f"  {self.path}:{self._line(e['loc'])}: {text}"
-                for e, text in zip(found, sentences(error, model), strict=False)
-            ]
-            raise ConfigError(f"{self.path}: {len(found)} wrong value(s)\n" + "\n".join(lines)) from error
+            told = sorted((self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False))
+            lines = [f"  {self.path}:{line}: {text}" for line, text in told]
+            count = "1 wrong value" if len(found) == 1 else f"{len(found)} wrong values"
+            raise ConfigError(f"{self.path}: {count}\n" + "\n".join(lines)) from error
 
     def _line(self, loc: Sequence[int | str]) -> int:
         """Line of a value, or of the innermost thing around it that there is."""

@@ -9,6 +9,7 @@ from fgloc.errors import RecordingError
 from fgloc.recording.metadata import BagMetadata, read_metadata
 
 _KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
+_MOST_NAMED = 5
 EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 
@@ -44,9 +45,9 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
         if file.is_file() and file.suffix in (".mcap", ".db3"):
             groups[file.suffix].append(file)
     if not groups:
-        bags = sorted(file.name for file in path.glob("*.bag"))
-        hint = f"; give one of its ROS 1 bags: {', '.join(bags)}" if bags else f"; {EXPECTED}"
-        raise RecordingError(f"{path}: a folder without .mcap or .db3{hint}")
+        inside = _recordings_in(path)
+        hint = f"give one of the recordings in it: {', '.join(inside)}" if inside else EXPECTED
+        raise RecordingError(f"{path}: a folder without .mcap or .db3; {hint}")
     if len(groups) > 1:
         names = ", ".join(file.name for files in groups.values() for file in files)
         raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
@@ -54,6 +55,12 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
     state = "damaged" if (path / "metadata.yaml").exists() else "missing"
     notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
     return None, tuple(files)
+
+
+def _recordings_in(folder: Path) -> list[str]:
+    """Names of ROS 1 bags and rosbag2 folders in a folder, the first ones."""
+    found = [*folder.glob("*.bag"), *(file.parent for file in folder.glob("*/metadata.yaml"))]
+    return sorted({str(path) for path in found})[:_MOST_NAMED]
 
 
 def kind_of(path: Path) -> str:

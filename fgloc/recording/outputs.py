@@ -16,7 +16,7 @@ import numpy as np
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
-from fgloc.frames import quaternion_yaw, rpy_matrix, rpy_quaternion
+from fgloc.frames import quaternion_matrix, quaternion_yaw, roll_pitch, rpy_matrix, rpy_quaternion
 from fgloc.types import Decision, Trajectory
 
 _NS = 1_000_000_000
@@ -85,8 +85,12 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
             file.write(" ".join(f"{number:.9e}" for number in numbers) + "\n")
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: Path, ground: bool = False) -> Trajectory:
     """Read a TUM trajectory, flattened to the plane. Stamps are exact to the nanosecond.
+
+    Args:
+        path: the file.
+        ground: keep height, roll and pitch too.
 
     Raises:
         TrajectoryError: the file is missing or empty, or a line has not eight finite numbers, a zero quaternion, or a
@@ -95,10 +99,11 @@ def read_tum(path: Path) -> Trajectory:
     lines = read_text(path, TrajectoryError, "give a TUM text file", max_bytes=1 << 30).splitlines()
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
+    heights: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        stamp, pose = _parse_tum_line(line, where=f"{path}, line {number}")
+        stamp, pose, height = _parse_tum_line(line, where=f"{path}, line {number}")
         if stamps and stamp <= stamps[-1]:
             raise TrajectoryError(
                 f"{path}, line {number}: stamp {line.split()[0]} does not come after {_seconds(stamps[-1])}; "
@@ -106,9 +111,11 @@ def read_tum(path: Path) -> Trajectory:
             )
         stamps.append(stamp)
         poses.append(pose)
+        heights.append(height)
     if not stamps:
         raise TrajectoryError(f"{path}: no pose in it; expected lines of t x y z qx qy qz qw")
-    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=float))
+    above = np.array(heights, dtype=float) if ground else None
+    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=float), ground=above)
 
 
 def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
@@ -229,7 +236,8 @@ def _seconds(stamp_ns: int) -> str:
     return f"{sign}{whole}.{rest:09d}"
 
 
-def _parse_tum_line(line: str, where: str) -> tuple[int, tuple[float, float, float]]:
+def _parse_tum_line(line: str, where: str) -> tuple[int, tuple[float, float, float], tuple[float, float, float]]:
+    """Stamp [ns]; x, y [m] and yaw [rad]; z [m], roll and pitch [rad]."""
     words = line.split()
     if len(words) != 8:
         raise TrajectoryError(f"{where}: {len(words)} values, expected the 8 of t x y z qx qy qz qw: {line.strip()!r}")
@@ -243,9 +251,10 @@ def _parse_tum_line(line: str, where: str) -> tuple[int, tuple[float, float, flo
     stamp = int((Decimal(words[0]) * _NS).to_integral_value())
     if abs(stamp) >= 2**63:
         raise TrajectoryError(f"{where}: stamp {words[0]} is out of range; expected seconds")
-    x, y = float(words[1]), float(words[2])
+    x, y, z = (float(word) for word in words[1:4])
     quaternion = np.array([float(word) for word in words[4:]])
     norm = float(np.linalg.norm(quaternion))
     if not 0.5 < norm < 2.0:
         raise TrajectoryError(f"{where}: quaternion {' '.join(words[4:])} has length {norm:.3g}, expected 1 (x y z w)")
-    return stamp, (x, y, quaternion_yaw(quaternion / norm))
+    quaternion /= norm
+    return stamp, (x, y, quaternion_yaw(quaternion)), (z, *roll_pitch(quaternion_matrix(quaternion)))

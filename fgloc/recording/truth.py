@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import TruthConfig
-from fgloc.frames import quaternion_matrix, quaternion_yaw, rpy_matrix
+from fgloc.frames import quaternion_matrix, quaternion_yaw, roll_pitch, rpy_matrix
 from fgloc.recording.reader import Recording
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
@@ -27,7 +26,7 @@ def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:
     """Height, roll and pitch ``(3,)`` of the base, from the pose of the body which the system tracks."""
     R = quaternion_matrix(event.orientation) @ rpy_matrix(0.0, 0.0, -config.yaw_offset_rad)
     height = float(event.position[2] - R[2, :2] @ np.asarray(config.offset_m))
-    roll, pitch = math.atan2(R[2, 1], R[2, 2]), -math.asin(min(max(R[2, 0], -1.0), 1.0))
+    roll, pitch = roll_pitch(R)
     return np.array([height, roll, pitch])
 
 

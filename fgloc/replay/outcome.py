@@ -48,7 +48,7 @@ class Outcome:
 
     def failed(self, why: str) -> str:
         """Message of a run that failed: what is wrong with the set-up, why it failed, what may be the cause."""
-        return " ".join([*self.mistakes, why, *self.hints, *self.untried])
+        return " ".join([*self.mistakes, sentence(why) if self.mistakes else why, *self.hints, *self.untried])
 
 
 def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[str], list[str]]:

@@ -183,4 +183,6 @@ def load_train_config(path: Path) -> TrainConfig:
     Raises:
         ConfigError: it cannot be read, or a key or value is wrong.
     """
-    return Settings(path, "give a training configuration").validated(TrainConfig)
+    return Settings(
+        path, "give a training configuration; fgloc train --init BAG... --out train.yaml writes one"
+    ).validated(TrainConfig)

@@ -101,9 +101,11 @@ def test_same_bag_twice_gives_the_same_bytes(bag, tmp_path):
 
 
 def test_without_truth_the_run_is_still_done(tmp_path):
-    code, stdout, _ = fgloc("smooth", write_circle(tmp_path, seconds=4.0, truth=False), "--out", tmp_path / "out")
+    seen = write_circle(tmp_path, seconds=4.0, truth=False)
+    code, stdout, _ = fgloc("smooth", seen, "--out", tmp_path / "out", "--mcap", tmp_path / "run.mcap")
     assert code == 0
     assert "ATE" not in stdout
+    assert stdout.splitlines()[-1].split() == ["MCAP", str(tmp_path / "run.mcap")]
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ate_mean_m"] is None
 
 
@@ -179,7 +181,9 @@ def test_real_time_replay_takes_the_recordings_time(tmp_path):
 def test_map_surveys_the_beacons(bag, tmp_path):
     code, stdout, _ = fgloc("map", bag, "--out", tmp_path / "map.yaml")
     assert code == 0
-    assert stdout == f"4 landmarks in {tmp_path / 'map.yaml'}\n"
+    told, following = stdout.splitlines()
+    assert told == f"4 landmarks in {tmp_path / 'map.yaml'}"
+    assert following.startswith(f"next: fgloc calibrate {bag} --map {tmp_path / 'map.yaml'} --out calibrated.yaml")
     landmarks = load_map(tmp_path / "map.yaml").landmarks
     for i in BEACONS:
         for j in BEACONS:

@@ -46,6 +46,12 @@ def test_short_help(command):
     assert "Usage: " in out
 
 
+def test_the_lists_of_commands_show_whole_sentences():
+    for group in ((), ("sim",), ("convert",)):
+        listed = fgloc(*group, "-h")[1].partition("Commands:")[2].strip().splitlines()
+        assert all(line.endswith(".") and not line.endswith("..") for line in listed), listed
+
+
 def test_completion_is_offered():
     assert "--install-completion" in fgloc("--help")[1]
 
@@ -89,6 +95,18 @@ def test_a_pipe_gets_a_line_every_ten_seconds_with_the_time_left():
         progress.end("batch")
     assert lines == ["batch: 20 of 60 s (33 %), 20 s left", "batch: 40 of 60 s (67 %), 10 s left"]
     assert LINE_S == 10.0
+
+
+def test_no_time_left_is_told_of_work_that_has_just_begun():
+    now, lines = [0.0], []
+    with progress.told_to(Lines(lines.append, lambda: now[0])):
+        now[0] = 12.0  # imports took long
+        progress.tell("batch", 0, 60.0, "s")
+        now[0] = 12.01
+        progress.tell("batch", 0.2, 60.0, "s")
+        now[0] = 14.0
+        progress.tell("batch", 20.0, 60.0, "s")
+    assert lines == ["batch: 20 of 60 s (33 %), 4 s left"]
 
 
 def test_the_time_left_of_resumed_work_is_of_what_was_done_now():
@@ -145,12 +163,15 @@ def test_the_gravest_remark_comes_first(bag):
     said = remarks(noted, worse)
     assert [r.kind for r in said] == ["mistake", "warning", "warning", "warning", "note", "note"]
     assert "errors are 3.0 times" in said[1].text
+    assert (
+        "raise map.position_sigma_m or landmarks.range_scale_sigma or wheels.scale_sigma" in said[1].text
+    )  # no camera
     assert "40 messages of image were dropped (image.dark 40)" in said[2].text
     assert "another frame" in said[3].text
     assert [r.text for r in said[4:]] == ["Set gate.max_speed.", "Nothing special."]
 
 
-# --- a robot of one's own ---------------------------------------------------------------------------------------------
+# --- a robot of your own ----------------------------------------------------------------------------------------------
 
 RADIUS, TRACK = 0.08, 0.4
 
@@ -188,13 +209,33 @@ def test_init_finds_topics_wheels_and_says_what_is_missing(tmp_path):
     assert config.wheels.track == pytest.approx(TRACK, rel=0.01)
     assert "warning: no truth" in err
     assert "nothing bounds the drift" in err
-    assert f"next: fgloc map {bag}" in out
+    assert f"next: fgloc info {bag}" in out
+    assert "next: fgloc map" not in out  # there is nothing to survey
     before = file.read_text()
     assert "# sightings:  # not found" in before
     code, _, err = fgloc("init", bag, "--out", file)
     assert (code, file.read_text()) == (1, before)
     assert "--force" in err
     assert fgloc("init", bag, "--out", file, "--force")[0] == 0
+
+
+def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path):
+    """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps."""
+    path, late = tmp_path / "run" / "bag", 14 * 86_400 * 10**9
+    with BagWriter(path) as bag:
+        for k in range(40):
+            stamp = START_NS + k * 50_000_000
+            bag.odometry("/odom", stamp - late, np.zeros(3), (0.0, 0.0), received_ns=stamp)
+            bag.range_bearing("/landmarks", stamp, [(0, 2.0, 0.0)])
+            bag.truth("/truth", stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    file = tmp_path / "robot.yaml"
+    code, out, err = fgloc("init", path, "--out", file)
+    config = load_config(file)
+    assert code == 0
+    assert config.recording.received_stamps == ("odometry",)
+    assert "the header stamps of odometry are of another clock" in err
+    assert config.truth.align == "se2"  # no map beside the bag: a survey begins at the first pose
+    assert f"next: fgloc map {path}" in out
 
 
 def test_a_training_configuration_is_split_by_recording(tmp_path):

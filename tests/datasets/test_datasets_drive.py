@@ -105,9 +105,9 @@ def test_selection_keeps_each_windows_time(tmp_path: Path) -> None:
 
 
 def testspans() -> None:
-    assert span("3-5") == range(3, 6)
-    assert span("7") == range(7, 8)
-    assert span(None) is None
+    assert span("3-5", "--windows") == range(3, 6)
+    assert span("7", "--windows") == range(7, 8)
+    assert span(None, "--windows") is None
 
 
 @pytest.mark.parametrize(

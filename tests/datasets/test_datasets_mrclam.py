@@ -150,10 +150,13 @@ def test_command_line(
 
     assert run(str(source), "--out", str(tmp_path / "all")) == 0
     assert sorted(p.name for p in (tmp_path / "all").iterdir()) == [f"robot{k}" for k in mrclam.ROBOTS]
-    assert "4 sightings of landmarks" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "4 sightings of landmarks" in said
+    assert f"next: fgloc smooth {tmp_path / 'all' / 'robot5' / 'bag'} --out {tmp_path / 'all' / 'robot5'}" in said
     assert run(str(tmp_path / "nowhere"), "--robot", "1", "--out", str(tmp_path / "x")) == 1
     assert "Robot1_Odometry.dat: cannot be read" in capsys.readouterr().err
     assert run("--out", str(tmp_path / "x")) == 2
+    assert "Invalid value for SRC: give the folder" in capsys.readouterr().err
 
 
 # --- constants ---

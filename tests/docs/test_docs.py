@@ -10,9 +10,11 @@ import sys
 import pytest
 from doc_blocks import PAGES, ROOT, blocks
 from schema_files import MODELS, schema
+from typer.main import get_command
 
 from fgloc.ablation.suite import load_suite
-from fgloc.config import Config, load_config
+from fgloc.cli import app
+from fgloc.config import Config, config_type, load_config
 from fgloc.sensors.maps import load_map
 
 SAMPLE = ROOT / "datasets" / "samples" / "installed_run"
@@ -168,3 +170,38 @@ def test_the_site_is_built_without_a_warning_and_asks_for_nothing(tmp_path):
     text = (tmp_path / "site" / "reference" / "cli.html").read_text("utf-8")
     assert "fgloc smooth" in text
     assert "<math" in (tmp_path / "site" / "concepts.html").read_text("utf-8")
+
+
+def options_of(command):
+    """Names of the commands below a command, and the options of each, by the words that lead to it."""
+    found = {(): {name for p in command.params for name in (*p.opts, *p.secondary_opts)} | {"--help", "-h"}}
+    for name, below in getattr(command, "commands", {}).items():
+        found |= {(name, *words): options for words, options in options_of(below).items()}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_every_option_that_a_page_names_is_one(page):
+    """In sentences, and of commands that are not run."""
+    known = options_of(get_command(app))
+    commands = re.findall(r"`fgloc ([^`]+)`", page.read_text(encoding="utf-8"))
+    for block in blocks(page):
+        commands += re.findall(r"\bfgloc ([^#|;&\n]+)", block.text) if block.language == "sh" else []
+    for text in commands:
+        words = text.split()
+        depth = next(n for n in (2, 1, 0) if tuple(words[:n]) in known)
+        named = {word.strip("[]'") for word in words if word.strip("[").startswith("--")}
+        assert named <= known[tuple(words[:depth])], f"{page.name}: fgloc {text}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "decisions"], ids=page_id)
+def test_every_setting_that_a_page_names_is_one(page):
+    """Decisions may name settings that are gone."""
+    known = config_type().model_json_schema()
+    sections = {
+        name: known["$defs"][part["$ref"].rpartition("/")[2]]["properties"] if "$ref" in part else {}
+        for name, part in known["properties"].items()
+    }
+    named = re.findall(r"`(\w+)\.([a-z]\w*)(?:\.\w+)*(?:: [^`]*)?`", page.read_text(encoding="utf-8"))
+    wrong = {(section, key) for section, key in named if key not in sections.get(section, {key: None})}
+    assert not {pair for pair in wrong if pair[1] not in ("py", "yaml", "growth")}, page  # files; a row of a benchmark

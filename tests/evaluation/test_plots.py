@@ -67,6 +67,13 @@ def test_every_picture_is_drawn(change):
         assert np.ptp(image[..., :3]) > 0.5
 
 
+def test_no_line_leads_across_a_silence_of_the_truth_in_the_plots_to_zoom():
+    result = figure_eight()  # the truth is silent in the middle third
+    zoomed = json.loads(script_data(interactive(result, match_result(result, CONFIG))))
+    for series in (*zoomed["errors"].values(), *zoomed["truth"].values()):
+        assert [k for k, value in enumerate(series) if value is None] == [100]
+
+
 def test_trajectory_axes_are_equal_and_show_everything():
     result = figure_eight()
     axes = plot_trajectory(result, match_result(result, CONFIG)).axes[0]

@@ -144,6 +144,35 @@ def test_a_damaged_folder_is_named(tmp_path, file, content, named):
         read_results(tmp_path)
 
 
+def test_a_run_on_uneven_ground_is_read_back_in_space(tmp_path):
+    """Its trajectory has height, roll and pitch, its covariances are 6 x 6; both go into the bag."""
+    flat = figure_eight(modes=MODES)
+    t = flat.trajectory
+    rng = np.random.default_rng(5)
+    n = len(t)
+    roots = rng.normal(0.0, 0.02, (n, 6, 6)) + 0.1 * np.eye(6)
+    spatial = roots @ roots.transpose(0, 2, 1)
+    ground = rng.uniform(-0.2, 0.2, (n, 3))
+    planar = spatial[:, (0, 1, 5)][:, :, (0, 1, 5)]
+    result = replace(flat, trajectory=Trajectory(t.stamps_ns, t.poses, planar, ground, spatial))
+    result.write(tmp_path / "out")
+    back = read_results(tmp_path / "out").trajectory
+    assert np.allclose(back.ground, ground, atol=1e-8)
+    assert np.allclose(back.poses, t.poses, atol=1e-8)
+    assert np.allclose(back.ground_covs, spatial, rtol=1e-8)
+    assert np.allclose(back.covs, planar, rtol=1e-8)
+    done = CliRunner().invoke(app, ["export", str(tmp_path / "out"), "--mcap", str(tmp_path / "run.mcap")])
+    assert done.exit_code == 0, done.output
+    (_, first), *_ = messages(tmp_path / "run.mcap")["/fgloc/pose"]
+    assert first.pose.pose.position.z == pytest.approx(ground[0, 0], abs=1e-8)
+    assert np.allclose(first.pose.covariance.reshape(6, 6), spatial[0], rtol=1e-8)
+
+
+def test_what_is_no_folder_of_a_run_is_named(tmp_path):
+    with pytest.raises(TrajectoryError, match=r"no trajectory\.tum in it; give the folder of a finished run"):
+        read_results(tmp_path)
+
+
 def test_the_command_exports_a_folder(tmp_path):
     figure_eight(modes=MODES).write(tmp_path / "out")
     arguments = ["export", str(tmp_path / "out"), "--mcap", str(tmp_path / "a.mcap"), "--kitti", str(tmp_path / "b")]

@@ -1,5 +1,6 @@
 """What a run must not keep to itself: ignored ids, a missing map, sightings dropped for their stamps, a lost robot."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.datasets.bag import BagWriter
 from fgloc.recording.reader import open_recording
+from fgloc.replay.outcome import Outcome
 from fgloc.runner import run
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.types import Mode
@@ -90,3 +92,11 @@ def test_fault_50_ids_outside_the_map_are_named_in_runs_with_images(tmp_path):
     assert [note for note in result.notes if "ids that are not in the map are ignored" in note and "49" in note]
     with open_recording(folder / "bag", config.recording) as recording:
         assert "image" in recording.roles
+
+
+def test_the_message_of_a_failed_run_is_in_sentences():
+    found = Outcome({}, Counter(), ("No marker is seen.",), ("Map and sightings contradict each other.",), (), ())
+    assert found.failed("the first pose was never found.") == (
+        "No marker is seen. The first pose was never found. Map and sightings contradict each other."
+    )
+    assert replace(found, mistakes=()).failed("the first pose was never found.").startswith("the first pose")

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fgloc.datasets.sim.floor import Humps, Patch, Ramp, RandomPatches, Rough
 from fgloc.datasets.sim.scenario import World
 from fgloc.datasets.sim.section import channel_rng
+from fgloc.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 FRICTION_CELL_M = 0.02
 HEIGHT_CELL_M = 0.04
 _LAYER = np.iinfo(np.uint8).max

@@ -55,7 +55,7 @@
       if (run.sigma) traces.push({ name: "3σ", showlegend: yaxis === "y", legendgroup: "s", x: run.poses.t, yaxis,
         y: run.sigma[key].map((s) => s === null ? null : +(3 * s).toPrecision(4)), mode: "lines", fill: "tozeroy",
         line: { color: colors.sky, width: 1 } });
-      if (run.errors) traces.push({ name: "distance from the truth", showlegend: yaxis === "y", legendgroup: "e",
+      if (run.errors) traces.push({ name: "error against the truth", showlegend: yaxis === "y", legendgroup: "e",
         x: run.errors.t, y: run.errors[key], yaxis, mode: "lines", line: { color: theme.ink, width: 1.5 } });
     }
     for (const [key, name, color, symbol] of [["accepted", "sighting accepted", theme.blue, "circle"],

@@ -12,7 +12,7 @@ from fgloc import se2
 from fgloc.live import LivePose
 from fgloc.types import FloatArray
 
-SPAN_S = 0.1  # the twist is the mean over this long: five messages
+SPAN_S = 0.125  # the twist is the mean over this long: three poses
 _AHEAD_NS = 50_000_000  # over which the last speed is held; 1 m/s² moves the pose by 2.5 mm from that in this time
 _LEAST_S = 0.03  # between two poses whose covariances tell how fast the covariance grows
 _LEAST_VARIANCE = 1e-8  # (m/s)², (rad/s)²: no motion is known better

@@ -12,9 +12,9 @@ from fgloc.types import FloatArray
 BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complexfloating]
 
-_ALONG = 12  # profiles on the part of an edge that belongs to a corner
+_ALONG = 12  # profiles on the part of an edge that is used for a corner
 _ACROSS = 11  # samples of a profile
-_MAX_LENGTH_PX = 24.0  # of that part: a lens bends longer ones
+_MAX_LENGTH_PX = 24.0  # of that part: a lens bends longer ones; a shorter edge belongs to both of its corners
 _MIN_SIDE_PX = 6.0
 _MAX_HALF_WIDTH_PX = 3.0
 _CELL_SHARE = 0.7  # of a cell that a profile reaches to either side
@@ -68,7 +68,7 @@ def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
     lengths = np.maximum(lengths, 1.0)
     unit = sides / lengths
     near = np.minimum(1.5, 0.1 * lengths)
-    reach = np.minimum(0.5 * lengths, _MAX_LENGTH_PX) - near
+    reach = np.minimum(lengths - 2.0 * near, _MAX_LENGTH_PX)
     half_width = np.minimum(np.maximum(_CELL_SHARE * lengths / cells, 1.0), _MAX_HALF_WIDTH_PX)
     outward = (half_width * (-1j * unit))[..., None]
     starts = np.stack([given + near * unit, following - near * unit], axis=2)
