@@ -87,7 +87,7 @@ without = run_with(config.model_copy(update={"motion": config.motion.model_copy(
     """figure = plot_error(with_model, match_result(with_model, config))
 figure.set_dpi(90)
 figure""",
-    "What was judged wrong, as the report has it:",
+    "The detected faults, as the report has them:",
     """for judgement in compute_metrics(with_model, config).judgements:
     print(f"{judgement.when:14} {judgement.what:45} {judgement.effect}")""",
 ]

@@ -15,7 +15,7 @@ _MOST_NEES = 3.0  # NEES/3: errors of √3 = 1.7 times what the covariance says;
 _MOST_DROPPED = 0.2  # share of a sensor's messages
 _FEWEST = 20  # dropped ones
 _GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees")
-_SIGMAS = {"camera": "position_sigma_m", "landmarks": "range_scale_sigma", "wheels": "scale_sigma"}  # by section
+_PRIOR = re.compile(r"(position|scale)_sigma")  # of a section's settings, the one that says most of its installation
 _SETTINGS = {  # of a sensor whose messages are dropped
     "odometry": "gate.max_speed, gate.max_yaw_rate or recording.received_stamps",
     "joints": "gate.max_wheel_rate or recording.received_stamps",
@@ -49,7 +49,7 @@ def _warnings(result: RunResult, metrics: Metrics) -> Iterator[str]:
     if nees is not None and nees > _MOST_NEES:
         yield (
             f"NEES/3 is {nees:.1f}, expected about 1: the errors are {nees**0.5:.1f} times what the covariance says. "
-            "Something is off by more than its sigma: see what the report judged wrong, and raise "
+            "Something is off by more than its sigma: see the faults that the report lists, and raise "
             f"{_prior_sigmas(result)} to what your installation really is"
         )
     dropped: Counter[str] = Counter()
@@ -67,10 +67,18 @@ def _warnings(result: RunResult, metrics: Metrics) -> Iterator[str]:
 
 def _prior_sigmas(result: RunResult) -> str:
     """The settings that say how far off this run's installation may be."""
-    found = [] if result.found is None else [s.name for s in result.found.settings]
-    names = [f"{section}.{key}" for section, key in _SIGMAS.items() if any(n.startswith(f"{section}.") for n in found)]
-    names = ["map.position_sigma_m"] * (result.found is not None and result.found.landmarks is not None) + names
-    return " or ".join(names or ["wheels.scale_sigma"])
+    from fgloc.config import Config
+
+    found = result.found
+    sections = [] if found is None else [setting.name.partition(".")[0] for setting in found.settings]
+    if found is not None and found.landmarks is not None:
+        sections.insert(0, "map")
+    names = []
+    for section in dict.fromkeys(sections):
+        field = Config.model_fields.get(section)  # "stamp_offset_s" is of the clocks
+        keys = () if field is None else getattr(field.annotation, "model_fields", ())
+        names += [f"{section}.{key}" for key in keys if _PRIOR.search(key)][:1]
+    return " or ".join(names) or "the sigmas of its settings"
 
 
 def _setting_names() -> re.Pattern[str]:
