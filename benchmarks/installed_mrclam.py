@@ -29,8 +29,8 @@ from fgloc.runner import run
 from fgloc.types import Estimate, Step, Trajectory
 
 _ROOT = Path(__file__).resolve().parent.parent
-_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
+DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
+MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
 _MODES = ("batch", "online")
 IDS = (
     "mrclam.first_pose_s",
@@ -42,7 +42,7 @@ IDS = (
 def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
     """All rows; a quick run takes one robot. There is one split: no robot's settings have seen its own run."""
     del split
-    source = _DATA / "mrclam6"
+    source = DATA / "mrclam6"
     if not source.is_dir():
         yield from not_run(IDS, f"no {source}; set FGLOC_REAL_DATA")
         return
@@ -78,10 +78,10 @@ def _robot(robot: int) -> Mapping[str, Any]:
 def localized(robot: int) -> dict[str, float]:
     """One robot, online and smoothed from the same replay."""
     with tempfile.TemporaryDirectory() as scratch:
-        bag = mrclam.convert(_DATA / "mrclam6", robot, Path(scratch) / "robot")
+        bag = mrclam.convert(DATA / "mrclam6", robot, Path(scratch) / "robot")
         robot_yaml = find_beside(bag, "robot.yaml")
         assert robot_yaml is not None
-        model = {"motion": {"model": _MODELS / f"without_robot{robot}.safetensors"}}
+        model = {"motion": {"model": MODELS / f"without_robot{robot}.safetensors"}}
         config = changed(load_config(robot_yaml), model)
         estimates: list[Estimate] = []
         moved_ns: list[int] = []

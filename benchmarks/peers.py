@@ -7,6 +7,8 @@
 - ``wheels``: dead reckoning by the wheels from the first true pose.
 - ``fgloc``: online, with the learned motion that its ``robot.yaml`` names.
 
+The case ``mrclam`` has five real robots: see `benchmarks.peers_mrclam`.
+
 ``peers.CASE.NAME.*``: mean over the seeds, spread their standard deviation. ``peers.CASE.best_over_fgloc``: the least
 mean ATE of the peers over fgloc's. ``update_ms``: mean processor time of a step without the detection of markers.
 """
@@ -25,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import peers_filter
+from benchmarks import peers_filter, peers_mrclam
 from benchmarks.adaptive_recordings import Recorded, Split
 from benchmarks.adaptive_runs import CASES as FAILURES
 from benchmarks.adaptive_runs import Replayed, changed, failure, replayed
@@ -35,6 +37,7 @@ from benchmarks.installed_runs import floor, kept, processor_times
 from benchmarks.peers_localizer import GRID, KINDS, Kind, Localizer, Settings
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
+from fgloc.datasets import mrclam
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.matching import match
 from fgloc.sensors.wheels.config import WheelsConfig
@@ -52,6 +55,7 @@ TUNED: dict[Kind, Settings] = {
 _TUNED_ON = (41, 42)  # of the validation split
 _ROUNDS = 2
 _LOST_M = 10.0  # an error that counts for one without an end, in the mean of logarithms
+Runs = dict[str, Callable[[Sequence[Step]], list[Estimate]]]  # by method
 Scores = Mapping[str, Mapping[str, float]]  # by method: ate_mm, yaw_deg, nees_over_3, worst_mm, update_ms
 
 
@@ -68,6 +72,10 @@ def measure(quick: bool, split: Split, library: Path | str, seeds: int | None) -
             runs.append(_scored(case, split, seed, library))
             print(f"{case} {seed}", file=sys.stderr, flush=True)
         yield from _rows(case, runs)
+    if peers_mrclam.SOURCE.is_dir():
+        yield from _rows("mrclam", [_robot(robot, library) for robot in mrclam.ROBOTS[: 1 if quick else None]])
+    else:
+        yield from not_run(["peers.mrclam.best_over_fgloc"], f"no {peers_mrclam.SOURCE}; set FGLOC_REAL_DATA")
 
 
 def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
@@ -106,11 +114,32 @@ def run_all(case: str, split: Split, seed: int, library: Path) -> dict[str, dict
     assert online.covs is not None
     stamps = online.stamps_ns.tolist()
     estimates = [Estimate(s, p, c) for s, p, c in zip(stamps, online.poses, online.covs, strict=True)]
-    out = {"fgloc": score(estimates, truth) | {"update_ms": ms}}
-    for name, run in others(recorded, made, library).items():
+    runs = others(recorded, made, library)
+    return {"fgloc": score(estimates, truth) | {"update_ms": ms}} | _scores_of(runs, made.steps, truth)
+
+
+def _robot(robot: int, library: Path) -> Scores:
+    """Scores of everybody on one robot of MRCLAM, kept likewise."""
+
+    def run_all() -> dict[str, dict[str, float]]:
+        with processor_times() as times:
+            made = peers_mrclam.replay(robot)
+        ours = score(made.estimates, made.truth) | {"update_ms": float(np.mean(times))}
+        runs: Runs = {
+            "beacons": lambda steps: peers_mrclam.Beacons(made).run(steps, made.truth),
+            "wheels": lambda steps: dead_reckoning(steps, made.config.wheels, made.truth),
+        }
+        return {"fgloc": ours} | _scores_of(runs, made.steps, made.truth)
+
+    return kept(f"peers_mrclam_{robot}_{peers_filter.sources_key(library)}", run_all)
+
+
+def _scores_of(runs: Runs, steps: Sequence[Step], truth: Trajectory) -> dict[str, dict[str, float]]:
+    out = {}
+    for name, run in runs.items():
         began = time.process_time()
-        found = run(made.steps)
-        out[name] = score(found, truth) | {"update_ms": 1e3 * (time.process_time() - began) / len(made.steps)}
+        found = run(steps)
+        out[name] = score(found, truth) | {"update_ms": 1e3 * (time.process_time() - began) / len(steps)}
     return out
 
 
@@ -125,13 +154,13 @@ def replay(case: str, split: Split, seed: int) -> tuple[Recorded, Replayed, floa
     return recorded, made, float(np.mean(times))
 
 
-def others(recorded: Recorded, made: Replayed, library: Path) -> dict[str, Callable[[Sequence[Step]], list[Estimate]]]:
+def others(recorded: Recorded, made: Replayed, library: Path) -> Runs:
     """Everybody else, by name."""
     camera, landmarks, wheels = recorded.camera, made.landmarks, recorded.config.wheels
     assert camera is not None
     assert made.online.truth is not None
     truth = made.online.truth
-    found: dict[str, Callable[[Sequence[Step]], list[Estimate]]] = {
+    found: Runs = {
         f"rl_{kind}": lambda steps, k=kind: Localizer(library, k, landmarks, camera, steps).run(TUNED[k])  # type: ignore[misc]
         for kind in KINDS
     }
