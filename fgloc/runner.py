@@ -13,7 +13,7 @@ import numpy as np
 
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.clock_trials import clock_note, clock_trials
-from fgloc.calibration.contradictions import contradictions
+from fgloc.calibration.contradictions import contradictions, model_misfit
 from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
 from fgloc.config import Config
@@ -25,6 +25,7 @@ from fgloc.replay.options import Progress, RunMode, RunOptions
 from fgloc.replay.outcome import Outcome, never_found, sentence
 from fgloc.replay.replay import Replay
 from fgloc.replay.smoothing import SmoothedRun, smooth_run
+from fgloc.sensors import registry
 from fgloc.types import (
     Estimate,
     FloatArray,
@@ -72,19 +73,17 @@ def run(
     estimates = last_pass(all_estimates)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found, tried = installation_found(parts, outcome.roles, installed), None
-    if check and not wrong.sentences and options.get("on_step") is None:
+    check = check and not wrong.sentences and options.get("on_step") is None
+    if check and (misfit := model_misfit(found, config.estimator.gate_probability)) is not None:
+        result = run(recording_path, map_path, registry.motion_model().without(config), mode, progress, **options)
+        return replace(result, mistakes=(misfit, *result.mistakes), notes=(misfit, *result.notes))
+    if check:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))
     notes = _notes(wrong, outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))
     result = _result(parts, replay, outcome, estimates, smoothed)
-    return replace(
-        result,
-        notes=notes,
-        source=recording_path,
-        config=config,
-        found=found,
-        wall_s=time.perf_counter() - began,
-    )
+    wall_s = time.perf_counter() - began
+    return replace(result, notes=notes, source=recording_path, config=config, found=found, wall_s=wall_s)
 
 
 def _notes(
