@@ -96,9 +96,9 @@ class IncrementalEstimator(Estimator):
         newest.belief = self._replayed([*window, newest], newest.belief)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
-        """Where to linearize: at the prediction or, while a pose in space is not yet known, where sightings put it."""
+        """Where to linearize: at the prediction or, where sightings are far from linear over it, where they put it."""
         known = frame.belief.installation or self.installed
-        near = is_level_known(known, self.installation) and (is_linear(frame.belief) or not self.installation.ground)
+        near = is_level_known(known, self.installation) and is_linear(frame.belief)
         if not frame.sightings or not self.factors.known or near:
             return frame.belief
         measurements = [s.measurement for s in frame.sightings]

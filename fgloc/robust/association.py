@@ -181,8 +181,7 @@ class Association:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
             bound = self._gate(dof)
-            in_space = uncertain and self._factors.installation.ground
-            if nis > bound and in_space and (corrected := correct(predicted, known, [m], self._factors)):
+            if nis > bound and uncertain and (corrected := correct(predicted, known, [m], self._factors)):
                 nis = min(nis, corrected[1])
             judged.append((nis, dof, "gate" if nis > bound else ""))
         return self._agreed(measurements, predicted, judged) if uncertain and self._config.weights.adaptive else judged
