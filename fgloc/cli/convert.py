@@ -54,7 +54,7 @@ def mrclam(
             f"{len(run.truth_ns)} true poses; left out: {run.robots_left_out} sightings of robots, "
             f"{run.unknown_left_out} of no known barcode"
         )
-    _tell_next(folder)
+    _say_next(folder)
 
 
 @app.command()
@@ -78,7 +78,7 @@ def pioneer(
     if source is None:
         raise typer.BadParameter("give the bag, or --download FOLDER", param_hint="BAG")
     converted(source, out, storage)
-    _tell_written(out)
+    _say_written(out)
 
 
 @app.command()
@@ -110,7 +110,7 @@ def turtlebot3(
         say(f"left out: {count} messages of {what}: the definition of their type is not known")
     for note in notes:
         say(f"note: {note}")
-    _tell_written(out)
+    _say_written(out)
 
 
 @app.command()
@@ -131,7 +131,7 @@ def drive(
     unknown = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
     source = _given_or_fetched(source, "CSV", download, url, unknown)
     converted(source, out, storage, span(windows, "--windows"), span(calibration, "--calibration"))
-    _tell_written(out)
+    _say_written(out)
 
 
 def _given_or_fetched(source: Path | None, name: str, download: Path | None, url: str | None, unknown: str) -> Path:
@@ -147,12 +147,12 @@ def _given_or_fetched(source: Path | None, name: str, download: Path | None, url
     return source
 
 
-def _tell_written(out: Path) -> None:
+def _say_written(out: Path) -> None:
     """The files of one converted recording, and what to do with them."""
     names = [name for name in ("bag", "map.yaml", "robot.yaml", "windows.csv") if (out / name).exists()]
     say(f"written to {out}: {', '.join(names)}")
-    _tell_next(out)
+    _say_next(out)
 
 
-def _tell_next(folder: Path) -> None:
+def _say_next(folder: Path) -> None:
     next_step(f"fgloc smooth {shown_path(folder / 'bag')} --out {shown_path(folder / 'result')}", "localize with it")

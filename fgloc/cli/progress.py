@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fgloc.replay.options import Progress
 
 LINE_S = 10.0  # between two lines on a pipe; shorter work says nothing
-_RATE_S = 1.0  # work has to have gone on for this long before a rate, and so the time left, can be told
+_RATE_S = 1.0  # work has to have gone on for this long before a rate, and so the time left, can be given
 
 
 @contextmanager

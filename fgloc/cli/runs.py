@@ -136,7 +136,7 @@ def calibrate(
     map_file: MapOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Calibrate wheels, camera and clocks. Recordings on a known map, or with landmarks seen again, tell them."""
+    """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text

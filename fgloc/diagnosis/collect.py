@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.window import Spots, Window
+from fgloc.diagnosis.window import RelativeSightings, Window
 from fgloc.sensors import registry
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.pnp import marker_pose_candidates
@@ -18,7 +18,7 @@ from fgloc.types import FloatArray, FrameMeasurement, LandmarkMap, PixelMeasurem
 
 SPAN_S = 8.0  # sightings of a window
 MARGIN_S = 1.2  # wheel motion before and after them, for clocks that differ
-_MOST_SPOTS = 150
+_MOST_SIGHTINGS = 150
 _SPARSE_S = 0.09  # events closer than this to the one before add little information
 _FLOOR_RAD, _FLOOR_M, _FLOOR_SHARE = 0.01, 0.02, 0.01  # what wheels err over a window, whatever the sensor's noise
 
@@ -46,7 +46,7 @@ class SightingCollector:
         self._sensor = sensor
         self._place = T_base_sensor
 
-    def spots(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
+    def sightings(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
         """What was seen where."""
         if event.in_pixels and self._map is None and registry.raw_landmarks().size(self._config) is None:
             return
@@ -83,14 +83,14 @@ class SightingCollector:
 
 
 class WindowCutter:
-    """Collects motion and spots; gives a window whenever one is complete."""
+    """Collects motion and sightings; gives a window whenever one is complete."""
 
     def __init__(self) -> None:
         self._segment = -1
         self._times: list[float] = []
         self._motions: list[FloatArray] = []
-        self._spots: list[RelativeSighting] = []
-        self._last_spot_s = -math.inf
+        self._sightings: list[RelativeSighting] = []
+        self._last_sighting_s = -math.inf
         self._origin_ns: int | None = None
         self.travelled: FloatArray = np.zeros(3)  # from the segment's first step to the oldest pose kept
 
@@ -108,12 +108,12 @@ class WindowCutter:
 
     def wants(self, at_s: float) -> bool:
         """Whether a sightings event at this time would add something."""
-        return abs(at_s - self._last_spot_s) >= _SPARSE_S and len(self._spots) < 2 * _MOST_SPOTS
+        return abs(at_s - self._last_sighting_s) >= _SPARSE_S and len(self._sightings) < 2 * _MOST_SIGHTINGS
 
-    def see(self, spot: RelativeSighting) -> None:
+    def add_sighting(self, sighting: RelativeSighting) -> None:
         """Keep a sighting."""
-        self._spots.append(spot)
-        self._last_spot_s = spot.at_s
+        self._sightings.append(sighting)
+        self._last_sighting_s = sighting.at_s
 
     def move(self, step: Step, motion: FloatArray | None) -> Window | None:
         """Take in the step's motion; None: it is not known, and what was kept is of no use any more."""
@@ -132,21 +132,21 @@ class WindowCutter:
         for passed in self._motions[:keep]:
             self.travelled = se2.compose(self.travelled, passed)
         del self._times[:keep], self._motions[:keep]
-        self._spots = [s for s in self._spots if s.at_s >= end - MARGIN_S]
+        self._sightings = [s for s in self._sightings if s.at_s >= end - MARGIN_S]
         return window
 
     def _window(self) -> Window:
         start = self._times[0]
-        inside = [s for s in self._spots if start + MARGIN_S <= s.at_s < self._times[-1] - MARGIN_S]
-        inside = inside[:: max(1, -(-len(inside) // _MOST_SPOTS))]
-        spots = Spots(
+        inside = [s for s in self._sightings if start + MARGIN_S <= s.at_s < self._times[-1] - MARGIN_S]
+        inside = inside[:: max(1, -(-len(inside) // _MOST_SIGHTINGS))]
+        sightings = RelativeSightings(
             np.array([s.at_s - start for s in inside]),
             np.array([s.landmark_id for s in inside], dtype=np.int64),
             np.array([s.point for s in inside]).reshape(-1, 3),
             np.array([(s.sigma_rad, s.sigma_m) for s in inside]).reshape(-1, 2),
         )
-        return Window(start, np.array(self._times) - start, np.array(self._motions), spots)
+        return Window(start, np.array(self._times) - start, np.array(self._motions), sightings)
 
     def _forget(self, at_s: float) -> None:
-        self._times, self._motions, self._spots = [at_s], [], []
+        self._times, self._motions, self._sightings = [at_s], [], []
         self.travelled = np.zeros(3)

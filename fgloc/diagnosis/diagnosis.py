@@ -71,7 +71,7 @@ class Diagnosis:
         self._known: dict[int, FloatArray] | None = None
         if landmark_map is not None:
             self._known = {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
-        self._spotter = SightingCollector(
+        self._collector = SightingCollector(
             config, landmark_map, LandmarkSensor(config, landmark_map, camera, T_base_sensor), self._place
         )
         self._cutter = WindowCutter()
@@ -96,8 +96,8 @@ class Diagnosis:
         for event in step.sightings:
             at_s = self._cutter.seconds(event.stamp_ns)
             if self._cutter.wants(at_s):
-                for spot in self._spotter.spots(event, at_s):
-                    self._cutter.see(spot)
+                for sighting in self._collector.sightings(event, at_s):
+                    self._cutter.add_sighting(sighting)
         for imu in step.inertial:
             self._gyro.record(imu, self._cutter.seconds(imu.stamp_ns))
         travelled = self._cutter.travelled

@@ -51,7 +51,7 @@ PRIOR_SIGMAS_NO_MAP = np.array([1.0, 0.3, 0.5, 0.01, 0.1, 0.1, 0.1, 0.1, 0.3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spots:
+class RelativeSightings:
     """Sightings ``(m,)``: time [s], landmark, place in the sensor's axes ``(m, 3)``, noise of bearing and range."""
 
     times: FloatArray
@@ -67,7 +67,7 @@ class Window:
     start_s: float
     times: FloatArray  # (n + 1,) s
     motions: FloatArray  # (n, 3) between them
-    spots: Spots
+    sightings: RelativeSightings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +105,7 @@ def fit_window(
         any_clock: look for large clock offsets too, where none makes it fit.
 
     Returns:
-        None if the window does not determine its place: too few sightings, or all of one spot.
+        None if the window does not determine its place: too few sightings, or all of one point.
     """
     problem = _Problem.make(window, T_base_sensor, known)
     if problem is None:
@@ -131,25 +131,25 @@ class _Problem:
 
     @staticmethod
     def make(window: Window, T_base_sensor: FloatArray, known: Mapping[int, FloatArray] | None) -> _Problem | None:
-        spots = window.spots
-        if len(spots.times) < _MIN_SIGHTINGS:
+        sightings = window.sightings
+        if len(sightings.times) < _MIN_SIGHTINGS:
             return None
         sensor = T_base_sensor[:2, 3]
-        arms = (spots.points @ T_base_sensor[:3, :3].T)[:, :2]
+        arms = (sightings.points @ T_base_sensor[:3, :3].T)[:, :2]
         if np.hypot(arms[:, 0], arms[:, 1]).min() < 1e-3:
             return None
         axis = T_base_sensor[:2, 2]  # of a camera: z forward; of other sensors z is up, and this is nothing
         along = (arms @ axis)[:, None] * axis
-        seen = _in_path(_path(window.times, window.motions, np.zeros(len(Fault)), spots.times), arms + sensor)
-        numbers, slots = np.unique(spots.ids, return_inverse=True)
+        seen = _in_path(_path(window.times, window.motions, np.zeros(len(Fault)), sightings.times), arms + sensor)
+        numbers, slots = np.unique(sightings.ids, return_inverse=True)
         if known is None:
             counts = np.bincount(slots)
             if len(numbers) < 2 or counts.min() < 2:
                 return None
             local = np.stack([np.bincount(slots, seen[:, k]) / counts for k in (0, 1)], axis=1).ravel()
             return _Problem(window, arms, along, sensor, None, slots, local, PRIOR_SIGMAS_NO_MAP**-2.0)
-        landmarks = np.array([known[int(i)] for i in spots.ids])
-        place = rigid(seen, landmarks, spots.sigmas[:, 1] ** -2.0)
+        landmarks = np.array([known[int(i)] for i in sightings.ids])
+        place = rigid(seen, landmarks, sightings.sigmas[:, 1] ** -2.0)
         return (
             None
             if place is None
@@ -160,8 +160,8 @@ class _Problem:
         """Whitened ``(2 m,)``: bearings, then ranges."""
         n = len(self.local)
         local, fault = x[:n], x[n:]
-        spots = self.window.spots
-        poses = _path(self.window.times, self.window.motions, fault, spots.times - fault[Fault.LATE])
+        sightings = self.window.sightings
+        poses = _path(self.window.times, self.window.motions, fault, sightings.times - fault[Fault.LATE])
         if self.landmarks is None:
             targets = local.reshape(-1, 2)[self.slots]
         else:  # into the window's frame
@@ -175,7 +175,7 @@ class _Problem:
         off = np.arctan2(arms[:, 1], arms[:, 0]) - fault[Fault.TURN] - np.arctan2(left, ahead)
         off = (off + math.pi) % (2.0 * math.pi) - math.pi
         far = np.hypot(arms[:, 0], arms[:, 1]) * math.exp(fault[Fault.SCALE]) - np.hypot(ahead, left)
-        return np.concatenate([off / spots.sigmas[:, 0], far / spots.sigmas[:, 1]])
+        return np.concatenate([off / sightings.sigmas[:, 0], far / sightings.sigmas[:, 1]])
 
     def solve(self, late_s: float, faults: bool = True) -> Fit:
         """Gauss–Newton with Cauchy weights, from this clock offset; without ``faults`` only for the place."""
@@ -200,7 +200,7 @@ class _Problem:
         noise = (float(w @ r**2) + _OWN_DOF) / (max(len(r) - n, 1) + _OWN_DOF)
         information, pull = (J.T * w) @ J / noise, -(J.T @ (w * r)) / noise
         information, pull = eliminated(information, pull, n)
-        middle = float(self.window.spots.times.mean())
+        middle = float(self.window.sightings.times.mean())
         evidence = Evidence(self.window.start_s + middle, information, pull + information @ x[n:])
         place = x[:3] if self.landmarks is not None else np.zeros(3)
         strain = math.sqrt(float(self.prior @ x[n:] ** 2))
@@ -251,8 +251,8 @@ def rigid(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatA
 
 def spread_ratio(window: Window, T_base_sensor: FloatArray, known: Mapping[int, FloatArray]) -> float:
     """How much wider apart the landmarks of a window are on the map than wheels and sightings put them."""
-    spots = window.spots
-    arms = (spots.points @ T_base_sensor[:3, :3].T)[:, :2] + T_base_sensor[:2, 3]
-    seen = _in_path(_path(window.times, window.motions, np.zeros(len(Fault)), spots.times), arms)
-    landmarks = np.array([known[int(i)] for i in spots.ids])
+    sightings = window.sightings
+    arms = (sightings.points @ T_base_sensor[:3, :3].T)[:, :2] + T_base_sensor[:2, 3]
+    seen = _in_path(_path(window.times, window.motions, np.zeros(len(Fault)), sightings.times), arms)
+    landmarks = np.array([known[int(i)] for i in sightings.ids])
     return float(np.sqrt(landmarks.var(axis=0).sum() / max(seen.var(axis=0).sum(), 1e-12)))

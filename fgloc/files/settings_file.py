@@ -59,8 +59,10 @@ class Settings:
             return model.model_validate(self.content)
         except ValidationError as error:
             found = error.errors()
-            told = sorted((self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False))
-            lines = [f"  {self.path}:{line}: {text}" for line, text in told]
+            wrong = sorted(
+                (self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False)
+            )
+            lines = [f"  {self.path}:{line}: {text}" for line, text in wrong]
             count = "1 wrong value" if len(found) == 1 else f"{len(found)} wrong values"
             raise ConfigError(f"{self.path}: {count}\n" + "\n".join(lines)) from error
 

@@ -119,7 +119,7 @@ class Schedule:
         self._scene = scene
 
     def inside(self, event: Event) -> tuple[float, float] | None:
-        """The interval that holds the event, whether or not chance picks it."""
+        """The interval that contains the event, whether or not chance picks it."""
         seconds = self._scene.seconds(event)
         return next(((a, b) for a, b in self.intervals if a <= seconds < b), None)
 
