@@ -54,8 +54,8 @@ class Association:
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
         """Sort sightings into accepted and rejected, with the decision on each.
 
-        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and the
-        pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
+        The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
+        the pose is not known well, it is taken again at the pose that best explains prediction and sighting together,
         because the linear one is far too large.
         """
         accepted, rejected, decisions = [], [], []
