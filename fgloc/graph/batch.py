@@ -14,7 +14,15 @@ from fgloc.config import BatchConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
 from fgloc.graph.batch_ground import GroundMotions, ground_covs, ground_of
-from fgloc.graph.batch_solve import estimated_landmarks, initial_values, solvable, with_deep_stack, without_orphans
+from fgloc.graph.batch_solve import (
+    eliminated,
+    elimination_order,
+    estimated_landmarks,
+    initial_values,
+    marginal_covs,
+    with_deep_stack,
+    without_orphans,
+)
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
@@ -85,7 +93,7 @@ class BatchSmoother:
         if factors.known:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
         self._values = initial_values(self.frames, self.accepted, self._factors)
-        self._solved: gtsam.Marginals | gtsam.ISAM2 | None = None  # covariances of the last solution
+        self._solved: gtsam.GaussianBayesTree | gtsam.ISAM2 | None = None  # covariances of the last solution
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
@@ -167,32 +175,21 @@ class BatchSmoother:
         marginals = self._marginals()
         return with_deep_stack(lambda: self._result(marginals))
 
-    def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
-        """Covariances of the solution; of long stretches that hardly anything determines, by QR."""
+    def _marginals(self) -> gtsam.GaussianBayesTree | gtsam.ISAM2:
+        """Where the covariances of the last solution are."""
         if self._solved is None:
-            self._solved = self._new_marginals()
+            self._solved = with_deep_stack(lambda: eliminated(self._graph, self._values, self._order))
         return self._solved
 
-    def _new_marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
-        try:
-            return with_deep_stack(lambda: gtsam.Marginals(self._graph, self._values))
-        except RuntimeError:
-            params = gtsam.ISAM2Params()
-            params.setFactorization("QR")
-            params.relinearizeSkip = 1
-            solver = gtsam.ISAM2(params)
-            solvable(lambda: with_deep_stack(lambda: solver.update(self._graph, self._values)))
-            return solver
-
-    def _result(self, marginals: gtsam.Marginals | gtsam.ISAM2) -> Smoothed:
+    def _result(self, marginals: gtsam.GaussianBayesTree | gtsam.ISAM2) -> Smoothed:
         ground, spatial = None, None
         if self._on_ground is not None:
             ground, spatial = self._ground(), ground_covs(marginals, self.frames)
-        covs = [marginals.marginalCovariance(pose_key(frame.k)) for frame in self.frames] if spatial is None else ()
+        covs = marginal_covs(marginals, self.frames) if spatial is None else spatial[:, :3, :3]
         return Smoothed(
             stamps_ns=self.stamps_ns(),
             poses=self.poses(),
-            covs=np.array(covs) if spatial is None else spatial[:, :3, :3],
+            covs=covs,
             ground=ground,
             ground_covs=spatial,
             landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
@@ -206,6 +203,7 @@ class BatchSmoother:
     def _optimize(self) -> None:
         """Linearize the sightings anew and solve, until the error stays what it is."""
         self._solved = None
+        self._order = elimination_order(self.frames, self.accepted, self._factors)
         previous = math.inf
         for _ in range(MOST_STEPS):
             self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
@@ -260,7 +258,7 @@ class BatchSmoother:
         params.setMaxIterations(self._config.max_iterations)
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
         params.setRelativeErrorTol(CONVERGED)
-        return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, self._order, params).optimize()
 
 
 def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:

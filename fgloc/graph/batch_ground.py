@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import gtsam
 import numpy as np
 
+from fgloc.graph.batch_solve import forget_separators
 from fgloc.graph.factors import installed_motion_factor, pose_key
 from fgloc.graph.ground import gravity, ground_key
 from fgloc.graph.installation import GROUND, Installation
@@ -20,13 +21,14 @@ def ground_of(values: gtsam.Values, frames: Sequence[Keyframe]) -> FloatArray:
     return np.array([values.atVector(ground_key(frame.k)) for frame in frames]).reshape(-1, len(GROUND))
 
 
-def ground_covs(marginals: gtsam.Marginals | gtsam.ISAM2, frames: Sequence[Keyframe]) -> FloatArray:
+def ground_covs(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, frames: Sequence[Keyframe]) -> FloatArray:
     """Covariances ``(n, 6, 6)`` of x, y, yaw (right perturbation), height, roll and pitch."""
     found = []
-    for frame in frames:
+    for row, frame in enumerate(frames):
         keys = [pose_key(frame.k), ground_key(frame.k)]
         joint = marginals.jointMarginalCovariance(keys)
         found.append(np.block([[np.asarray(joint.at(a, b)) for b in keys] for a in keys]))
+        forget_separators(marginals, row)
     return np.array(found)
 
 

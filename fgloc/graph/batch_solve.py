@@ -1,9 +1,9 @@
-"""Parts of the batch solution that need no state: initial values, a deep stack, landmarks that came out."""
+"""Parts of the batch solution that need no state: initial values, the order of elimination, a deep stack."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -29,20 +29,9 @@ from fgloc.types import (
 
 _DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
 
+_KEYFRAMES_HELD = 500  # whose separators' covariances GTSAM holds: 7 MB
+
 _T = TypeVar("_T")
-
-
-def solvable(work: Callable[[], _T]) -> _T:
-    """Do what needs the graph's covariances.
-
-    Raises:
-        EstimatorError: the graph leaves a pose undetermined.
-    """
-    try:
-        return work()
-    except RuntimeError as error:
-        why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
-        raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
 
 
 def with_deep_stack(work: Callable[[], _T]) -> _T:
@@ -84,6 +73,95 @@ def initial_values(
     return values
 
 
+def elimination_order(
+    frames: Sequence[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
+) -> gtsam.Ordering:
+    """Keys in the order in which they are eliminated: poses by nested dissection of the chain, the installation last.
+
+    The middle keyframe comes after both halves, and so in each half: a tree as deep as the logarithm of the length.
+    GTSAM's default, COLAMD, keeps the chain in its own order; it takes a time that grows with the square of the length
+    to find it, and so does GTSAM's search for the roots of a tree as deep as the chain is long. An estimated landmark
+    comes before the middle of the smallest part that holds all keyframes that see it.
+
+    Source: George 1973, "Nested dissection of a regular finite element mesh".
+    """
+    keys = [[pose_key(f.k)] if f.ground is None else [pose_key(f.k), ground_key(f.k)] for f in frames]
+    landmarks = {} if factors.known else _landmarks_by_part(frames, accepted)
+    ordering = gtsam.Ordering()
+    parts = [(0, len(frames), False)]
+    while parts:
+        first, end, halves_done = parts.pop()
+        middle = (first + end) // 2
+        if halves_done:
+            for key in (*landmarks.get(middle, ()), *keys[middle]):
+                ordering.push_back(key)
+        elif first < end:
+            parts += [(first, end, True), (middle + 1, end, False), (first, middle, False)]
+    if factors.installation.constants:
+        ordering.push_back(INSTALLATION)
+    return ordering
+
+
+def _landmarks_by_part(
+    frames: Sequence[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]]
+) -> dict[int, list[int]]:
+    """Keys of landmarks by the middle row of the smallest part in which all their sightings are."""
+    seen: dict[int, tuple[int, int]] = {}
+    for row, frame in enumerate(frames):
+        for sighting in accepted[frame.k]:
+            landmark_id = sighting.measurement.landmark_id
+            seen[landmark_id] = seen.get(landmark_id, (row, row))[0], row
+    found: dict[int, list[int]] = {}
+    for landmark_id, (earliest, latest) in seen.items():
+        first, end = 0, len(frames)
+        while not earliest <= (middle := (first + end) // 2) <= latest:
+            first, end = (first, middle) if latest < middle else (middle + 1, end)
+        found.setdefault(middle, []).append(landmark_key(landmark_id))
+    return found
+
+
+def eliminated(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
+) -> gtsam.GaussianBayesTree | gtsam.ISAM2:
+    """The graph solved about these values, for its covariances; with long stretches that little determines, by QR.
+
+    Raises:
+        EstimatorError: the graph leaves a pose undetermined.
+    """
+    try:
+        return graph.linearize(values).eliminateMultifrontal(ordering)
+    except RuntimeError:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR")
+        params.relinearizeSkip = 1
+        solver = gtsam.ISAM2(params)
+    try:
+        solver.update(graph, values)
+    except RuntimeError as error:
+        why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
+        raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
+    return solver
+
+
+def marginal_covs(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, frames: Sequence[Keyframe]) -> FloatArray:
+    """Covariances ``(n, 3, 3)`` of the poses, right perturbation."""
+    covs = np.empty((len(frames), 3, 3))
+    for row, frame in enumerate(frames):
+        covs[row] = marginals.marginalCovariance(pose_key(frame.k))
+        forget_separators(marginals, row)
+    return covs
+
+
+def forget_separators(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, row: int) -> None:
+    """After every so many keyframes: what GTSAM holds to find covariances near to those already found.
+
+    With 40 parameters of the installation that is 14 kB a keyframe. Of a tree that was ordered by nested dissection
+    the next keyframe needs but a logarithm of it again; ISAM2's is as deep as the chain is long.
+    """
+    if row % _KEYFRAMES_HELD == _KEYFRAMES_HELD - 1 and isinstance(marginals, gtsam.GaussianBayesTree):
+        marginals.deleteCachedShortcuts()
+
+
 def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
     """Values of the keys that the graph still mentions."""
     kept, mentioned = gtsam.Values(values), set(graph.keyVector())
@@ -94,7 +172,9 @@ def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> 
 
 
 def estimated_landmarks(
-    accepted: Mapping[int, tuple[LandmarkFactor, ...]], values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2
+    accepted: Mapping[int, tuple[LandmarkFactor, ...]],
+    values: gtsam.Values,
+    marginals: gtsam.GaussianBayesTree | gtsam.ISAM2,
 ) -> dict[int, Landmark]:
     """Landmarks that were variables, with their covariance."""
     landmarks = {}
