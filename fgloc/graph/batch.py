@@ -15,11 +15,12 @@ from fgloc.errors import EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
 from fgloc.graph.batch_ground import GroundMotions, ground_covs, ground_of
 from fgloc.graph.batch_solve import (
-    eliminated,
+    Solved,
     elimination_order,
     estimated_landmarks,
     initial_values,
-    marginal_covs,
+    pose_covs,
+    solved,
     with_deep_stack,
     without_orphans,
 )
@@ -92,8 +93,10 @@ class BatchSmoother:
         self._sightings = None
         if factors.known:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
+        # With landmarks as variables GTSAM's own order has the smaller cliques
+        self._order = elimination_order(self.frames, factors.installation.constants) if factors.known else None
         self._values = initial_values(self.frames, self.accepted, self._factors)
-        self._solved: gtsam.GaussianBayesTree | gtsam.ISAM2 | None = None  # covariances of the last solution
+        self._solved: Solved | None = None  # covariances of the last solution
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
@@ -175,17 +178,17 @@ class BatchSmoother:
         marginals = self._marginals()
         return with_deep_stack(lambda: self._result(marginals))
 
-    def _marginals(self) -> gtsam.GaussianBayesTree | gtsam.ISAM2:
+    def _marginals(self) -> Solved:
         """Where the covariances of the last solution are."""
         if self._solved is None:
-            self._solved = with_deep_stack(lambda: eliminated(self._graph, self._values, self._order))
+            self._solved = solved(self._graph, self._values, self._order)
         return self._solved
 
-    def _result(self, marginals: gtsam.GaussianBayesTree | gtsam.ISAM2) -> Smoothed:
+    def _result(self, marginals: Solved) -> Smoothed:
         ground, spatial = None, None
         if self._on_ground is not None:
             ground, spatial = self._ground(), ground_covs(marginals, self.frames)
-        covs = marginal_covs(marginals, self.frames) if spatial is None else spatial[:, :3, :3]
+        covs = pose_covs(marginals, self.frames) if spatial is None else spatial[:, :3, :3]
         return Smoothed(
             stamps_ns=self.stamps_ns(),
             poses=self.poses(),
@@ -193,7 +196,7 @@ class BatchSmoother:
             ground=ground,
             ground_covs=spatial,
             landmarks={} if self._factors.known else estimated_landmarks(self.accepted, self._values, marginals),
-            error=self._graph.error(self._values),
+            error=self._error,
         )
 
     def _theta(self) -> FloatArray:
@@ -203,20 +206,16 @@ class BatchSmoother:
     def _optimize(self) -> None:
         """Linearize the sightings anew and solve, until the error stays what it is."""
         self._solved = None
-        self._order = elimination_order(self.frames, self.accepted, self._factors)
-        previous = math.inf
+        self._error = math.inf
         for _ in range(MOST_STEPS):
             self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
-            graph = self._linearized()
-            start = self._values if self._factors.known else without_orphans(self._values, graph)
-            values = self._solve(graph, start)
-            error = graph.error(values)
-            if not np.isfinite(error):
+            self._graph = self._linearized()
+            start = self._values if self._factors.known else without_orphans(self._values, self._graph)
+            previous, self._error = self._error, self._solve(start)
+            if not np.isfinite(self._error):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
-            self._values, self._graph = values, graph
-            if abs(previous - error) <= CONVERGED * error:
+            if abs(previous - self._error) <= CONVERGED * self._error:
                 break
-            previous = error
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
@@ -224,7 +223,7 @@ class BatchSmoother:
             for factor in (f for held in self.accepted.values() for s in held for f in s.factors):
                 graph.add(factor)
             return graph
-        for factor in self._sightings.factors(self._whole_poses(), self._theta()):
+        for factor in self._sightings.factors(self._whole_poses(), self._theta(), self._values):
             graph.add(factor)
         return graph
 
@@ -253,12 +252,17 @@ class BatchSmoother:
             if frame.prior is not None:
                 yield prior_factor(frame.k, frame.prior.pose, frame.prior.cov)
 
-    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    def _solve(self, start: gtsam.Values) -> float:
+        """Levenberg-Marquardt on the graph as it is linearized; its error."""
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self._config.max_iterations)
-        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack on long chains
+        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack in GTSAM's order
         params.setRelativeErrorTol(CONVERGED)
-        return gtsam.LevenbergMarquardtOptimizer(graph, values, self._order, params).optimize()
+        if self._order is not None:
+            params.setOrdering(self._order)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
+        self._values = optimizer.optimize()
+        return float(optimizer.error())
 
 
 def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:

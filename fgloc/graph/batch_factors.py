@@ -20,7 +20,7 @@ from fgloc.graph.noise_models import whitening_of
 from fgloc.graph.observation import Observations
 from fgloc.types import FloatArray, IntArray, MotionMeasurement
 
-_AT_ONCE = 1000  # keyframes whose sightings are linearized at the same time: each may have 100 kB of Jacobians
+_AT_ONCE = 300  # keyframes whose sightings are linearized at the same time; each may have 100 kB of Jacobians
 
 
 class BatchMotions:
@@ -66,12 +66,13 @@ class BatchMotions:
         yield from self._plain
         before = poses[np.array(self._at, dtype=np.int64) - 1]
         after = se2.compose_array(before, self._motions)
-        theta = np.zeros(self._n)
-        for (first, second), linear, start, end in zip(self._keys, self._linear, before, after, strict=True):
-            values = gtsam.Values()
+        installed = gtsam.Values()
+        installed.insert(INSTALLATION, np.zeros(self._n))
+        ends = zip(self._keys, self._linear, before.tolist(), after.tolist(), strict=True)
+        for (first, second), linear, start, end in ends:
+            values = gtsam.Values(installed)
             values.insert(first, gtsam.Pose2(*start))
             values.insert(second, gtsam.Pose2(*end))
-            values.insert(INSTALLATION, theta)
             yield gtsam.LinearContainerFactor(linear, values)
 
 
@@ -95,16 +96,16 @@ class BatchSightings:
             if held:
                 self._chunks.append(_Images(held, factors))
 
-    def factors(self, poses: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+    def factors(self, poses: FloatArray, theta: FloatArray, values: gtsam.Values) -> Iterator[gtsam.NonlinearFactor]:
         """All factors, linear about poses ``(n, 3)`` of the keyframes and an installation ``(p,)``.
 
-        On uneven ground poses are ``(n, 6)``, with height, roll and pitch.
+        On uneven ground poses are ``(n, 6)``, with height, roll and pitch. The values are the same, for GTSAM.
         """
         rest = np.zeros((len(theta) + 1, len(theta) + 1))  # information of the installation, and its last column
         for chunk in self._chunks:
-            yield from chunk.factors(poses, theta, rest)
+            yield from chunk.factors(poses, theta, values, rest)
         if len(theta):
-            yield self._of_installation(theta, rest)
+            yield self._of_installation(theta, values, rest)
 
     def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
         """Squared residual ``(m,)`` of each sighting by its own noise, and its rows, see `Observations.squares`."""
@@ -114,7 +115,7 @@ class BatchSightings:
             np.concatenate([np.zeros(0, dtype=np.int64), *(rows for _, rows in found)]),
         )
 
-    def _of_installation(self, theta: FloatArray, rest: FloatArray) -> gtsam.NonlinearFactor:
+    def _of_installation(self, theta: FloatArray, values: gtsam.Values, rest: FloatArray) -> gtsam.NonlinearFactor:
         """Its prior, and all that the sightings tell of it alone."""
         prior, n = self._installation.prior(), len(theta)
         W = whitening_of(prior.cov[:n, :n])
@@ -124,8 +125,6 @@ class BatchSightings:
         residual = np.linalg.solve(root.T, total[:n, n])
         A = np.vstack([root, np.zeros(n)])  # the last row is what no installation can explain
         b = np.append(residual, np.sqrt(max(0.0, total[n, n] - float(residual @ residual))))
-        values = gtsam.Values()
-        values.insert(INSTALLATION, theta)
         linear = gtsam.JacobianFactor(INSTALLATION, A, -b, gtsam.noiseModel.Unit.Create(n + 1))
         return gtsam.LinearContainerFactor(linear, values)
 
@@ -145,7 +144,9 @@ class _Images:
         new = np.flatnonzero(np.diff(stamps[order]) | np.diff(self._row[order])) + 1
         self._images = np.split(order, new)
 
-    def factors(self, poses: FloatArray, theta: FloatArray, rest: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+    def factors(
+        self, poses: FloatArray, theta: FloatArray, values: gtsam.Values, rest: FloatArray
+    ) -> Iterator[gtsam.NonlinearFactor]:
         """As `BatchSightings.factors`; what concerns the installation alone is added to ``rest``."""
         own = poses[self._row]
         (_, batch), *others = self._observed.batches
@@ -161,17 +162,16 @@ class _Images:
             same = np.array([image for image in ahead if len(image) == size])
             rows = _rows(same, stack, len(theta))
             white = whitened(rows, shared[same].reshape(*rows.shape[:2], shared.shape[2]))
-            yield from self._of_poses(same[:, 0], white, own, theta, rest)
+            yield from self._of_poses(same[:, 0], white, own.shape[1], values, rest)
 
     def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
         """As `BatchSightings.squares`."""
         return self._observed.squares(poses[self._row], theta)
 
     def _of_poses(
-        self, first: IntArray, white: FloatArray, own: FloatArray, theta: FloatArray, rest: FloatArray
+        self, first: IntArray, white: FloatArray, d: int, values: gtsam.Values, rest: FloatArray
     ) -> Iterator[gtsam.NonlinearFactor]:
-        """Factors of images, of which these are the first sightings, from white rows ``(g, d, p + n + 1)``."""
-        d = own.shape[1]
+        """Factors of images, of which these are the first sightings, from white rows ``(g, m, d + n + 1)``."""
         Q, R = np.linalg.qr(white[:, :, :d])
         others = white[:, :, d:]
         top = np.swapaxes(Q, 1, 2) @ others
@@ -179,15 +179,11 @@ class _Images:
         rest += flat.T @ flat - flat_top.T @ flat_top
         noise = gtsam.noiseModel.Unit.Create(R.shape[1])
         keys = [pose_key(k) for k in self._k[first].tolist()]
-        for key, pose, by_pose, by_rest in zip(keys, own[first], R, top, strict=True):
-            values = gtsam.Values()
-            values.insert(key, gtsam.Pose2(*pose[:3]))
+        for key, by_pose, by_rest in zip(keys, R, top, strict=True):
             blocks: list[Any] = [key, by_pose[:, :3]]
             if d > 3:
-                values.insert(of_ground(key), pose[3:])
                 blocks += [of_ground(key), by_pose[:, 3:]]
-            if len(theta):
-                values.insert(INSTALLATION, theta)
+            if self._installation.constants:
                 blocks += [INSTALLATION, by_rest[:, :-1]]
             linear = gtsam.JacobianFactor(*blocks, -by_rest[:, -1], noise)  # type: ignore[call-overload]
             yield gtsam.LinearContainerFactor(linear, values)

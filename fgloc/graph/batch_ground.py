@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import gtsam
 import numpy as np
 
-from fgloc.graph.batch_solve import forget_separators
+from fgloc.graph.batch_solve import Solved, forget_separators
 from fgloc.graph.factors import installed_motion_factor, pose_key
 from fgloc.graph.ground import gravity, ground_key
 from fgloc.graph.installation import GROUND, Installation
@@ -21,7 +21,7 @@ def ground_of(values: gtsam.Values, frames: Sequence[Keyframe]) -> FloatArray:
     return np.array([values.atVector(ground_key(frame.k)) for frame in frames]).reshape(-1, len(GROUND))
 
 
-def ground_covs(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, frames: Sequence[Keyframe]) -> FloatArray:
+def ground_covs(marginals: Solved, frames: Sequence[Keyframe]) -> FloatArray:
     """Covariances ``(n, 6, 6)`` of x, y, yaw (right perturbation), height, roll and pitch."""
     found = []
     for row, frame in enumerate(frames):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import gtsam
 import numpy as np
@@ -29,7 +29,10 @@ from fgloc.types import (
 
 _DEEP_STACK_BYTES = 1 << 30  # of address space; only what is used is taken
 
-_KEYFRAMES_HELD = 500  # whose separators' covariances GTSAM holds: 7 MB
+_KEYFRAMES_KEPT = 200  # whose separators GTSAM may keep: the way to the root, found again, is a twentieth of their cost
+
+Solved: TypeAlias = gtsam.GaussianBayesTree | gtsam.Marginals | gtsam.ISAM2
+"""What covariances are read from; the first where the order of elimination was given."""
 
 _T = TypeVar("_T")
 
@@ -73,93 +76,71 @@ def initial_values(
     return values
 
 
-def elimination_order(
-    frames: Sequence[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
-) -> gtsam.Ordering:
+def elimination_order(frames: Sequence[Keyframe], constants: int) -> gtsam.Ordering:
     """Keys in the order in which they are eliminated: poses by nested dissection of the chain, the installation last.
 
     The middle keyframe comes after both halves, and so in each half: a tree as deep as the logarithm of the length.
-    GTSAM's default, COLAMD, keeps the chain in its own order; it takes a time that grows with the square of the length
-    to find it, and so does GTSAM's search for the roots of a tree as deep as the chain is long. An estimated landmark
-    comes before the middle of the smallest part that holds all keyframes that see it.
+    GTSAM's default, COLAMD, leaves the chain in its own order. To find that, and then the roots of a tree as deep as
+    the chain is long, for each factor of the installation anew, takes a time that grows with the square of the length.
 
     Source: George 1973, "Nested dissection of a regular finite element mesh".
     """
-    keys = [[pose_key(f.k)] if f.ground is None else [pose_key(f.k), ground_key(f.k)] for f in frames]
-    landmarks = {} if factors.known else _landmarks_by_part(frames, accepted)
     ordering = gtsam.Ordering()
     parts = [(0, len(frames), False)]
     while parts:
         first, end, halves_done = parts.pop()
         middle = (first + end) // 2
         if halves_done:
-            for key in (*landmarks.get(middle, ()), *keys[middle]):
-                ordering.push_back(key)
+            ordering.push_back(pose_key(frames[middle].k))
+            if frames[middle].ground is not None:
+                ordering.push_back(ground_key(frames[middle].k))
         elif first < end:
             parts += [(first, end, True), (middle + 1, end, False), (first, middle, False)]
-    if factors.installation.constants:
+    if constants:
         ordering.push_back(INSTALLATION)
     return ordering
 
 
-def _landmarks_by_part(
-    frames: Sequence[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]]
-) -> dict[int, list[int]]:
-    """Keys of landmarks by the middle row of the smallest part in which all their sightings are."""
-    seen: dict[int, tuple[int, int]] = {}
-    for row, frame in enumerate(frames):
-        for sighting in accepted[frame.k]:
-            landmark_id = sighting.measurement.landmark_id
-            seen[landmark_id] = seen.get(landmark_id, (row, row))[0], row
-    found: dict[int, list[int]] = {}
-    for landmark_id, (earliest, latest) in seen.items():
-        first, end = 0, len(frames)
-        while not earliest <= (middle := (first + end) // 2) <= latest:
-            first, end = (first, middle) if latest < middle else (middle + 1, end)
-        found.setdefault(middle, []).append(landmark_key(landmark_id))
-    return found
-
-
-def eliminated(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
-) -> gtsam.GaussianBayesTree | gtsam.ISAM2:
+def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering | None) -> Solved:
     """The graph solved about these values, for its covariances; with long stretches that little determines, by QR.
 
     Raises:
         EstimatorError: the graph leaves a pose undetermined.
     """
     try:
-        return graph.linearize(values).eliminateMultifrontal(ordering)
+        if ordering is not None:
+            return graph.linearize(values).eliminateMultifrontal(ordering)
+        return with_deep_stack(lambda: gtsam.Marginals(graph, values))
     except RuntimeError:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.relinearizeSkip = 1
         solver = gtsam.ISAM2(params)
     try:
-        solver.update(graph, values)
+        with_deep_stack(lambda: solver.update(graph, values))
     except RuntimeError as error:
         why = str(error).strip().partition("\n\n")[0].replace("\n", " ")  # what follows is advice on GTSAM's use
         raise EstimatorError(f"the covariances of the batch cannot be had: {why}") from error
     return solver
 
 
-def marginal_covs(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, frames: Sequence[Keyframe]) -> FloatArray:
+def pose_covs(solution: Solved, frames: Sequence[Keyframe]) -> FloatArray:
     """Covariances ``(n, 3, 3)`` of the poses, right perturbation."""
     covs = np.empty((len(frames), 3, 3))
     for row, frame in enumerate(frames):
-        covs[row] = marginals.marginalCovariance(pose_key(frame.k))
-        forget_separators(marginals, row)
+        covs[row] = solution.marginalCovariance(pose_key(frame.k))
+        forget_separators(solution, row)
     return covs
 
 
-def forget_separators(marginals: gtsam.GaussianBayesTree | gtsam.ISAM2, row: int) -> None:
-    """After every so many keyframes: what GTSAM holds to find covariances near to those already found.
+def forget_separators(solution: Solved, row: int) -> None:
+    """After every so many keyframes: what GTSAM has kept of the way from the root to those before.
 
-    With 40 parameters of the installation that is 14 kB a keyframe. Of a tree that was ordered by nested dissection
-    the next keyframe needs but a logarithm of it again; ISAM2's is as deep as the chain is long.
+    That is 14 kB a keyframe with 40 parameters of the installation, 1 MB with 360. In a tree made by nested dissection
+    the way of the next keyframe is short; in the others, of GTSAM's order, it may be as long as the chain.
     """
-    if row % _KEYFRAMES_HELD == _KEYFRAMES_HELD - 1 and isinstance(marginals, gtsam.GaussianBayesTree):
-        marginals.deleteCachedShortcuts()
+    if row % _KEYFRAMES_KEPT == _KEYFRAMES_KEPT - 1 and isinstance(solution, gtsam.GaussianBayesTree):
+        solution.deleteCachedShortcuts()
 
 
 def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
@@ -174,7 +155,7 @@ def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> 
 def estimated_landmarks(
     accepted: Mapping[int, tuple[LandmarkFactor, ...]],
     values: gtsam.Values,
-    marginals: gtsam.GaussianBayesTree | gtsam.ISAM2,
+    marginals: Solved,
 ) -> dict[int, Landmark]:
     """Landmarks that were variables, with their covariance."""
     landmarks = {}

@@ -21,14 +21,19 @@ def run():
     return frames, factors, poses, 0.3 * rng.normal(size=len(factors.installation)) * factors.installation.sigmas
 
 
-def system(made, poses, theta, frames):
-    """Information matrix and vector of factors at these poses, and their error."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for factor in made:
-        graph.add(factor)
+def values_of(poses, theta, frames):
+    values = gtsam.Values()
     for frame, pose in zip(frames, poses, strict=True):
         values.insert(pose_key(frame.k), gtsam.Pose2(*pose))
     values.insert(INSTALLATION, theta)
+    return values
+
+
+def system(made, poses, theta, frames):
+    """Information matrix and vector of factors at these poses, and their error."""
+    graph, values = gtsam.NonlinearFactorGraph(), values_of(poses, theta, frames)
+    for factor in made:
+        graph.add(factor)
     ordering = gtsam.Ordering()
     for key in sorted(graph.keyVector()):
         ordering.push_back(key)
@@ -56,7 +61,8 @@ def test_sightings_and_the_prior_of_the_installation(run):
             lines = factors.observe([s.measurement for s in frame.sightings]).linearize(pose, theta)
             one_by_one += sighting_factors(frame.k, frame.sightings, lines, pose, theta)
     assert len(one_by_one) > 50
-    at_once = BatchSightings(frames, [frame.sightings for frame in frames], factors).factors(poses, theta)
+    sightings = BatchSightings(frames, [frame.sightings for frame in frames], factors)
+    at_once = sightings.factors(poses, theta, values_of(poses, theta, frames))
     for a, b in zip(system(one_by_one, poses, theta, frames), system(at_once, poses, theta, frames), strict=True):
         assert np.allclose(a, b, rtol=1e-8, atol=1e-9 * np.abs(a).max())
 
