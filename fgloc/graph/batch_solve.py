@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 
 def with_deep_stack(work: Callable[[], _T]) -> _T:
-    """Run in a thread of its own: GTSAM's elimination of a chain of 1e5 poses overflows the usual 8 MB of stack."""
+    """Run in a thread of its own: in its own order GTSAM overflows 8 MB of stack with a chain of 1e5 poses."""
     before = threading.stack_size(_DEEP_STACK_BYTES)
     try:
         with ThreadPoolExecutor(1) as pool:
