@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from benchmarks.adaptive_recordings import Recorded
 from benchmarks.adaptive_runs import CASES as FAILURES
-from benchmarks.adaptive_runs import Replayed, failure, replayed
+from benchmarks.adaptive_runs import Replayed, changed, failure, replayed
 from benchmarks.adaptive_scores import score
 from benchmarks.installed_recordings import Take, load
 from benchmarks.installed_scores import Errors, carried, errors, lost_share
@@ -26,6 +26,8 @@ from fgloc.evaluation.metrics import match_result
 from fgloc.types import RunResult
 
 _KINDS = {"frozen": "frozen", "onewheel": "left_wheel_dead"}  # the fault of the wheels in a case
+FOREIGN = "foreign"  # a case: the motion model is of another robot, one whose landmarks are beacons
+_FOREIGN_MODEL = {"motion": {"model": "shipped:mrclam/all"}}
 _NAMED_KINDS = {"frozen", "left_wheel_dead", "right_wheel_dead"}
 
 
@@ -96,11 +98,16 @@ def run(cell: Cell) -> Outcome:
         chain = [failure(described) for described in _chain(cell, recorded)]
     except ValueError as error:  # a drive too short for the failure
         return Outcome(failed=str(error))
-    smooth = not isinstance(cell.source, int) and cell.case in FAILURES and (mechanism is None or mechanism.batch)
+    smooth = (
+        not isinstance(cell.source, int)
+        and (cell.case == FOREIGN or cell.case in FAILURES)
+        and (mechanism is None or mechanism.batch)
+    )
     watching = watched(MECHANISMS) if mechanism is None else nullcontext({})
     with watching as acted, nullcontext() if mechanism is None else mechanism.off():
         try:
-            made = replayed(recorded, recorded.config, chain, seed, smooth)
+            config = changed(recorded.config, _FOREIGN_MODEL if cell.case == FOREIGN else {})
+            made = replayed(recorded, config, chain, seed, smooth)
         except (FglocError, RuntimeError, ValueError, ArithmeticError) as error:
             return Outcome(failed=f"{type(error).__name__}: {str(error).splitlines()[0][:200]}")
     if made is None:
@@ -110,6 +117,8 @@ def run(cell: Cell) -> Outcome:
 
 def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     kind, _, amount = cell.case.partition("_")
+    if kind == FOREIGN:
+        return []
     if kind == "ids":
         return [{"kind": "wrong_ids", "probability": 0.01 * int(amount)}]
     if kind == "moved" and amount:

@@ -33,6 +33,10 @@ def _without_wheels(result: Any, before: Any, budget: NoiseBudget, *args: Any) -
     return "wheels" in budget.rejected
 
 
+def _model_contradicted(found: Any, *_: Any) -> bool:
+    return found is not None and "learned" in found.sources
+
+
 OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_test",
@@ -40,6 +44,14 @@ OF_MOTION: tuple[Mechanism, ...] = (
         ("robust/glr_test.py", "robust/motion_faults.py"),
         (Switch("fgloc.robust.glr_test:GlrTest._worst", Returns((0.0, 1))),),
         Probe("fgloc.robust.glr_test:GlrTest.judge", lambda verdict, *_: verdict.flagged),
+        batch=True,
+    ),
+    Mechanism(
+        "fault_attribution",
+        "Where wheels and learned motion differ, the one that sightings contradict is left out.",
+        ("robust/fault_attribution.py", "robust/motion_faults.py"),
+        (Switch("fgloc.robust.fault_attribution:FaultAttribution.contradicted", Returns(None)),),
+        Probe("fgloc.robust.fault_attribution:FaultAttribution.contradicted", _model_contradicted),
         batch=True,
     ),
     Mechanism(

@@ -13,7 +13,7 @@ import numpy as np
 
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.clock_trials import clock_note, clock_trials
-from fgloc.calibration.contradictions import contradictions, model_misfit
+from fgloc.calibration.contradictions import contradictions
 from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
 from fgloc.config import Config
@@ -25,7 +25,6 @@ from fgloc.replay.options import Progress, RunMode, RunOptions
 from fgloc.replay.outcome import Outcome, never_found, sentence
 from fgloc.replay.replay import Replay
 from fgloc.replay.smoothing import SmoothedRun, smooth_run
-from fgloc.sensors import registry
 from fgloc.types import (
     Estimate,
     FloatArray,
@@ -74,9 +73,6 @@ def run(
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found, tried = installation_found(parts, outcome.roles, installed), None
     check = check and not wrong.sentences and options.get("on_step") is None
-    if check and (misfit := model_misfit(found, config.estimator.gate_probability)) is not None:
-        result = run(recording_path, map_path, registry.motion_model().without(config), mode, progress, **options)
-        return replace(result, mistakes=(misfit, *result.mistakes), notes=(misfit, *result.notes))
     if check:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))

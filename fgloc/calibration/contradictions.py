@@ -12,8 +12,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fgloc.sensors import registry
-from fgloc.stats import evidence_bound
 from fgloc.types import InstallationFound, Setting
 
 SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given
@@ -31,22 +29,6 @@ def contradictions(found: InstallationFound) -> tuple[str, ...]:
 def contradicted(s: Setting) -> bool:
     """Whether what was found is surely further from what was given than that may be off."""
     return abs(s.off) > SURE_SIGMAS and abs(s.found - s.given) > SURE_SIGMAS * s.sigma
-
-
-def model_misfit(found: InstallationFound, probability: float) -> str | None:
-    """Why the motion model is not of this robot; None if it may be, or if there is none.
-
-    Another robot's model is seldom off by a scale alone, but a scale that is off by more than chance allows tells it.
-
-    Args:
-        found: by a run with it.
-        probability: of the gate (`fgloc.stats.evidence_bound`).
-    """
-    model = registry.motion_model()
-    for s in found.settings:
-        if s.name in model.installation.sigmas and contradicted(s) and s.off**2 > evidence_bound(probability, 1):
-            return model.misfit(s)
-    return None
 
 
 def _landmarks(found: InstallationFound) -> Iterator[str]:

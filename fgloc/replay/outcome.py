@@ -43,7 +43,8 @@ class Outcome:
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
-        mistakes = (*wrong.sentences, *parts.diagnosis.mistakes, *unused_sightings(rejections, recording.roles, seen))
+        unused = unused_sightings(rejections, recording.roles, seen)
+        mistakes = (*wrong.sentences, *parts.diagnosis.mistakes, *unused, *parts.localizer.motion.mistakes)
         return cls(recording.roles, rejections, mistakes, tuple(hints), tuple(untried), notes)
 
     def failed(self, why: str) -> str:

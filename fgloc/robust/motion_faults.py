@@ -10,7 +10,8 @@ import numpy as np
 
 from fgloc.config import WeightsConfig
 from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.robust.glr_test import GlrTest
+from fgloc.robust.fault_attribution import Contradicted, FaultAttribution
+from fgloc.robust.glr_test import GlrResult, GlrTest
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors import registry
@@ -19,6 +20,9 @@ from fgloc.types import FloatArray, MotionReadings, Step
 _MOVED = 0.25  # of the reference source's travel: a wheel that turned less than this while it did more stood still
 _LEAST_M = 0.03  # of a wheel's travel: less is no evidence
 _EVIDENCE_S = 1.0  # of travel from which the kind of failure is determined
+_MODEL_WRONG_S = 10.0  # a model that was wrong is used again when it has agreed for this long: it mostly stays wrong
+KNOWN = "distrusted"  # a failure that the configuration states
+CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +31,14 @@ class FaultVerdict:
 
     Attributes:
         budget: which of them are rejected and why, or the scale on their covariances.
-        span: for how many of the newest steps, this one included, it holds.
+        earlier: what was found out of the newest steps, this one included ...
+        span: ... and of how many of them.
         nis: of the difference of wheels and reference source over the least likely window; NaN without one.
         threshold: that ``nis`` is held against.
     """
 
     budget: NoiseBudget = field(default_factory=NoiseBudget)
+    earlier: NoiseBudget = field(default_factory=NoiseBudget)
     span: int = 1
     nis: float = math.nan
     threshold: float = math.nan
@@ -41,26 +47,43 @@ class FaultVerdict:
 class MotionFaultMonitor:
     """Tests wheels against their reference source; known failures are taken as given.
 
+    Where the two differ, wheels are taken to be wrong, unless sightings contradict the learned motion instead.
+
     Attributes:
-        flags: how often each source was flagged, by "source.reason".
+        flags: how often wheels were flagged, by "source.reason".
+        compared_s: for how long there was a motion model to be compared with the wheels [s] ...
+        left_out_s: ... and for how long it was left out, as sightings contradict it.
     """
 
-    def __init__(self, config: WeightsConfig, sources: MotionSources, track_m: float | None) -> None:
+    def __init__(
+        self,
+        config: WeightsConfig,
+        sources: MotionSources,
+        track_m: float | None,
+        attribution: FaultAttribution | None = None,
+    ) -> None:
         """Set up.
 
         Args:
             config: thresholds, and known failures.
             sources: gives the difference of two readings with its covariance.
             track_m: distance of the wheels, to distinguish left from right; None: unknown.
+            attribution: tells by sightings which of the two is wrong; None: always the wheels.
         """
         self.flags: Counter[str] = Counter()
+        self.compared_s = self.left_out_s = 0.0
         self._config = config
         self._sources = sources
+        self._attribution = attribution
         self._track_m = track_m
         self._glr = GlrTest(config)
         self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, motion of wheels and reference
         self._first_ns: int | None = None  # of the run
-        self._reason = "slip"
+        self._wrong_before: dict[str, str] = {}  # as of the step before: sources, and why
+        self._reason = "slip"  # of the wheels
+        self._model_wrong_s = 0.0  # for how long the model is still left out
+        self._tested_s = 0.0  # since a model that is left out was last tested
+        self._differ = 0  # for how many steps the two have differed
 
     def begin(self, step: Step) -> None:
         """The first step of the run, or of a segment."""
@@ -79,31 +102,79 @@ class MotionFaultMonitor:
         if registry.motion_names().odometer in rejected:  # nothing to be found out
             self.reset()
         readings = replace(readings, **dict.fromkeys(rejected))
-        difference = source_difference(readings, self._sources) if self._config.adaptive else None
-        if difference is None:
-            return FaultVerdict(NoiseBudget(rejected))
-        verdict = self._glr.judge(
-            step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
-        )
-        self._travelled(step.dt, readings)
-        if not verdict.flagged:
-            budget = NoiseBudget(rejected, verdict.scale)
-            return FaultVerdict(budget, verdict.span, verdict.nis, verdict.bound)
-        if verdict.since:
-            self._reason = "slip"
-        reason = self._failure(verdict.since)
-        if verdict.since or reason != self._reason:
-            self.flags[f"{registry.motion_names().odometer}.{reason}"] += 1
-            if not verdict.since:  # the same failure, seen better now
-                self.flags -= Counter({f"{registry.motion_names().odometer}.{self._reason}": 1})
-            self._reason = reason
-        budget = NoiseBudget({registry.motion_names().odometer: reason, **rejected})
-        return FaultVerdict(budget, max(verdict.since, 1), verdict.nis, verdict.bound)
+        left_out = {registry.motion_names().model} if self._model_wrong_s > 0.0 else set()
+        difference = None
+        if self._config.adaptive:
+            difference = source_difference(replace(readings, **dict.fromkeys(left_out)), self._sources)
+        verdict = GlrResult(False, 0, math.nan, math.nan)
+        if difference is not None:
+            verdict = self._glr.judge(
+                step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
+            )
+            self._travelled(step.dt, readings)
+        wrong, span = self._wrong(step, readings, verdict)
+        scale = 1.0 if verdict.flagged else verdict.scale
+        self.compared_s += step.dt * (readings.learned is not None)
+        self.left_out_s += step.dt * (registry.motion_names().model in wrong)
+        budget, earlier = NoiseBudget({**wrong, **rejected}, scale), NoiseBudget(wrong if span else {}, scale)
+        return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
+
+    def _wrong(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
+        """The sources that are wrong with the reason, and of how many of the newest steps that is news."""
+        names, since, was_left_out = registry.motion_names(), verdict.since, self._model_wrong_s > 0.0
+        self._differ = since or self._differ + 1
+        found = self._contradicted(step, readings, verdict)
+        contradicted = frozenset() if found is None else found.sources
+        if names.model in contradicted:
+            self._model_wrong_s = _MODEL_WRONG_S
+            if not was_left_out:
+                self._glr.reset()  # wheels are compared with another source from now on
+        elif found is not None:
+            self._model_wrong_s = max(self._model_wrong_s - self._config.window_s, 0.0)
+        if verdict.flagged:
+            self._reason = self._failure(since)
+        wrong = {names.model: CONTRADICTED} if self._model_wrong_s > 0.0 else {}
+        by_default = verdict.flagged and (was_left_out or names.model not in contradicted)
+        if names.odometer in contradicted or by_default:
+            wrong[names.odometer] = self._reason
+        before, self._wrong_before = self._wrong_before, wrong
+        if verdict.flagged:
+            self._count(before.get(names.odometer), wrong.get(names.odometer), since)
+        news = names.odometer in contradicted or (names.model in contradicted and not was_left_out)
+        if since or found is None or not news or before.keys() == wrong.keys():
+            return wrong, since
+        return wrong, found.steps
+
+    def _contradicted(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> Contradicted | None:
+        """What sightings exclude; None: they cannot tell, or need not be asked.
+
+        They are asked while wheels and learned motion differ; of a model that is left out, once every window.
+        """
+        if self._attribution is None or readings.learned is None:
+            return None
+        if self._model_wrong_s == 0.0:
+            self._tested_s = 0.0
+            return self._attribution.contradicted(self._differ) if verdict.flagged else None
+        self._tested_s += step.dt
+        if self._tested_s < self._config.window_s:
+            return None
+        found = self._attribution.contradicted(None)
+        if found is not None:
+            self._tested_s = 0.0
+        return found
+
+    def _count(self, before: str | None, why: str | None, since: int) -> None:
+        """Count a failure of the wheels that is new; one that is seen better now takes the place of the one before."""
+        odometer = registry.motion_names().odometer
+        if why is not None and (since or why != before):
+            self.flags[f"{odometer}.{why}"] += 1
+        if before is not None and not since and why != before:
+            self.flags -= Counter({f"{odometer}.{before}": 1})
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9
         end = start + step.dt
-        return {d.source: "distrusted" for d in self._config.distrust if start < d.end_s and end > d.start_s}
+        return {d.source: KNOWN for d in self._config.distrust if start < d.end_s and end > d.start_s}
 
     def _travelled(self, dt: float, readings: MotionReadings) -> None:
         reference = readings.learned or readings.gyro
@@ -127,5 +198,5 @@ class MotionFaultMonitor:
         if stood.all():
             return "frozen"
         if self._track_m is None or not stood.any():
-            return self._reason if not since else "slip"
+            return "slip" if since else self._reason
         return "left_wheel_dead" if stood[0] else "right_wheel_dead"

@@ -16,12 +16,15 @@ from fgloc.graph.estimator import Estimator
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.noise_budget import COVARIANCE_FACTOR, NoiseBudget
 from fgloc.robust.decision_log import flag_notes, motion_decisions
+from fgloc.robust.fault_attribution import FaultAttribution
 from fgloc.robust.lift import LiftMonitor
-from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
+from fgloc.robust.motion_faults import KNOWN, FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors import registry
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
+
+_CARRIED = "carried"  # why nothing of a robot that was lifted enters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +68,8 @@ class MotionJudge:
         self.sources = MotionSources(config, sensors, estimator.factors)
         self.rejections: Counter[str] = Counter()
         self._estimator = estimator
-        self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m)
+        attribution = FaultAttribution(config, estimator) if self.sources.learned_is_independent else None
+        self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m, attribution)
         self._lift = LiftMonitor()
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
@@ -139,7 +143,16 @@ class MotionJudge:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know of the sources, one sentence each."""
-        return tuple(flag_notes(self._faults.flags))
+        return (*self._model_notes(), *flag_notes(self._faults.flags))
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """The sentence on a motion model that sightings contradict most of the time."""
+        return self._model_notes() if self._faults.left_out_s > 0.5 * self._faults.compared_s else ()
+
+    def _model_notes(self) -> tuple[str, ...]:
+        left_out_s = self._faults.left_out_s
+        return (registry.motion_model().left_out(left_out_s),) if left_out_s > 0.0 else ()
 
     def _revise(self, verdict: FaultVerdict) -> tuple[Decision, ...]:
         """Combine the motion of earlier steps anew, back to where the sources began to differ.
@@ -151,7 +164,7 @@ class MotionJudge:
         decisions: list[Decision] = []
         frames = (log[i] for i in range(newest - verdict.span + 2, newest + 1) if i in log)
         for frame in (f for f in frames if f.prior is None):
-            revised = _revised(frame, verdict.budget)
+            revised = _revised(frame, verdict.earlier)
             if revised is None:
                 continue
             frame.budget = revised
@@ -164,17 +177,17 @@ class MotionJudge:
 
 def _carried() -> NoiseBudget:
     names = registry.motion_names()
-    return NoiseBudget({names.odometer: "carried", names.model: "carried"})
+    return NoiseBudget({names.odometer: _CARRIED, names.model: _CARRIED})
 
 
 def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:
     """The budget of an earlier step by what is known now; None: it stays."""
     before = frame.budget
-    odometer = registry.motion_names().odometer
-    if odometer in now.rejected:
-        if odometer in before.rejected:
+    if now.rejected:
+        known = {name: why for name, why in before.rejected.items() if why in (KNOWN, _CARRIED)}
+        if {**now.rejected, **known}.keys() == before.rejected.keys():
             return None
-        return replace(before, rejected={**before.rejected, odometer: now.rejected[odometer]})
+        return replace(before, rejected={**now.rejected, **known})
     if now.scale >= COVARIANCE_FACTOR * max(before.scale, 1.0):
         return replace(before, scale=now.scale)
     return None

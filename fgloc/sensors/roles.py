@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from fgloc.sensors.base import MotionInstallation, MotionRole, RawMistake
 from fgloc.sensors.noise_density import NoiseDensity
-from fgloc.types import FloatArray, LandmarkMap, Setting
+from fgloc.types import FloatArray, LandmarkMap
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -137,7 +137,7 @@ class ModelRole:
         correlation: how the errors of odometer and model go together; None: they are taken as independent.
         given: settings with another model; `pydantic.ValidationError` where there is none of this name.
         without: settings by which none is used.
-        misfit: what to tell the user where a setting that a run found says that the model is not of this robot.
+        left_out: what to tell the user where sightings contradicted the model for so long [s].
         shipped_name: ``shipped:NAME`` of a file that comes with the package; None for others.
     """
 
@@ -147,7 +147,7 @@ class ModelRole:
     correlation: Callable[[Config, MotionPredictor], ErrorCorrelation | None]
     given: Callable[[Config, Path], Config]
     without: Callable[[Config], Config]
-    misfit: Callable[[Setting], str]
+    left_out: Callable[[float], str]
     shipped_name: Callable[[Path], str | None]
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fgloc.sensors.learned.config import MotionConfig, shipped_name
 from fgloc.sensors.learned.installation import INSTALLATION
 from fgloc.sensors.roles import ModelRole, with_values
-from fgloc.types import FloatArray, Setting
+from fgloc.types import FloatArray
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -36,11 +36,10 @@ def _given(config: Config, model: Path) -> Config:
     return config.model_copy(update={"motion": motion})
 
 
-def _misfit(found: Setting) -> str:
+def _left_out(seconds: float) -> str:
     return (
-        f"The motion model is not of this robot: {found.name} would be {found.found:.3g} ± {found.sigma:.2g}, "
-        f"{found.given:.3g} was given; the run was made without it. Train one of this robot (fgloc train), or set "
-        "motion.use: false."
+        f"The motion model was left out for {seconds:.1f} s: sightings contradict it. It may be of another robot or "
+        "floor: train one of this robot (fgloc train), or set motion.use: false."
     )
 
 
@@ -50,6 +49,6 @@ ROLE = ModelRole(
     correlation=_correlation,
     given=_given,
     without=lambda config: with_values(config, "motion", {"use": False}),
-    misfit=_misfit,
+    left_out=_left_out,
     shipped_name=shipped_name,
 )
