@@ -154,10 +154,13 @@ def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float
 def found_again(recorded: Recorded, online: RunResult, kidnapped_s: float, events: Sequence[Event]) -> float:
     """From the first marker in view after the robot was carried away until the estimate is right and stays so [s].
 
-    If that never happens: until the end of the run.
+    If that never happens: until the end of the run; 0 if it sees no marker any more.
     """
     at_ns = recorded.start_ns + round(kidnapped_s * 1e9)
-    seen = min(e.stamp_ns for e in events if isinstance(e, CornersEvent) and e.sightings and e.stamp_ns > at_ns)
+    sightings = (e.stamp_ns for e in events if isinstance(e, CornersEvent) and e.sightings and e.stamp_ns > at_ns)
+    seen = min(sightings, default=None)
+    if seen is None:
+        return 0.0
     assert online.truth is not None
     truth = se2.interpolate(online.truth.stamps_ns, online.truth.poses, online.trajectory.stamps_ns)
     error = online.trajectory.poses - truth

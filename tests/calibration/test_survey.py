@@ -66,6 +66,7 @@ def test_places_and_directions_are_found(found):
     assert sigma[:, :3].max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_file_is_taken_as_it_is(bag, tmp_path):
     out = tmp_path / "map.yaml"
     given = ["--dictionary", "DICT_4X4_50", "--size", "0.25"]
@@ -89,7 +90,9 @@ def test_writing_and_reading_keeps_the_map(found, tmp_path):
 
 def test_several_bags_make_one_map(tmp_path):
     halves = [
-        write_world(tmp_path / str(n), World(room(), seed=n, seconds=11.0, start_s=s, start_ns=(n + 1) * 10**18))
+        write_world(
+            tmp_path / str(n), World(room(), seed=n, seconds=11.0, start_s=s, start_ns=(n + 1) * 10**18)
+        )
         for n, s in enumerate((0.0, 9.0))
     ]
     both = survey(halves, settings())

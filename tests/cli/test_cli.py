@@ -245,6 +245,7 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
         assert str(tmp_path / "out" / mode / "report.html") in stdout
 
 
+@pytest.mark.slow
 def test_bundled_sample_is_localised(tmp_path):
     code, stdout, _ = fgloc("demo", "--out", tmp_path)
     assert code == 0
