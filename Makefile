@@ -33,10 +33,10 @@ follow: .venv/.sim
 	$(BIN)/fgloc sim follow-demo --out follow-out --workers $(JOBS)
 
 test: .venv/.dev
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 
 test-all: .venv/.docs
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 check: .venv/.dev
 	$(BIN)/ruff format --check .
@@ -54,7 +54,7 @@ docs: .venv/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 docs-test: .venv/.docs
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile tests/docs
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal tests/docs
 
 bench: .venv/.dev
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
