@@ -22,9 +22,12 @@ class Align(StrEnum):
 def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
     """Tell what a recording holds. Topics, rates, gaps, what a run would use, what looks wrong (also with the map)."""
     from fgloc.diagnosis.gross_mistakes import inspect_all
+    from fgloc.errors import MapError
     from fgloc.recording.files import find_beside
     from fgloc.recording.info import format_info
 
+    if map_file is not None and not map_file.exists():
+        raise MapError(f"{map_file}: there is no such file; give the map, or leave --map out")
     map_path = map_file or find_beside(bag, "map.yaml")
     say(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)
 

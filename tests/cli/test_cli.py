@@ -191,6 +191,10 @@ def test_map_surveys_the_beacons(bag, tmp_path):
             assert surveyed == pytest.approx(math.dist(BEACONS[i], BEACONS[j]), abs=0.15)
 
 
+def test_info_with_a_map_that_is_not_there_is_an_error(bag, tmp_path):
+    assert "there is no such file" in refused("info", bag, "--map", tmp_path / "map.yaml")
+
+
 def test_info_names_what_would_be_used(bag):
     code, stdout, _ = fgloc("info", bag)
     assert code == 0
