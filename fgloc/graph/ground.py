@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from fgloc import se2
@@ -34,11 +33,15 @@ _EPS = 1e-6
 
 def ground_key(k: int) -> int:
     """Key of height, roll and pitch of keyframe k: one vector."""
+    import gtsam  # not where a set-up is checked without a graph: it takes 0.15 s to load
+
     return int(gtsam.symbol("g", k))
 
 
 def of_ground(pose: int) -> int:
     """Key of height, roll and pitch of the keyframe whose pose has this key."""
+    import gtsam
+
     return ground_key(gtsam.Symbol(pose).index())
 
 
