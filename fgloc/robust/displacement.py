@@ -32,7 +32,7 @@ def by_displacement(one: Linearized, pose: FloatArray) -> FloatArray:
     return np.asarray(-one.J[:, :2] @ np.array([[c, s], [-s, c]]))
 
 
-def turned(one: Linearized, rows: tuple[int, int]) -> FloatArray:
+def rotation_cov(one: Linearized, rows: tuple[int, int]) -> FloatArray:
     """Covariance ``(d, d)`` of a marker's residual if whoever moved it also turned it, and hung it higher or lower.
 
     Args:

@@ -87,11 +87,11 @@ class FaultAttribution:
                 return None
             seen = bool(frame.sightings or frame.rejected)
             if seen or stretch:
-                stretch.insert(0, frame)
+                stretch.append(frame)
             age_s = self._estimator.elapsed_s - frame.elapsed_s
             began = steps is not None and k <= newest + 1 - steps
             if len(stretch) > 1 and seen and (began or age_s >= self._config.weights.window_s):
-                return stretch
+                return stretch[::-1]
             if frame.prior is not None or age_s > self._config.estimator.lag_s:
                 return None
         return None

@@ -25,7 +25,7 @@ from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition, sighting_whitening
 from fgloc.graph.observation import Observations
-from fgloc.robust.displacement import MOVED, Explained, by_displacement, explain, turned
+from fgloc.robust.displacement import MOVED, Explained, by_displacement, explain, rotation_cov
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
@@ -209,7 +209,7 @@ class LandmarkModes:
             if one.behind:
                 break
             found, B = innovation(P, [one]), by_displacement(one, belief.pose)
-            W = sighting_whitening(found.cov + turned(one, rows)) / scale
+            W = sighting_whitening(found.cov + rotation_cov(one, rows)) / scale
             G = -W @ (B + found.H @ self._M[row])
             w = W @ (found.residual - B @ moved)
             explained = explain(w, G[None], self._moved[row, None], self._cov[row, None])
@@ -231,17 +231,19 @@ class LandmarkModes:
             cost[row], moved[row], cov[row] = own[0][0], own[1][0], own[2][0]
         explains = cost < misread
         if explains[row]:
-            self._inform(row, np.linalg.inv(cov[row]) - np.linalg.inv(self._cov[row]), isinstance(m, PixelMeasurement))
+            self._add_information(
+                row, np.linalg.inv(cov[row]) - np.linalg.inv(self._cov[row]), isinstance(m, PixelMeasurement)
+            )
         self._moved[explains], self._cov[explains] = moved[explains], cov[explains]
         self._evidence[:, row] += min(float(w @ w), misread) - np.minimum(cost, misread)
         self._seen[:, row] += 1.0
         self._explained[row] += explains[row]
 
-    def _inform(self, row: int, information: FloatArray, same_errors: bool) -> None:
+    def _add_information(self, row: int, information: FloatArray, same_errors: bool) -> None:
         """What a sighting knows of its landmark's displacement ``(2, 2)``.
 
         Errors of a marker's corners are the same in one image after another while the view hardly changes: a few tenths
-        of a pixel that put a small one at 6 m a hand's breadth off. So its sharpest sighting counts for all of them.
+        of a pixel that put a small one at 6 m off by 0.17 m. So its sharpest sighting counts for all of them.
         """
         if not same_errors:
             self._information[row] += information

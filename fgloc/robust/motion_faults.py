@@ -83,7 +83,7 @@ class MotionFaultMonitor:
         self._reason = "slip"  # of the wheels
         self._model_wrong_s = 0.0  # for how long the model is still left out
         self._tested_s = 0.0  # since a model that is left out was last tested
-        self._differ = 0  # for how many steps the two have differed
+        self._differing_steps = 0  # for how many steps the two have differed
 
     def begin(self, step: Step) -> None:
         """The first step of the run, or of a segment."""
@@ -112,17 +112,17 @@ class MotionFaultMonitor:
                 step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
             )
             self._travelled(step.dt, readings)
-        wrong, span = self._wrong(step, readings, verdict)
+        wrong, span = self._wrong_sources(step, readings, verdict)
         scale = 1.0 if verdict.flagged else verdict.scale
         self.compared_s += step.dt * (readings.learned is not None)
         self.left_out_s += step.dt * (registry.motion_names().model in wrong)
         budget, earlier = NoiseBudget({**wrong, **rejected}, scale), NoiseBudget(wrong if span else {}, scale)
         return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
 
-    def _wrong(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
+    def _wrong_sources(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
         """The sources that are wrong with the reason, and of how many of the newest steps that is news."""
         names, since, was_left_out = registry.motion_names(), verdict.since, self._model_wrong_s > 0.0
-        self._differ = since or self._differ + 1
+        self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)
         contradicted = frozenset() if found is None else found.sources
         if names.model in contradicted:
@@ -154,7 +154,7 @@ class MotionFaultMonitor:
             return None
         if self._model_wrong_s == 0.0:
             self._tested_s = 0.0
-            return self._attribution.contradicted(self._differ) if verdict.flagged else None
+            return self._attribution.contradicted(self._differing_steps) if verdict.flagged else None
         self._tested_s += step.dt
         if self._tested_s < self._config.window_s:
             return None

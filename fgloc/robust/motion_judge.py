@@ -159,6 +159,8 @@ class MotionJudge:
 
         Wheels that are wrong are left out; before that is certain, covariances are scaled.
         """
+        if not verdict.earlier.rejected and verdict.earlier.scale < COVARIANCE_FACTOR:
+            return ()
         log, newest = self._estimator.log.keyframes, self._estimator.k
         changed: dict[int, Sequence[MotionMeasurement]] = {}
         decisions: list[Decision] = []
