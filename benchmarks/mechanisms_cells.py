@@ -27,6 +27,8 @@ from fgloc.types import RunResult
 
 _KINDS = {"frozen": "frozen", "onewheel": "left_wheel_dead"}  # the fault of the wheels in a case
 FOREIGN = "foreign"  # a case: the motion model is of another robot, one whose landmarks are beacons
+PUSHED = "pushed"  # a case: for 0.6 s nothing is recorded, twice, so that the robot is 15 to 20 cm farther on at once
+_PUSHED_S = [[20.0, 20.6], [40.0, 40.6]]
 _FOREIGN_MODEL = {"motion": {"model": "shipped:mrclam/all"}}
 _NAMED_KINDS = {"frozen", "left_wheel_dead", "right_wheel_dead"}
 
@@ -100,7 +102,7 @@ def run(cell: Cell) -> Outcome:
         return Outcome(failed=str(error))
     smooth = (
         not isinstance(cell.source, int)
-        and (cell.case == FOREIGN or cell.case in FAILURES)
+        and (cell.case in (FOREIGN, PUSHED) or cell.case in FAILURES)
         and (mechanism is None or mechanism.batch)
     )
     watching = watched(MECHANISMS) if mechanism is None else nullcontext({})
@@ -119,6 +121,8 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     kind, _, amount = cell.case.partition("_")
     if kind == FOREIGN:
         return []
+    if kind == PUSHED:
+        return [{"kind": "kidnap", "when": {"intervals": _PUSHED_S}}]
     if kind == "ids":
         return [{"kind": "wrong_ids", "probability": 0.01 * int(amount)}]
     if kind == "moved" and amount:
@@ -131,7 +135,7 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
 
 def _scored(cell: Cell, recorded: Recorded, chain: Sequence[Failure], made: Replayed, acted: dict[str, int]) -> Outcome:
     config, online, batch = recorded.config, made.online, made.batch
-    lifted = [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap | Lift)]
+    lifted = [] if cell.case == PUSHED else [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap | Lift)]
     unknown = carried(made.given, recorded.start_ns + round(lifted[0] * 1e9)) if lifted else None
     figures = score(recorded, 0, config, online, None, chain, made.given)
     reasons = {d.reason for d in online.decisions if d.kind == "wheels"} & _NAMED_KINDS

@@ -14,13 +14,13 @@ from benchmarks.common import Row
 from benchmarks.installed_recordings import Take
 from benchmarks.installed_runs import CASES as INSTALLED_CASES
 from benchmarks.installed_scores import Errors
-from benchmarks.mechanisms_cells import FOREIGN, Cell, Outcome
+from benchmarks.mechanisms_cells import FOREIGN, PUSHED, Cell, Outcome
 from benchmarks.mechanisms_effect import MODES, failed, mean, ratio
 from benchmarks.mechanisms_robots import ROBOT_CASES
 from benchmarks.mechanisms_switch import Mechanism
 
 Outcomes = Mapping[Cell, Outcome]
-CASES = (*INSTALLED_CASES, FOREIGN)
+CASES = (*INSTALLED_CASES, FOREIGN, PUSHED)
 SLIP_CASES = ("none", "slip", "mu01")
 MOVED_CASES, MISREAD_CASES = ("moved_30", "moved_70", "moved_150"), ("ids_10", "ids_30", "ids_50")  # cm; percent
 _LEAST_M = 0.03  # of a slip
