@@ -34,7 +34,12 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "place_search",
         "While every sighting is refused, another place that explains them is searched for on the map.",
-        ("relocalization/tracking_state.py", "relocalization/global_search.py", "relocalization/place_search.py"),
+        (
+            "relocalization/tracking_state.py",
+            "relocalization/global_search.py",
+            "relocalization/place_search.py",
+            "relocalization/gaussian_sum.py",
+        ),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
         batch=True,
@@ -62,20 +67,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         (Switch(f"{_WHERE}.keeps_initial_pose", _never),),
         Probe(f"{_WHERE}.gate_initial_pose", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,
-    ),
-    Mechanism(
-        "gaussian_sum",
-        "Gaussian sum: poses before the sightings of beacons are enough to confirm a place.",
-        ("relocalization/gaussian_sum.py",),
-        (Switch(f"{_WHERE}.unconfirmed", Returns(None)),),
-        Probe(f"{_WHERE}.unconfirmed", not_none),
-    ),
-    Mechanism(
-        "start_leave_one_out",
-        "A place found from beacons must hold without any one of them.",
-        ("relocalization/place_search.py",),
-        (Switch(f"{_SEARCH}:PlaceSearch._checked", Returns(True)),),
-        Probe(f"{_SEARCH}:PlaceSearch._checked", lambda checked, *_: not checked),
     ),
     Mechanism(
         "start_trimming",

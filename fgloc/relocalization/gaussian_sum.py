@@ -1,8 +1,13 @@
-"""The pose before it is confirmed: a bounded Gaussian sum over every place that the sightings of beacons allow.
+"""Where a robot is among beacons: a bounded Gaussian sum over every place that their sightings allow.
 
 One range and bearing leaves the pose free to turn about the beacon. That ring is cut into Gaussians, each with its own
 extended Kalman filter and its own weight; later sightings of other beacons decide between them. In exponential
 coordinates on the right the ring is a straight line, so that each piece of it is represented exactly.
+
+Three things can be wrong, each with its own prior. A sighting has a wrong id: then it is one of another beacon, or of
+nothing in the map. A beacon does not stand where the map has it: then its sightings say nothing of the place, but they
+agree with each other, and count as one contradiction, however often it was seen. The robot was carried or pushed: then
+it may be anywhere on the ring of the first sighting that the most probable place refuses.
 
 Source: Alspach and Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE TAC 17(4), 1972;
 rotation about a point of the body as a one-parameter subgroup: Solà et al., "A micro Lie theory", 2018.
@@ -12,24 +17,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.joint import FAR_M2, LINEAR_M, LINEAR_RAD, MOST_JOINT, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import repetition
+from fgloc.relocalization.beacon_geometry import RING, SeenBeacons, log_density, moments, residuals, ring, rotated
+from fgloc.relocalization.pose_consensus import MAX_SIGMA
 from fgloc.robust.landmark_modes import MOST_HYPOTHESES
-from fgloc.stats import GATE
+from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
-_RING = 24  # pieces of a ring, 15 degrees apart
-_OUTLIER = 0.02  # share of sightings with a wrong id, or of a beacon that was moved ...
-_UNIFORM = 1.0 / (2.0 * math.pi * math.sqrt(FAR_M2))  # ... seen in any direction [1/rad], as far as that [1/m]
-_NEGLIGIBLE = -math.log(1.0 - GATE)  # in log weight, below that of the most probable
-_AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
+WRONG_LANDMARK = 0.05  # prior probability that a landmark is not where the map has it, each independently
+CARRIED = 1e-3  # prior probability that a robot was carried away when a sighting contradicts its pose
+_IN_PLACE, _MOVED = math.log(1.0 - WRONG_LANDMARK), math.log(WRONG_LANDMARK)
+_CERTAIN = 0.99  # probability from which the graph begins at a place
+_UNIFORM = -math.log(2.0 * math.pi * math.sqrt(FAR_M2))  # log density of a sighting: any bearing [rad] and range [m]
+_MISREAD = 0.02  # share of sightings with a wrong id, as long as nothing is known of it
+# Log weight below the most probable one's that a hypothesis may yet gain: what carrying costs, and two sightings.
+_NEGLIGIBLE = math.log(RING / CARRIED) - 2.0 * math.log(1.0 - GATE)
+_AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least ...
+_FAR = 0.01  # ... but may be anywhere with this share of the density among them
 _SAME = np.array([LINEAR_M, LINEAR_M, LINEAR_RAD])  # two hypotheses this near are one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Displacement:
+    """Of a landmark that stands elsewhere than the map says: ``(2,)`` [m], and twice the log odds that it does."""
+
+    by: FloatArray
+    evidence: float
 
 
 class GaussianSum:
@@ -38,14 +60,14 @@ class GaussianSum:
     Attributes:
         poses: ``(n, 3)`` ``T_map_base``.
         covs: ``(n, 3, 3)`` of right perturbations.
-        log_weights: ``(n,)`` of the likelihood of all sightings so far, not normalized.
+        places: ``(L, 2)`` of all landmarks in the map.
     """
 
     def __init__(self, config: Config, landmark_map: LandmarkMap | None) -> None:
         self._config = config.landmarks
-        known = landmark_map.landmarks.values() if landmark_map is not None else ()
-        self._places = {m.landmark_id: m.position[:2] for m in known}
-        places = np.array(list(self._places.values())).reshape(-1, 2)
+        known = list(landmark_map.landmarks.values()) if landmark_map is not None else []
+        self._index = {m.landmark_id: k for k, m in enumerate(known)}
+        self.places = places = np.array([m.position[:2] for m in known]).reshape(-1, 2)
         self._middle = places.mean(axis=0) if len(places) else np.zeros(2)
         around = np.cov(places.T, bias=True) if len(places) else np.eye(2)
         self._nearness = np.linalg.inv(_AROUND**2 * around + np.eye(2) * _LEAST_AROUND_M**2)
@@ -53,42 +75,87 @@ class GaussianSum:
 
     def reset(self) -> None:
         """Nothing is known of the pose."""
-        self.poses, self.covs, self.log_weights = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
+        self.poses, self.covs = np.zeros((0, 3)), np.zeros((0, 3, 3))
+        self._log_prior = np.zeros(0)  # (n,), with what was merged into each
+        self._log_elsewhere = 0.0  # log prior of all places but a tracked one
+        # Sightings with right ids, and with wrong ones, by the most probable hypothesis; the prior counts as well
+        self._ids = np.array([1.0 / _MISREAD - 1.0, 1.0])
         self._last_ns: dict[int, int] = {}  # by landmark
-        self._none = 0.0  # log likelihood of all sightings if all of them are outliers
+        self._rows: dict[int, int] = {}  # of landmarks in what follows
+        self._in_place = np.zeros((0, 0))  # (n, L) log likelihood of each one's sightings if it is where the map has it
+        self._moved, self._all_misread = np.zeros(0), np.zeros(0)  # (L,) if it is not; if each of them has a wrong id
+        self._beacons = SeenBeacons()
 
-    def add(self, motions: Sequence[MotionMeasurement], sightings: Sequence[LandmarkMeasurement]) -> None:
-        """Take in one step. The work is bounded: so many hypotheses, so many sightings."""
-        if len(self.poses) and motions:
+    def add(
+        self,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[LandmarkMeasurement],
+        tracked: PoseWithCovariance | None = None,
+    ) -> None:
+        """Take in one step. The work is bounded: so many hypotheses and sightings, times the landmarks in the map.
+
+        Args:
+            motions: over the step.
+            sightings: made in it.
+            tracked: where the robot is after them if it is where it was estimated to be; of the first step.
+        """
+        if motions and len(self.poses):
             self._predict(*fuse(motions))
-        beacons = [m for m in sightings if isinstance(m, PointMeasurement) and m.landmark_id in self._places]
+        beacons = [m for m in sightings if isinstance(m, PointMeasurement) and m.landmark_id in self._index]
+        if beacons and tracked is not None and not self.has_seen:
+            self.poses, self.covs, self._log_prior = tracked.pose[None].copy(), tracked.cov[None].copy(), np.zeros(1)
+            self._in_place, self._log_elsewhere = np.zeros((1, 0)), math.log(CARRIED)
         for m in beacons[:: -(-len(beacons) // MOST_JOINT) or 1]:
             self._take(m)
+
+    @property
+    def has_seen(self) -> bool:
+        """Whether there was any sighting of a beacon."""
+        return bool(self._rows)
+
+    @property
+    def log_weights(self) -> FloatArray:
+        """``(n,)`` of the likelihood of all sightings so far, not normalized."""
+        if not len(self.poses):
+            return np.zeros(0)
+        return np.asarray(self._log_prior + self._by_landmark().sum(1))
+
+    def _by_landmark(self) -> FloatArray:
+        """``(n, L)`` log likelihood of each landmark's sightings, be it in place or moved."""
+        return np.logaddexp(_IN_PLACE + self._in_place, _MOVED + self._moved)
+
+    def confirmed(self, tracked: PoseWithCovariance | None = None) -> PoseWithCovariance | None:
+        """The most probable hypothesis if it is known well enough, and so probable that it may be taken as known.
+
+        Args:
+            tracked: where the robot is estimated to be; then it has to be elsewhere.
+        """
+        best = self.most_probable()
+        if best is None or (np.sqrt(np.diag(best.cov)) > MAX_SIGMA).any():
+            return None
+        off = np.abs(self.poses - best.pose)
+        off[:, 2] = np.abs(se2.wrap_array(off[:, 2]))
+        there = (off < MAX_SIGMA).all(1) if tracked is None else (off < MAX_SIGMA).all(1) & self._differs_from(tracked)
+        elsewhere = self._log_elsewhere + (_MOVED + self._moved).sum()  # with all landmarks moved
+        weights = np.append(self.log_weights, elsewhere)
+        weights = np.exp(weights - weights.max())
+        return best if weights[:-1][there].sum() > _CERTAIN * weights.sum() else None
+
+    def _differs_from(self, pose: PoseWithCovariance) -> NDArray[np.bool_]:
+        """Which hypotheses are not this pose."""
+        off = self.poses - pose.pose
+        off[:, 2] = se2.wrap_array(off[:, 2])
+        cov = rotated(self.covs, self.poses[:, 2]) + rotated(pose.cov[None], pose.pose[2:])
+        nis = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
+        return np.asarray(nis > chi2_bound(GATE, se2.DOF))
 
     def belief(self) -> PoseWithCovariance | None:
         """Mean and covariance of the whole sum, with what the bent rings add; None before the first sighting."""
         if not len(self.poses):
             return None
         weights = np.exp(self.log_weights - self.log_weights.max())
-        weights /= weights.sum()
-        variances, axes = np.linalg.eigh(self.covs)
-        spread = axes * np.sqrt(se2.DOF * np.maximum(variances, 0.0))[:, None, :]
-        points = np.stack(
-            [
-                se2.compose_array(self.poses, se2.exp_array(sign * spread[:, :, j]))
-                for j in range(se2.DOF)
-                for sign in (-1.0, 1.0)
-            ],
-            1,
-        )
-        share = np.repeat(weights / (2 * se2.DOF), 2 * se2.DOF)
-        x, y, yaw = points.reshape(-1, 3).T
-        middle = math.atan2(float(share @ np.sin(yaw)), float(share @ np.cos(yaw)))
-        mean = np.array([share @ x, share @ y, middle])
-        off = np.column_stack([x - mean[0], y - mean[1], se2.wrap_array(yaw - middle)])
-        mean[2] = se2.wrap(middle + float(share @ off[:, 2]))
-        off[:, 2] -= share @ off[:, 2]
-        return PoseWithCovariance(mean, se2.rotate_cov((off * share[:, None]).T @ off, -float(mean[2])))
+        weights[weights < 1.0 - GATE] = 0.0
+        return moments(self.poses, self.covs, weights / weights.sum())
 
     def most_probable(self) -> PoseWithCovariance | None:
         """The hypothesis with the largest weight; None before the first sighting."""
@@ -97,45 +164,96 @@ class GaussianSum:
         best = int(self.log_weights.argmax())
         return PoseWithCovariance(self.poses[best], self.covs[best])
 
+    def displaced(self) -> dict[int, Displacement]:
+        """Of each beacon seen, where it is and whether the map is wrong, if the most probable hypothesis is right."""
+        if not len(self.poses):
+            return {}
+        best = int(self.log_weights.argmax())
+        odds = 2.0 * (_MOVED + self._moved - _IN_PLACE - self._in_place[best])
+        stands = {i: se2.compose(self.poses[best], [*self._beacons.place(i), 0.0])[:2] for i in self._rows}
+        return {i: Displacement(stands[i] - self.places[self._index[i]], odds[row]) for i, row in self._rows.items()}
+
     def _predict(self, motion: FloatArray, cov: FloatArray) -> None:
         self.poses = se2.compose_array(self.poses, np.broadcast_to(motion, self.poses.shape))
         ad = se2.adjoint(se2.inverse(motion))
         self.covs = ad @ self.covs @ ad.T + cov
+        self._beacons.move(motion, cov)
 
     def _take(self, m: PointMeasurement) -> None:
-        R = self._cov(m)
-        seen_before = m.landmark_id in self._last_ns
+        R, new = self._cov(m), m.landmark_id not in self._rows
+        right, wrong = self._ids
+        self._right_id, self._wrong_id = math.log(right / (right + wrong)), math.log(wrong / (right + wrong)) + _UNIFORM
         self._last_ns[m.landmark_id] = m.stamp_ns
-        outlier = math.log(_OUTLIER * _UNIFORM)
+        if new:
+            self._rows[m.landmark_id] = len(self._rows)
+            self._in_place = np.pad(self._in_place, ((0, 0), (0, 1)))
+            self._moved, self._all_misread = np.append(self._moved, 0.0), np.append(self._all_misread, 0.0)
+        row = self._rows[m.landmark_id]
+        rings = [(self._log_elsewhere, self._all_misread.copy())] if new and not self._log_elsewhere else []
+        before = self._log_prior, self._by_landmark()
+        unexplained = self._anywhere(m, R, row, new)
         if len(self.poses):
-            self._update(m, R, outlier)
-        if not seen_before:  # and everything before it may have been wrong
-            poses, covs = _ring(self._places[m.landmark_id], m, R)
-            off = poses[:, :2] - self._middle
-            near = -0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off)
-            born = near + self._none + math.log((1.0 - _OUTLIER) * _UNIFORM / _RING)
-            self.poses = np.concatenate([self.poses, poses])
-            self.covs = np.concatenate([self.covs, covs])
-            self.log_weights = np.concatenate([self.log_weights, born])
-        self._none += outlier
+            best = int((before[0] + before[1].sum(1)).argmax())
+            refused = not self._update(m, R, row)[best]
+            self._ids[int(refused and unexplained)] += 1.0
+            if refused:  # the robot may have been carried away just now; that each beacon was moved is asked anew
+                rings.append((before[0][best] + math.log(CARRIED), before[1][best]))
+        for log_prior, in_place in rings:
+            self._add_ring(m, R, row, log_prior, in_place)
+        self._all_misread[row] += self._wrong_id
         self._prune()
 
-    def _update(self, m: PointMeasurement, R: FloatArray, outlier: float) -> None:
-        """Kalman's update of each hypothesis that the sighting suits; for the others it is an outlier."""
-        residual, J = _residuals(self.poses, self._places[m.landmark_id], m)
+    def _add_ring(self, m: PointMeasurement, R: FloatArray, row: int, log_prior: float, in_place: FloatArray) -> None:
+        """Hypotheses all around the beacon of a sighting, with this prior and ``(L,)`` evidence of those before it."""
+        poses, covs = ring(self.places[self._index[m.landmark_id]], m, R)
+        off = poses[:, :2] - self._middle
+        near = np.logaddexp(-0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off), math.log(_FAR))
+        self.poses = np.concatenate([self.poses, poses])
+        self.covs = np.concatenate([self.covs, covs])
+        self._log_prior = np.concatenate([self._log_prior, log_prior + near - math.log(RING)])
+        in_place = np.tile(in_place, (len(poses), 1))
+        in_place[:, row] += self._right_id + _UNIFORM
+        self._in_place = np.concatenate([self._in_place, in_place])
+
+    def _update(self, m: PointMeasurement, R: FloatArray, row: int) -> NDArray[np.bool_]:
+        """Kalman's update of the hypotheses that a sighting suits; for the others it is an outlier. Which it suits."""
+        residual, J = residuals(self.poses, self.places[self._index[m.landmark_id]], m)
         PJ = self.covs @ J.transpose(0, 2, 1)
         S = J @ PJ + R
-        weighed = np.linalg.solve(S, residual[:, :, None])[:, :, 0]
-        nis = np.einsum("ni,ni->n", residual, weighed)
-        fits = math.log((1.0 - _OUTLIER) / (2.0 * math.pi)) - 0.5 * (nis + np.log(np.linalg.det(S)))
-        good = fits > outlier
+        fits, misread = self._right_id + log_density(residual, S), self._misread_density(m, R)
+        self._in_place[:, row] += np.maximum(fits, misread)
+        good: NDArray[np.bool_] = (fits > misread) & (_IN_PLACE + self._in_place[:, row] > _MOVED + self._moved[row])
         gain = np.linalg.solve(S, PJ.transpose(0, 2, 1)).transpose(0, 2, 1)
         poses = se2.compose_array(self.poses, se2.exp_array(np.einsum("nij,nj->ni", gain, residual)))
         kept = np.eye(3) - gain @ J
         covs = kept @ self.covs @ kept.transpose(0, 2, 1) + gain @ R @ gain.transpose(0, 2, 1)
         self.poses = np.where(good[:, None], poses, self.poses)
         self.covs = np.where(good[:, None, None], covs, self.covs)
-        self.log_weights = self.log_weights + np.maximum(fits, outlier)
+        return good
+
+    def _misread_density(self, m: PointMeasurement, R: FloatArray) -> FloatArray:
+        """Log likelihood ``(n,)`` of a sighting whose id is wrong: of any other beacon, or of nothing in the map."""
+        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
+        x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
+        points = self.poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
+        off = points[:, None] - self.places
+        distances = np.einsum("nld,nld->nl", off, off)
+        distances[:, self._index[m.landmark_id]] = np.inf
+        residual, J = residuals(self.poses, self.places[distances.argmin(1)], m)
+        density = log_density(residual, J @ self.covs @ J.transpose(0, 2, 1) + R) - math.log(
+            max(len(self.places) - 1, 1)
+        )
+        density[distances.min(1) == np.inf] = -np.inf  # the map has no other
+        return np.asarray(self._wrong_id - math.log(2.0) + np.logaddexp(0.0, density - _UNIFORM))
+
+    def _anywhere(self, m: PointMeasurement, R: FloatArray, row: int, new: bool) -> bool:
+        """Evidence of a landmark that may stand anywhere, by its sightings; whether this one contradicts the others."""
+        likely = self._beacons.take(m, R, self._wrong_id - self._right_id)
+        if likely is not None:
+            self._moved[row] += self._right_id + likely
+        else:
+            self._moved[row] += self._right_id + _UNIFORM if new else self._wrong_id
+        return likely is None
 
     def _cov(self, m: PointMeasurement) -> FloatArray:
         """Of the sighting: with the errors that it shares with the last one of its landmark, and with all others."""
@@ -145,47 +263,20 @@ class GaussianSum:
 
     def _prune(self) -> None:
         """Merge what has become the same, and drop what is negligible."""
-        order = np.argsort(-self.log_weights)
-        order = order[self.log_weights[order] > self.log_weights[order[0]] - _NEGLIGIBLE]
-        kept: list[int] = []
-        weights = self.log_weights.copy()
-        poses = self.poses
-        for i in order:
-            if kept:
-                off = np.abs(poses[kept] - poses[i])
-                off[:, 2] = np.abs(se2.wrap_array(poses[kept][:, 2] - poses[i, 2]))
-                same = np.flatnonzero((off < _SAME).all(axis=1))
-                if len(same):
-                    weights[kept[same[0]]] = np.logaddexp(weights[kept[same[0]]], weights[i])
-                    continue
-            if len(kept) < MOST_HYPOTHESES:
-                kept.append(int(i))
-        self.poses, self.covs, self.log_weights = poses[kept], self.covs[kept], weights[kept]
-
-
-def _ring(place: FloatArray, m: PointMeasurement, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses ``(n, 3)`` all around a beacon seen so, with covariances that let each reach the next."""
-    yaws = np.linspace(-math.pi, math.pi, _RING, endpoint=False)
-    x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
-    c, s = np.cos(yaws), np.sin(yaws)
-    poses = np.column_stack([place[0] - c * x + s * y, place[1] - s * x - c * y, yaws])
-    about = np.array([y, -x, 1.0])  # turning about the point (x, y) of the body
-    J = np.array([[-y / m.range_m**2, x / m.range_m**2], [x / m.range_m, y / m.range_m]])
-    at = np.linalg.inv(J)  # of the point by bearing and range
-    cov = np.zeros((3, 3))
-    cov[:2, :2] = at @ R @ at.T
-    cov += np.outer(about, about) * (math.pi / _RING) ** 2
-    return poses, np.repeat(cov[None], _RING, axis=0)
-
-
-def _residuals(poses: FloatArray, place: FloatArray, m: PointMeasurement) -> tuple[FloatArray, FloatArray]:
-    """Measured minus predicted bearing and range ``(n, 2)``, and the prediction's Jacobian ``(n, 2, 3)``."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = place[0] - poses[:, 0], place[1] - poses[:, 1]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    r = np.maximum(np.hypot(x, y), LINEAR_M)
-    residual = np.column_stack([se2.wrap_array(m.bearing_rad - np.arctan2(y, x)), m.range_m - r])
-    J = np.zeros((len(poses), 2, 3))
-    J[:, 0] = np.column_stack([y / r**2, -x / r**2, -np.ones_like(r)])
-    J[:, 1] = np.column_stack([-x / r, -y / r, np.zeros_like(r)])
-    return residual, J
+        log_weights = self.log_weights
+        order = np.argsort(-log_weights)
+        order = order[log_weights[order] > log_weights[order[0]] - _NEGLIGIBLE]
+        off = np.abs(self.poses[order, None] - self.poses[order])
+        off[..., 2] = np.abs(se2.wrap_array(off[..., 2]))
+        before = np.tril((off < _SAME).all(-1), -1)  # the more probable ones that each is the same as
+        kept = np.ones(len(order), dtype=np.bool_)
+        for i in np.flatnonzero(before.any(1)):
+            same = np.flatnonzero(before[i] & kept)
+            if len(same):
+                kept[i], into = False, order[same[0]]
+                together = np.logaddexp(log_weights[into], log_weights[order[i]])
+                self._log_prior[into] += together - log_weights[into]
+                log_weights[into] = together
+        best = order[kept][:MOST_HYPOTHESES]
+        self.poses, self.covs, self._log_prior = self.poses[best], self.covs[best], self._log_prior[best]
+        self._in_place = self._in_place[best]

@@ -15,21 +15,21 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import FAR_M2, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.relocalization.gaussian_sum import GaussianSum
+from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.relocalization.gaussian_sum import Displacement, GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
 from fgloc.sensors.motion_compensation import compensated
 from fgloc.types import (
-    FloatArray,
     LandmarkMap,
     LandmarkMeasurement,
     MotionMeasurement,
     MotionReadings,
+    PointMeasurement,
     Step,
 )
 
 ANYWHERE = np.diag([FAR_M2, FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
 ORIGIN = 1e-6 * np.eye(se2.DOF)  # of a first pose that is the origin by definition
-_PATIENCE = 3.0  # times initialise_s, that a place waits for what could check it
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_S = 1.0
 
@@ -50,15 +50,17 @@ class InitialPose:
 
     Attributes:
         steps: what was collected, oldest first; the first one's motions are to be ignored.
-        first: weak prior for the oldest step, to be followed by all its sightings.
+        first: prior for the oldest step, to be followed by its sightings and all others.
         newest: pose at the newest step with the covariance that the sightings give.
-        by_sensors: from registered sensors alone.
+        gathered: from registered sensors or beacons, which come one at a time.
+        displaced: of each beacon seen, whether it is where the map has it; None: the place is not of beacons.
     """
 
     steps: tuple[SearchStep, ...]
     first: PoseWithCovariance
     newest: PoseWithCovariance
-    by_sensors: bool = False
+    gathered: bool = False
+    displaced: dict[int, Displacement] | None = None
 
 
 class GlobalSearch:
@@ -109,7 +111,7 @@ class GlobalSearch:
         motions: Sequence[MotionMeasurement],
         sightings: Sequence[LandmarkMeasurement],
         readings: MotionReadings | None = None,
-        known: bool = False,
+        tracked: PoseWithCovariance | None = None,
     ) -> InitialPose | None:
         """Add a step; return the start once one place explains what was seen.
 
@@ -118,8 +120,9 @@ class GlobalSearch:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            known: the robot has an estimated pose elsewhere. Then it takes two landmarks, and nearly everything to
-                agree: some wrong ids agree with some place always.
+            tracked: where the robot is estimated to be after the step. Then it takes two markers, and nearly
+                everything to agree on another place: some wrong ids agree with some place always. Among beacons another
+                place has to be so much more probable.
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
         horizon = step.stamp_ns - self._window_ns
@@ -127,22 +130,24 @@ class GlobalSearch:
             forgotten = self._steps.popleft()
             if self._keep_all and self._first:
                 self._earlier.append(forgotten)
-        if self._first:
-            self.hypotheses.add(motions if len(self._steps) + len(self._earlier) > 1 else (), sightings)
+        self.hypotheses.add(motions, sightings, tracked)
+        place = self.hypotheses.confirmed(tracked)
+        if place is not None:
+            return self._start(place, gathered=True, displaced=self.hypotheses.displaced())
+        if self.hypotheses.has_seen and all(isinstance(m, PointMeasurement) for c in self._steps for m in c.sightings):
+            return None
         if sightings and self._since_ns is None:
             self._since_ns = step.stamp_ns
         due = sightings and self._due(step.stamp_ns)
-        best = self._places.find(list(self._compensated()), known, self._waited()) if due else None
+        best = self._places.find(list(self._compensated()), tracked is not None) if due else None
         if best is None:
             return None
-        start = self._start(PoseWithCovariance(best.fit.pose, best.fit.cov))
-        return dataclasses.replace(start, by_sensors=best.by_sensors)
+        return self._start(PoseWithCovariance(best.fit.pose, best.fit.cov), best.by_sensors)
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
         since, patience_ns = self._since_ns or stamp_ns, self._config.estimator.initialise_s * 1e9
-        waited = self._tried_ns <= since + _PATIENCE * patience_ns < stamp_ns  # what counts as enough has changed
-        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_S * 1e9 and not waited:
+        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_S * 1e9:
             return False
         self._tried_ns = stamp_ns
         return True
@@ -160,36 +165,35 @@ class GlobalSearch:
         origin = PoseWithCovariance(np.zeros(3), ORIGIN.copy())
         return dataclasses.replace(self._start(origin), first=origin)
 
-    def _start(self, newest: PoseWithCovariance) -> InitialPose:
+    def _start(
+        self,
+        newest: PoseWithCovariance,
+        gathered: bool = False,
+        displaced: dict[int, Displacement] | None = None,
+    ) -> InitialPose:
         self.initializing = False
         steps = (*self._earlier, *self._steps)
-        first = PoseWithCovariance(se2.compose(newest.pose, se2.inverse(_travelled(steps))), ANYWHERE.copy())
+        *_, oldest = _back(newest, steps)
         self.forget()
-        return InitialPose(steps, first, newest)
-
-    def _waited(self) -> bool:
-        """Whether that is not to be expected any more."""
-        since = self._steps[-1].step.stamp_ns - (self._since_ns or 0)
-        return since > _PATIENCE * self._config.estimator.initialise_s * 1e9
+        # The sightings that follow are in it already; those of markers say themselves which of them are wrong
+        cov = ANYWHERE.copy() if displaced is None else COVARIANCE_FACTOR * oldest.cov
+        return InitialPose(steps, PoseWithCovariance(oldest.pose, cov), newest, gathered, displaced)
 
     def _compensated(self) -> Iterator[LandmarkMeasurement]:
         """Every collected sighting as seen from the newest step."""
-        motion, cov = np.zeros(3), np.zeros((3, 3))  # T_newest_then, and its covariance
-        for index in range(len(self._steps) - 1, -1, -1):
-            collected = self._steps[index]
+        here = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
+        for collected, then in zip(reversed(self._steps), _back(here, self._steps), strict=True):
             for m in collected.sightings:
-                yield compensated(m, motion, cov)
-            if collected.motions and index > 0:
-                step, step_cov = fuse(collected.motions)
-                back = se2.inverse(step)
-                ad = se2.adjoint(step)
-                motion, cov = se2.compose(motion, back), se2.compose_cov(cov, back, ad @ step_cov @ ad.T)
+                yield compensated(m, then.pose, then.cov)
 
 
-def _travelled(steps: Sequence[SearchStep]) -> FloatArray:
-    """``T_oldest_newest``."""
-    travelled = np.zeros(3)
-    for collected in steps[1:]:
+def _back(newest: PoseWithCovariance, steps: Sequence[SearchStep]) -> Iterator[PoseWithCovariance]:
+    """The poses of these steps if that of the last one is this; the last one first."""
+    pose, cov = newest.pose, newest.cov
+    yield newest
+    for collected in reversed(list(steps)[1:]):
         if collected.motions:
-            travelled = se2.compose(travelled, fuse(collected.motions)[0])
-    return travelled
+            step, step_cov = fuse(collected.motions)
+            back, ad = se2.inverse(step), se2.adjoint(step)
+            pose, cov = se2.compose(pose, back), se2.compose_cov(cov, back, ad @ step_cov @ ad.T)
+        yield PoseWithCovariance(pose, cov)

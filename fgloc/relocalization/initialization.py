@@ -87,19 +87,20 @@ class Initialization:
         if found is None:
             return self._recorder.unconfirmed(self._estimator.k + 1, step)
         if self._tracking.lost:
-            return self.jump(step, found.newest, ())
+            return self.jump(step, found, ())
         estimates = self._replay(found)
         return replace(estimates[-1], decisions=tuple(d for estimate in estimates for d in estimate.decisions))
 
-    def jump(self, step: Step, place: PoseWithCovariance, decisions: Sequence[Decision]) -> Estimate:
+    def jump(self, step: Step, found: InitialPose, decisions: Sequence[Decision]) -> Estimate:
         """Go on from a place that nothing connects with the estimated pose; ``decisions``: that led there."""
-        before = self._estimator.belief
+        before, place = self._estimator.belief, found.newest
         if before is not None:
             decisions = [*decisions, place_decision(self._estimator.k + 1, step.stamp_ns, before, place, JUMP)]
             self._tracking.found(before, place)
         self._motion.restart()
         self._sightings.restart()
         self._recorder.rejections["motion.jump"] += 1
+        decisions = [*decisions, *self._sightings.exclude_displaced(self._estimator.k + 1, step, found)]
         estimate = self._start(step, place, ())
         return replace(estimate, decisions=(*decisions, *estimate.decisions))
 
@@ -124,7 +125,9 @@ class Initialization:
         """Run the collected steps through the loop."""
         first, *rest = found.steps
         self._motion.begin_replay()
+        displaced = self._sightings.exclude_displaced(self._estimator.k + 1, first.step, found)
         estimates = [self._start(first.step, found.first, first.sightings)]
+        estimates[0] = replace(estimates[0], decisions=(*displaced, *estimates[0].decisions))
         return estimates + [self._advance(later.step, later.readings, later.sightings) for later in rest]
 
     def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:

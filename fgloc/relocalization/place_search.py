@@ -10,9 +10,9 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, MAX_SIGMA, WHOLE_SHARE, PoseConsensus, apart
+from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
-from fgloc.sensors.pnp import candidates_from_points, planar_base_candidates
+from fgloc.sensors.pnp import planar_base_candidates
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,
@@ -23,7 +23,6 @@ from fgloc.types import (
     PoseMeasurement,
 )
 
-_DETERMINE = 2  # beacons that determine a pose: of more on the map, one can be left out
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_FITTED, _MAX_SEEDS = 24, 6  # sightings for the fit; places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
@@ -38,13 +37,12 @@ class PlaceSearch:
         self._config, self._map, self._factors = config, landmark_map, factors
         self._window_ns = round(config.estimator.initialise_s * 1e9)
 
-    def find(self, sightings: Sequence[LandmarkMeasurement], known: bool, waited_enough: bool) -> PoseConsensus | None:
+    def find(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> PoseConsensus | None:
         """The place that nearly all sightings agree on; None: there is none, or it is not certain.
 
         Args:
             sightings: as seen from the pose that is looked for.
             known: the robot has an estimated pose elsewhere, so that it takes more to find it here.
-            waited_enough: what could check the place is not to be expected any more.
         """
         here = _spread(sightings, _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
@@ -64,23 +62,7 @@ class PlaceSearch:
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
         if not best.certain or (known and not best.overrides_prior):
             return None
-        if not known and not self._checked(best, here) and not (best.well_determined and waited_enough):
-            return None
         return best
-
-    def _checked(self, best: PoseConsensus, sightings: Sequence[LandmarkMeasurement]) -> bool:
-        """Whether beacons determine this place even if any one of them is left out: one may have been moved."""
-        agreeing = [
-            m for m in sightings if m.landmark_id in best.agreeing and (m.stamp_ns, m.landmark_id) not in best.outliers
-        ]
-        few = self._map is not None and len(self._map) <= _DETERMINE
-        if few or not all(isinstance(m, PointMeasurement) for m in agreeing):
-            return True
-        for landmark_id in best.agreeing:
-            fit = self._fit(best.fit.pose, [m for m in agreeing if m.landmark_id != landmark_id])
-            if fit is None or (np.sqrt(np.diag(fit.cov)) > MAX_SIGMA).any() or apart(fit.pose, best.fit.pose):
-                return False
-        return True
 
     def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
@@ -101,15 +83,13 @@ class PlaceSearch:
         residuals = {m.landmark_id: m.dof for m in agreeing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
-        outliers = [m for m in sightings if not any(m is other for other in agreeing)]
+        seen = {m.landmark_id for m in sightings}
         return PoseConsensus(
             fit,
             share,
             len(residuals),
             sum(residuals.values()) - se2.DOF,
-            frozenset(information_of),
-            frozenset(m.landmark_id for m in outliers) - frozenset(information_of),
-            frozenset((m.stamp_ns, m.landmark_id) for m in outliers),
+            frozenset(seen - information_of.keys()),
             all(isinstance(m, PoseMeasurement) for m in agreeing),
             _lasting(agreeing, self._window_ns),
         )
@@ -125,22 +105,18 @@ class PlaceSearch:
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:
             return
-        points = []
         by_pose = [m for m in sightings if isinstance(m, PoseMeasurement)]
         for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
             yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
         sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
         whole = [m for m in sightings if not isinstance(m, PointMeasurement)]  # that give a place each
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
-        for m in [*seeds, *(m for m in sightings if isinstance(m, PointMeasurement))]:
+        for m in seeds:
             landmark = self._map.landmarks[m.landmark_id]
             if isinstance(m, PixelMeasurement):
                 yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
             elif isinstance(m, FrameMeasurement):
                 yield se2.compose(landmark.planar, se2.inverse(m.pose))
-            elif isinstance(m, PointMeasurement):
-                points.append((landmark.position[:2], m.range_m, m.bearing_rad))
-        yield from candidates_from_points(points)
 
 
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:

@@ -12,7 +12,6 @@ from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
-_SHARP = 0.5  # times that, of a place that one moved beacon could produce
 _SAME_PLACE = 0.3  # m, rad: candidates nearer than this are one place
 # Of sightings of several landmarks a place has to explain more than half, as any other place explains less then: the
 # rest have wrong ids, or were moved. One that explains less than this ...
@@ -21,9 +20,6 @@ WHOLE_SHARE = 0.8
 # short way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SHARP_SIGMA = 0.1  # m, rad
 REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
-
-SightingKey = tuple[int, int]
-"""Stamp [ns] and landmark of a sighting."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +34,7 @@ class PoseConsensus:
     share: float
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
-    agreeing: frozenset[int]  # landmarks that it explains ...
-    outlier_landmarks: frozenset[int]  # ... and those that it does not
-    outliers: frozenset[SightingKey]  # sightings that it does not
+    outlier_landmarks: frozenset[int]  # landmarks that it does not explain
     by_sensors: bool = False  # from registered sensors alone ...
     lasting: bool = False  # ... over as long as is collected
 
@@ -59,11 +53,6 @@ class PoseConsensus:
     @property
     def _sigmas(self) -> FloatArray:
         return np.sqrt(np.diag(self.fit.cov))
-
-    @property
-    def well_determined(self) -> bool:
-        """Whether it is known well enough to be a place although nothing checks it."""
-        return bool((self._sigmas <= _SHARP * MAX_SIGMA).all())
 
     @property
     def overrides_prior(self) -> bool:

@@ -12,6 +12,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.gaussian_sum import CARRIED, WRONG_LANDMARK
 from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.robust.association import NEAR_M, NEAR_RAD
 from fgloc.types import (
@@ -28,8 +29,6 @@ from fgloc.types import (
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
 _NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
-_KIDNAPPED = 1e-3  # prior probability that a robot was carried away where sightings contradict its pose ...
-_WRONG = 0.05  # ... and that a landmark which contradicts it was moved or misread, each independently
 
 
 class Tracking:
@@ -60,8 +59,7 @@ class Tracking:
         self._jump: FloatArray | None = None  # the first one ...
         self._jump_count = 0  # ... of so many
         self._reported = False  # whether an unconfirmed pose was reported
-        places = [] if landmark_map is None else [m.position[:2] for m in landmark_map.landmarks.values()]
-        self._places: FloatArray = np.array(places).reshape(-1, 2)
+        self._places = self._search.hypotheses.places
         self._never_found = False
 
     def begin_segment(
@@ -162,14 +160,11 @@ class Tracking:
         """
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
             return np.zeros((3, 3))
-        kidnapped = _KIDNAPPED / (_KIDNAPPED + _WRONG**contradicting)
+        kidnapped = CARRIED / (CARRIED + WRONG_LANDMARK**contradicting)
         return kidnapped * self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
-        """What is added to the covariance ``(3, 3)`` of a lost robot's pose: it may be anywhere on the map.
-
-        Nothing, where the pose is lost for its covariance, which has that already.
-        """
+        """What is added to the covariance ``(3, 3)`` of a lost robot's pose, unless that itself says it is lost."""
         if self.is_unlocalized(belief):
             return np.zeros((3, 3))
         return self._spread_of_map(belief)
@@ -185,6 +180,7 @@ class Tracking:
         """Look for the robot anywhere on the map."""
         self.lost = True
         self._search.initializing = True
+        self._search.hypotheses.reset()
 
     def is_unlocalized(self, belief: PoseWithCovariance | None) -> bool:
         """Whether the pose is so little known that only a search of the map can find it again."""
@@ -240,7 +236,7 @@ class Tracking:
         outliers: Sequence[LandmarkMeasurement],
         readings: MotionReadings,
         predicted: PoseWithCovariance,
-    ) -> PoseWithCovariance | None:
+    ) -> InitialPose | None:
         """While no sighting is accepted, look for another place that explains the rejected ones.
 
         Returns:
@@ -251,13 +247,11 @@ class Tracking:
         decided = self.keeps_initial_pose and self.initial_pose_conflict is not None
         if not searching or decided or self.initializing or not self._adaptive:
             return None
-        started = self._search.collect(step, motions, outliers, readings, known=True)
-        if started is None or self.keeps_initial_pose:
-            return None if started is None else started.newest
-        if started.by_sensors:  # no consensus is sought nearby: each of them may need all of the collected time
-            return started.newest
+        started = self._search.collect(step, motions, outliers, readings, predicted)
+        if started is None or self.keeps_initial_pose or started.gathered:
+            return started  # what is gathered has no consensus nearby: that may need all of the collected time
         x, y, yaw = se2.between(predicted.pose, started.newest.pose)
-        return started.newest if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
+        return started if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
 
     def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was estimated at."""

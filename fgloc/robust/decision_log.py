@@ -70,6 +70,11 @@ def place_decision(
     return Decision(k, stamp_ns, "place", -1, math.sqrt(nis), nis, se2.DOF, weight, reason, shift_m=shift)
 
 
+def moved_decision(k: int, stamp_ns: int, landmark_id: int, evidence: float, alarm: float) -> Decision:
+    """The row for a landmark that was found to be moved."""
+    return Decision(k, stamp_ns, "place", landmark_id, math.sqrt(evidence), evidence, 2, 1.0, "landmark_moved", alarm)
+
+
 def mode_decisions(k: int, stamp_ns: int, mode: Mode, since_fix_s: float, after_s: float) -> tuple[Decision, ...]:
     """The row of a pose that is not ``OK``: its residual is the time without an accepted sighting [s]."""
     if mode is Mode.OK:

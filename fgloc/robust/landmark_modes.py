@@ -139,6 +139,14 @@ class LandmarkModes:
         installation = InstallationEstimate(known.mean + off[3:], P[3:, 3:])
         return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation), evidence
 
+    def judged_elsewhere(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
+        """Leave out a landmark that a search found to be moved, if that is far and clear enough; whether it is."""
+        self.displacements.pop(landmark_id, None)
+        if evidence < self.alarm or not _LEAST_M < math.hypot(*moved) < _MOST_M:
+            return False
+        self.displacements[landmark_id] = moved
+        return True
+
     def _follow(self, landmark_id: int) -> None:
         """Have a hypothesis of this landmark, instead of that of the one not seen for longest if there are too many."""
         row = self._rows.pop(landmark_id, None)

@@ -6,7 +6,6 @@ the map in `Tracking`; here they are asked in turn.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +16,13 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.relocalization.global_search import InitialPose
 from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking
 from fgloc.robust.association import Association
-from fgloc.robust.decision_log import OVERRULED, moved_notes, place_decision
+from fgloc.robust.decision_log import OVERRULED, moved_decision, moved_notes, place_decision
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.motion_judge import JudgedMotion
-from fgloc.types import Decision, LandmarkMeasurement, PoseMeasurement, Step
+from fgloc.types import Decision, LandmarkMeasurement, PointMeasurement, PoseMeasurement, Step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class JudgedSightings:
     decisions: Sequence[Decision]
     predicted: PoseWithCovariance
     places: Sequence[Decision] = ()
-    elsewhere: PoseWithCovariance | None = None
+    elsewhere: InitialPose | None = None
 
     @property
     def observes_yaw(self) -> bool:
@@ -104,11 +104,11 @@ class SightingJudge:
         seen = self.associate(step, sightings, predicted)
         if seen.accepted:
             return motion, seen
-        outliers = [s.measurement for s in seen.rejected if not self.modes.excludes(s.measurement.landmark_id)]
+        outliers = [m for m in (s.measurement for s in seen.rejected) if self._may_tell_place(m)]
         place = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
         if place is not None and self._tracking.keeps_initial_pose:
-            self._tracking.record_conflict(predicted, place)
-            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, place, CONTRADICTS)
+            self._tracking.record_conflict(predicted, place.newest)
+            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, place.newest, CONTRADICTS)
             return motion, replace(seen, places=(row,))
         if place is not None or self._tracking.keeps_initial_pose:
             return motion, replace(seen, elsewhere=place)
@@ -122,6 +122,10 @@ class SightingJudge:
         seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
         return motion, replace(seen, places=(row,))
 
+    def _may_tell_place(self, m: LandmarkMeasurement) -> bool:
+        """Whether the search may know of a rejected sighting: it judges by itself whether a beacon was moved."""
+        return isinstance(m, PointMeasurement) or not self.modes.excludes(m.landmark_id)
+
     def associate(
         self, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
     ) -> JudgedSightings:
@@ -134,6 +138,14 @@ class SightingJudge:
             self.modes.forget()  # they all seem moved from there
         logged = () if self._tracking.keeps_initial_pose else rejected
         return JudgedSightings(accepted, rejected, logged, decisions, predicted)
+
+    def exclude_displaced(self, k: int, step: Step, found: InitialPose) -> list[Decision]:
+        """Leave out what the search found to be moved, and no longer what it found in place."""
+        return [
+            moved_decision(k, step.stamp_ns, landmark_id, one.evidence, self.modes.alarm)
+            for landmark_id, one in (found.displaced or {}).items()
+            if self.modes.judged_elsewhere(landmark_id, one.by, one.evidence)
+        ]
 
     def begin_graph(self, seen: JudgedSightings, belief: PoseWithCovariance) -> None:
         """The graph begins with these sightings, which made a pose of the predicted one."""
@@ -154,7 +166,4 @@ class SightingJudge:
         without, nis = self.modes.exclude(moved, belief)
         if without is not belief:
             self._estimator.correct(without, moved)
-        row = Decision(
-            k, step.stamp_ns, "place", moved, math.sqrt(nis), nis, 2, 1.0, "landmark_moved", self.modes.alarm
-        )
-        return [row], without is not belief
+        return [moved_decision(k, step.stamp_ns, moved, nis, self.modes.alarm)], without is not belief

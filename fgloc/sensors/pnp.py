@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.sensors.cameras import without_distortion
@@ -17,7 +16,6 @@ _MIN_DEPTH_M = 0.01
 _EXPLAINED_PX = 3.0  # a surveyed map and a calibrated camera leave less
 _ITERATIONS = 20
 _SAME = 1e-3  # metres and radians: two refined poses nearer than this are one
-_LEAVE_OUT_UP_TO = 8  # landmarks; among more, a mistaken one does not matter
 _TILT_SIGMA = 1.0  # rad; what is known of a marker's orientation beforehand, so that a frontal view has a covariance
 
 
@@ -140,48 +138,6 @@ def up_in_base(camera: Camera, seen: Sequence[tuple[FloatArray, Landmark]]) -> F
     if in_cam[:, 2].min() < _MIN_DEPTH_M or _rms(_project(ideal.K, in_cam) - pixels) > _EXPLAINED_PX:
         return None
     return np.asarray(camera.T_base_cam[:3, :3] @ R_cam_map[:, 2])
-
-
-def candidates_from_points(sightings: Sequence[tuple[FloatArray, float, float]]) -> list[FloatArray]:
-    """Poses of the base that explain ranges and bearings to known points, all from (nearly) one place.
-
-    Two points give a pose; a single one leaves a circle, and nothing is returned. With a few more, the poses that leave
-    out each of the landmarks follow the pose of all, for the case that one is mistaken.
-
-    Args:
-        sightings: position ``(2,)`` of the landmark in the map [m], range [m], bearing [rad].
-
-    Source: least-squares alignment of two point sets, Umeyama, IEEE PAMI 13(4), 1991, in the plane and without scale.
-    """
-    world = np.array([np.asarray(point, dtype=float)[:2] for point, _, _ in sightings]).reshape(-1, 2)
-    body = np.array([[r * math.cos(b), r * math.sin(b)] for _, r, b in sightings]).reshape(-1, 2)
-    poses = []
-    for chosen in _choices(world):
-        pose = _align(world[chosen], body[chosen])
-        if pose is not None:
-            poses.append(pose)
-    return poses
-
-
-def _choices(world: FloatArray) -> Iterator[NDArray[np.bool_]]:
-    """Masks ``(n,)``: all sightings, then all but those of each landmark, while these are few."""
-    yield np.ones(len(world), dtype=bool)
-    places = np.unique(world, axis=0)
-    if 3 <= len(places) <= _LEAVE_OUT_UP_TO:
-        yield from ((world != place).any(axis=1) for place in places)
-
-
-def _align(world: FloatArray, body: FloatArray) -> FloatArray | None:
-    """Pose ``(3,)`` that takes body points to world points; None if either set is nearly one point."""
-    if len(world) < 2:
-        return None
-    w, b = world - world.mean(axis=0), body - body.mean(axis=0)
-    if min(np.abs(w).max(), np.abs(b).max()) < 0.01:
-        return None
-    yaw = math.atan2(float((b[:, 0] * w[:, 1] - b[:, 1] * w[:, 0]).sum()), float((b * w).sum()))
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y = world.mean(axis=0) - np.array([[c, -s], [s, c]]) @ body.mean(axis=0)
-    return np.array([x, y, yaw])
 
 
 def _refine(

@@ -13,6 +13,7 @@ from test_initializer import landmark_map, point, seen_point
 from world_bags import write_world
 
 from fgloc import se2
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.robust.landmark_modes import MOST_HYPOTHESES
 from fgloc.runner import run
@@ -46,7 +47,7 @@ def error(total: GaussianSum, pose) -> tuple[np.ndarray, float]:
     return off, float(off @ np.linalg.solve(cov, off)) / 3.0
 
 
-def test_one_beacon_leaves_a_ring_and_its_covariance_says_so():
+def test_fault_55_one_beacon_leaves_a_ring_and_its_covariance_says_so():
     total, pose = next(drive((A, B, C), lambda _k: [A], 0.2))
     belief = total.belief()
     assert np.sqrt(belief.cov[2, 2]) > 1.2
@@ -70,6 +71,27 @@ def test_a_false_first_sighting_is_outvoted():
     assert np.hypot(*error(total, pose)[0][:2]) < 0.2
 
 
+def test_a_moved_beacon_counts_as_one_contradiction_however_often_it_is_seen():
+    """Beacon 1 stands 1.5 m from where the map has it, and is seen in nine of ten steps."""
+    stands = point(1, 4.5, 1.0)
+    *_, (total, pose) = drive((A, B, C), lambda k: [(B, C)[k // 10 % 2]] if k % 10 == 9 else [stands], seconds=8.0)
+    off, honest = error(total, pose)
+    assert np.hypot(*off[:2]) < 0.3
+    assert honest < 3.0
+    assert total.confirmed() is not None
+
+
+@pytest.mark.parametrize(("beacons", "jumps"), [((A, B, C), True), ((A, B), False)])
+def test_a_tracked_pose_is_given_up_where_three_beacons_tell_another_place(beacons, jumps):
+    """Two may both have been moved."""
+    tracked = PoseWithCovariance(np.array([-1.0, -2.0, 2.0]), 1e-4 * np.eye(3))
+    total = GaussianSum(config(), landmark_map(A, B, C))
+    for m in beacons:
+        total.add([], [seen_point(TRUTH, m)], tracked)
+    place = total.confirmed(tracked)
+    assert (place is not None and np.abs(place.pose - TRUTH).max() < 0.1) == jumps
+
+
 def test_the_work_of_a_step_is_bounded():
     """However many beacons are seen, and however long none of them is where the map has it."""
     rng = np.random.default_rng(2)
@@ -86,7 +108,7 @@ def test_the_work_of_a_step_is_bounded():
 
 
 def test_the_first_pose_of_a_drive_comes_with_the_second_beacon():
-    """The search waits for one that checks the others; meanwhile the pose is told, and is not surer than it may be."""
+    """Until its place is certain the pose is told, and is not surer than it may be."""
     told, honest = [], []
     for seed in range(12):
         world = World(beacons(), seed=seed, seconds=3.0, rate=5)

@@ -11,7 +11,6 @@ from marker_scenes import base_transform, forward_camera, project, standing, tra
 from fgloc import se2
 from fgloc.frames import rpy_matrix
 from fgloc.sensors.pnp import (
-    candidates_from_points,
     marker_pose_candidates,
     marker_pose_cov,
     planar_base_candidates,
@@ -139,39 +138,3 @@ def test_range_error_grows_with_the_square_of_range() -> None:
         cov = marker_pose_cov(camera, true_pose(camera, np.zeros(3), marker), 0.2, 0.3)
         sigmas.append(np.sqrt(cov[2, 2]))
     assert np.allclose(np.array(sigmas[1:]) / sigmas[:-1], 4.0, rtol=0.1)
-
-
-# --- points ---
-
-
-def sightings(pose: FloatArray, points: FloatArray) -> list[tuple[FloatArray, float, float]]:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    local = (points - pose[:2]) @ np.array([[c, -s], [s, c]])
-    return [(w, float(np.hypot(*p)), float(np.arctan2(p[1], p[0]))) for w, p in zip(points, local, strict=True)]
-
-
-@pytest.mark.parametrize("n", [2, 3, 5, 20])
-def test_points_give_the_pose(n: int) -> None:
-    rng = np.random.default_rng(n)
-    for _ in range(10):
-        pose = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)])
-        found = candidates_from_points(sightings(pose, rng.uniform(-5, 5, (n, 2))))
-        assert len(found) == (n + 1 if 3 <= n <= 8 else 1)
-        for candidate in found:
-            assert np.abs(se2.log(se2.between(pose, candidate))).max() < 1e-9
-
-
-def test_one_mistaken_landmark_of_four_is_left_out_by_one_candidate() -> None:
-    pose = np.array([1.0, 2.0, 0.5])
-    seen = sightings(pose, np.array([[3.0, 1.0], [4.0, 4.0], [0.0, 5.0], [5.0, 2.0]]))
-    seen[2] = (np.array([-4.0, -4.0]), *seen[2][1:])
-    errors = [np.abs(se2.log(se2.between(pose, c))).max() for c in candidates_from_points(seen)]
-    assert errors[0] > 0.5
-    assert min(errors) < 1e-9
-
-
-def test_fault_55_a_single_point_gives_no_pose() -> None:
-    assert candidates_from_points([]) == []
-    one = sightings(np.zeros(3), np.array([[2.0, 1.0]]))
-    assert candidates_from_points(one) == []
-    assert candidates_from_points(one * 3) == []
