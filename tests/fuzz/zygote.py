@@ -9,6 +9,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import BinaryIO
 
 from tests.fuzz.processes import Done
@@ -17,11 +18,14 @@ _ADDRESS_SPACE = 16 << 30
 
 
 def forked(work: Callable[[], int], seconds: float = 20.0) -> Done:
-    """Run a function in a forked process with limits on processor time and memory; it returns its exit code."""
+    """Run a function in a forked process with limits on processor time and memory; it returns its exit code.
+
+    Its memory is what it takes beyond what this process holds when it is forked: libraries, and what ran here before.
+    """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         sys.stdout.flush()
         sys.stderr.flush()
-        began = time.monotonic()
+        began, held_mb = time.monotonic(), _resident_mb()
         child = os.fork()
         if child == 0:
             _child(work, out, err, seconds)
@@ -36,7 +40,12 @@ def forked(work: Callable[[], int], seconds: float = 20.0) -> Done:
         err.seek(0)
         code, used = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
         texts = out.read().decode(errors="replace"), err.read().decode(errors="replace")
-        return Done(code, *texts, used, usage.ru_maxrss / 1024.0, late or (code < 0 and used >= seconds))
+        return Done(code, *texts, used, usage.ru_maxrss / 1024.0 - held_mb, late or (code < 0 and used >= seconds))
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def fgloc(*arguments: object, seconds: float = 20.0) -> Done:
