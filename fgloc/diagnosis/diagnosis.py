@@ -30,8 +30,8 @@ _MIN_ARM_M = 0.05
 _SAME_SCALE = 0.02
 _PLAUSIBLE = 1.5  # times how large faults may be: what is larger stands in for something that is not modeled
 _MODEL_S, _MODEL_SHARE, _MODEL_DEG, _MODEL_M = 0.003, 0.002, 0.2, 0.005  # what this model of a robot leaves out
-_GROSS_SHARE, _GROSS_KEPT = 0.5, 6
-_ALL_GROSS = 0.8  # without an explanation fewer may be the wheels' slipping
+_INCONSISTENT_SHARE, _INCONSISTENT_KEPT = 0.5, 6
+_ALL_INCONSISTENT = 0.8  # without an explanation fewer may be the wheels' slipping
 
 
 class Diagnosis:
@@ -78,8 +78,8 @@ class Diagnosis:
         self._faults = Pool(PRIOR_SIGMAS if landmark_map is not None else PRIOR_SIGMAS_NO_MAP)
         self._seen_by = seen_by
         self._gyro = GyroComparison(imu_up)
-        self._gross: list[Window] = []
-        self._gross_count = 0
+        self._inconsistent: list[Window] = []
+        self._inconsistent_count = 0
         self._tried = 0
         self._started: FloatArray | None = None  # where the sightings put the run's first pose
 
@@ -112,10 +112,10 @@ class Diagnosis:
         if fit is None:
             return
         self._tried += 1
-        if fit.gross:
-            self._gross_count += 1
-            if len(self._gross) < _GROSS_KEPT:
-                self._gross.append(window)
+        if fit.inconsistent:
+            self._inconsistent_count += 1
+            if len(self._inconsistent) < _INCONSISTENT_KEPT:
+                self._inconsistent.append(window)
             return
         self._faults.add(fit.evidence)
         if self._started is None and segment == 0 and self._known is not None:
@@ -144,12 +144,12 @@ class Diagnosis:
             source: where wheel motion came from: "ticks", "odometry", "command" or "".
             offsets: report constant offsets of clocks too; they have not been tried.
         """
-        if self._known is not None and self._gross_count > _GROSS_SHARE * max(self._tried, 3):
-            found = explanation(self._gross, self._place, self._known, self._camera)
-            share = f"in {self._gross_count} of {self._tried} stretches of the run"
+        if self._known is not None and self._inconsistent_count > _INCONSISTENT_SHARE * max(self._tried, 3):
+            found = explanation(self._inconsistent, self._place, self._known, self._camera)
+            share = f"in {self._inconsistent_count} of {self._tried} stretches of the run"
             if found is not None:
                 return (f"Map, sightings and wheel motion contradict each other {share}; they agree if {found}.",)
-            if self._gross_count > _ALL_GROSS * self._tried:
+            if self._inconsistent_count > _ALL_INCONSISTENT * self._tried:
                 return (
                     f"Map, sightings and wheel motion contradict each other {share}, and no single mistake of the "
                     "set-up explains it: check the map's positions, the sensor's transform, the wheels' geometry, "

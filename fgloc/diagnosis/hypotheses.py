@@ -44,7 +44,7 @@ def explanation(windows: Sequence[Window], T_base_sensor: FloatArray, known: Kno
         place = hypothesis.place(T_base_sensor)
         landmarks = hypothesis.known(known)
         fits = [fit_window(hypothesis.window(w), place, landmarks, any_clock=False) for w in windows]
-        good = [fit for fit in fits if isinstance(fit, Fit) and fit.misfit < _FITS and not fit.gross]
+        good = [fit for fit in fits if isinstance(fit, Fit) and fit.misfit < _FITS and not fit.inconsistent]
         if len(good) < _SHARE * len(windows):
             continue
         misfit = float(np.median([fit.misfit for fit in good]))

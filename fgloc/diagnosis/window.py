@@ -24,7 +24,7 @@ _MIN_SIGHTINGS = 8
 _NUDGE = 1e-5
 _POOR = 3.0  # median whitened residual above which other clock offsets are tried as starts
 _STARTS_S = (0.3, -0.3, 0.8, -0.8)
-_GROSS, _STRAINED = 4.0, 1.5
+_INCONSISTENT, _STRAINED = 4.0, 1.5
 _PLAIN = 1.5  # median whitened residual of a window that fits without any fault
 _NONE = 1e12  # information that leaves no fault
 _OWN_DOF = 4.0  # how much the assumed noise counts beside a window's own residuals
@@ -88,9 +88,9 @@ class Fit:
     evidence: Evidence
 
     @property
-    def gross(self) -> bool:
+    def inconsistent(self) -> bool:
         """Whether no faults of a plausible size make the window fit."""
-        return self.misfit > _GROSS or self.strain > _STRAINED
+        return self.misfit > _INCONSISTENT or self.strain > _STRAINED
 
 
 def fit_window(

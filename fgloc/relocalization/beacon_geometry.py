@@ -46,7 +46,7 @@ class SeenBeacons:
         return max(self._tracks[landmark_id], key=lambda track: track.count).point
 
     def take(self, m: PointMeasurement, R: FloatArray, least: float) -> float | None:
-        """Log density of a sighting with the covariance ``R`` given those before it, if it is more than the least."""
+        """Add a sighting with the covariance ``R``; its log density given those before, None if below the least."""
         tracks = self._tracks.setdefault(m.landmark_id, [])
         for track in tracks:
             residual, by_pose = residuals(np.zeros((1, 3)), track.point, m)
@@ -59,15 +59,14 @@ class SeenBeacons:
                 tracks.sort(key=lambda other: other is not track)
                 return density
         at = _point_by_sighting(m)
-        place = m.range_m * np.array([math.cos(m.bearing_rad), math.sin(m.bearing_rad)])
-        self._tracks[m.landmark_id] = [Track(place, at @ R @ at.T), *tracks[:1]]
+        self._tracks[m.landmark_id] = [Track(m.point, at @ R @ at.T), *tracks[:1]]
         return None
 
 
 def ring(place: FloatArray, m: PointMeasurement, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses ``(n, 3)`` all around a beacon seen so, with covariances that let each reach the next."""
     yaws = np.linspace(-math.pi, math.pi, RING, endpoint=False)
-    x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
+    x, y = m.point
     c, s = np.cos(yaws), np.sin(yaws)
     poses = np.column_stack([place[0] - c * x + s * y, place[1] - s * x - c * y, yaws])
     about = np.array([y, -x, 1.0])  # turning about the point (x, y) of the body
@@ -123,11 +122,3 @@ def moments(poses: FloatArray, covs: FloatArray, weights: FloatArray) -> PoseWit
     mean[2] = se2.wrap(middle + float(share @ off[:, 2]))
     off[:, 2] -= share @ off[:, 2]
     return PoseWithCovariance(mean, se2.rotate_cov((off * share[:, None]).T @ off, -float(mean[2])))
-
-
-def rotated(covs: FloatArray, yaws: FloatArray) -> FloatArray:
-    """Covariances ``(n, 3, 3)`` of right perturbations of poses with these yaws ``(n,)``, in the frame of the poses."""
-    turn = np.zeros((len(yaws), 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaws)
-    turn[:, 1, 0], turn[:, 0, 1], turn[:, 2, 2] = np.sin(yaws), -np.sin(yaws), 1.0
-    return np.asarray(turn @ covs @ turn.transpose(0, 2, 1))

@@ -27,7 +27,7 @@ from fgloc.config import Config
 from fgloc.graph.joint import FAR_M2, LINEAR_M, LINEAR_RAD, MOST_JOINT, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import repetition
-from fgloc.relocalization.beacon_geometry import RING, SeenBeacons, log_density, moments, residuals, ring, rotated
+from fgloc.relocalization.beacon_geometry import RING, SeenBeacons, log_density, moments, residuals, ring
 from fgloc.relocalization.pose_consensus import MAX_SIGMA
 from fgloc.robust.landmark_modes import MOST_HYPOTHESES
 from fgloc.stats import GATE, chi2_bound
@@ -145,7 +145,8 @@ class GaussianSum:
         """Which hypotheses are not this pose."""
         off = self.poses - pose.pose
         off[:, 2] = se2.wrap_array(off[:, 2])
-        cov = rotated(self.covs, self.poses[:, 2]) + rotated(pose.cov[None], pose.pose[2:])
+        covs = [se2.rotate_cov(cov, yaw) for cov, yaw in zip(self.covs, self.poses[:, 2], strict=True)]
+        cov = np.array(covs) + se2.rotate_cov(pose.cov, float(pose.pose[2]))
         nis = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
         return np.asarray(nis > chi2_bound(GATE, se2.DOF))
 
@@ -216,7 +217,7 @@ class GaussianSum:
         self._in_place = np.concatenate([self._in_place, in_place])
 
     def _update(self, m: PointMeasurement, R: FloatArray, row: int) -> NDArray[np.bool_]:
-        """Kalman's update of the hypotheses that a sighting suits; for the others it is an outlier. Which it suits."""
+        """Kalman update of the hypotheses that accept a sighting ``(n,)``; for the others it is an outlier."""
         residual, J = residuals(self.poses, self.places[self._index[m.landmark_id]], m)
         PJ = self.covs @ J.transpose(0, 2, 1)
         S = J @ PJ + R
@@ -234,7 +235,7 @@ class GaussianSum:
     def _misread_density(self, m: PointMeasurement, R: FloatArray) -> FloatArray:
         """Log likelihood ``(n,)`` of a sighting whose id is wrong: of any other beacon, or of nothing in the map."""
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
+        x, y = m.point
         points = self.poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
         off = points[:, None] - self.places
         distances = np.einsum("nld,nld->nl", off, off)
@@ -247,7 +248,7 @@ class GaussianSum:
         return np.asarray(self._wrong_id - math.log(2.0) + np.logaddexp(0.0, density - _UNIFORM))
 
     def _anywhere(self, m: PointMeasurement, R: FloatArray, row: int, new: bool) -> bool:
-        """Evidence of a landmark that may stand anywhere, by its sightings; whether this one contradicts the others."""
+        """Add the evidence of a beacon that may stand anywhere; whether this sighting contradicts its others."""
         likely = self._beacons.take(m, R, self._wrong_id - self._right_id)
         if likely is not None:
             self._moved[row] += self._right_id + likely

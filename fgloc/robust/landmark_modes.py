@@ -139,7 +139,7 @@ class LandmarkModes:
         installation = InstallationEstimate(known.mean + off[3:], P[3:, 3:])
         return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation), evidence
 
-    def judged_elsewhere(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
+    def exclude_if_moved(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
         """Leave out a landmark that a search found to be moved, if that is far and clear enough; whether it is."""
         self.displacements.pop(landmark_id, None)
         if evidence < self.alarm or not _LEAST_M < math.hypot(*moved) < _MOST_M:

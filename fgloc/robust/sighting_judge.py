@@ -105,13 +105,13 @@ class SightingJudge:
         if seen.accepted:
             return motion, seen
         outliers = [m for m in (s.measurement for s in seen.rejected) if self._may_tell_place(m)]
-        place = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
-        if place is not None and self._tracking.keeps_initial_pose:
-            self._tracking.record_conflict(predicted, place.newest)
-            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, place.newest, CONTRADICTS)
+        found = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
+        if found is not None and self._tracking.keeps_initial_pose:
+            self._tracking.record_conflict(predicted, found.newest)
+            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, found.newest, CONTRADICTS)
             return motion, replace(seen, places=(row,))
-        if place is not None or self._tracking.keeps_initial_pose:
-            return motion, replace(seen, elsewhere=place)
+        if found is not None or self._tracking.keeps_initial_pose:
+            return motion, replace(seen, elsewhere=found)
         fit = self._association.nearby_consensus(seen.rejected, seen.decisions, predicted)
         if fit is None:
             return motion, seen
@@ -144,7 +144,7 @@ class SightingJudge:
         return [
             moved_decision(k, step.stamp_ns, landmark_id, one.evidence, self.modes.alarm)
             for landmark_id, one in (found.displaced or {}).items()
-            if self.modes.judged_elsewhere(landmark_id, one.by, one.evidence)
+            if self.modes.exclude_if_moved(landmark_id, one.by, one.evidence)
         ]
 
     def begin_graph(self, seen: JudgedSightings, belief: PoseWithCovariance) -> None:

@@ -47,7 +47,7 @@ def compensated(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> 
     if isinstance(m, FrameMeasurement):
         pose = se2.compose(motion, m.pose)
         return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
-    x, y = m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad)
+    x, y = m.point
     px, py, _ = se2.compose(motion, (x, y, 0.0))
     r, bearing = math.hypot(px, py), math.atan2(py, px)
     added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -88,6 +89,11 @@ class PointMeasurement:
     twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def point(self) -> FloatArray:
+        """Where it is in the base frame ``(2,)`` [m]."""
+        return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
 
     @property
     def dof(self) -> int:
