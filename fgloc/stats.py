@@ -1,6 +1,6 @@
 """Quantiles that decide: one place for what "unlikely" means.
 
-There are three levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm an hour of a
+There are three levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm a day of a
 monitor (`alarm_bound`), and the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is
 named to the user.
 """
@@ -11,7 +11,7 @@ import math
 from functools import lru_cache
 
 GATE = 0.9999  # a measurement that is less likely than one minus this is not fused
-_ALARM_EVERY_S = 3600.0  # where nothing is wrong
+_ALARM_EVERY_S = 86400.0  # where nothing is wrong: a robot drives all day, some 20 km
 
 
 @lru_cache
@@ -23,7 +23,7 @@ def chi2_bound(probability: float, dof: int) -> float:
 
 
 def alarm_bound(seconds: float, tests: int, dof: int) -> float:
-    """χ² quantile that raises at most one false alarm an hour (Bonferroni).
+    """χ² quantile that raises at most one false alarm a day (Bonferroni).
 
     Args:
         seconds: after which it is tested again.

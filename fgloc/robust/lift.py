@@ -1,7 +1,7 @@
 """Whether the robot was lifted or pushed: signs of it in accelerometer, gyro and wheels, and what then is known.
 
 Wheels that hang in the air or stand do not measure where the robot is carried. Two tests look for it; each has at
-most one false alarm an hour where its errors are normal (Bonferroni over steps and windows):
+most one false alarm a day where its errors are normal (Bonferroni over steps and windows):
 
 - *vertical velocity*: the magnitude of the specific force, less what is usual, summed over windows of up to a second.
   It does not depend on the tilt. A robot on the floor cannot rise; its standard deviation is that of the run itself.
