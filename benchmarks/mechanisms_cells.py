@@ -29,6 +29,12 @@ _KINDS = {"frozen": "frozen", "onewheel": "left_wheel_dead"}  # the fault of the
 FOREIGN = "foreign"  # a case: the motion model is of another robot, one whose landmarks are beacons
 PUSHED = "pushed"  # a case: for 0.6 s nothing is recorded, twice, so that the robot is 15 to 20 cm farther on at once
 _PUSHED_S = [[20.0, 20.6], [40.0, 40.6]]
+WHEELS = "wheels"  # a case: ``dark60`` of a robot that has wheels and a camera alone
+_WHEELS_ALONE = {"motion": {"use": False}, "gyro": {"use": False}}
+GIVEN = "given"  # a case: the first pose is given and right, while the map is shifted as a whole ...
+_SHIFTED_M = 0.5  # ... by this
+LIKE = {FOREIGN: "slip", WHEELS: "dark60"}  # the case whose recording they are
+OWN_CASES = (FOREIGN, PUSHED, WHEELS, GIVEN)
 _FOREIGN_MODEL = {"motion": {"model": "shipped:mrclam/all"}}
 _NAMED_KINDS = {"frozen", "left_wheel_dead", "right_wheel_dead"}
 
@@ -102,13 +108,13 @@ def run(cell: Cell) -> Outcome:
         return Outcome(failed=str(error))
     smooth = (
         not isinstance(cell.source, int)
-        and (cell.case in (FOREIGN, PUSHED) or cell.case in FAILURES)
+        and (cell.case in OWN_CASES or cell.case in FAILURES)
         and (mechanism is None or mechanism.batch)
     )
     watching = watched(MECHANISMS) if mechanism is None else nullcontext({})
     with watching as acted, nullcontext() if mechanism is None else mechanism.off():
         try:
-            config = changed(recorded.config, _FOREIGN_MODEL if cell.case == FOREIGN else {})
+            config = changed(recorded.config, _changes(cell, recorded))
             made = replayed(recorded, config, chain, seed, smooth)
         except (FglocError, RuntimeError, ValueError, ArithmeticError) as error:
             return Outcome(failed=f"{type(error).__name__}: {str(error).splitlines()[0][:200]}")
@@ -121,6 +127,11 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     kind, _, amount = cell.case.partition("_")
     if kind == FOREIGN:
         return []
+    if kind == WHEELS:
+        return FAILURES[LIKE[WHEELS]].chain(recorded)
+    if kind == GIVEN:
+        ids = sorted(recorded.landmarks.landmarks)
+        return [{"kind": "moved_marker", "ids": ids, "distance_m": _SHIFTED_M, "together": True}]
     if kind == PUSHED:
         return [{"kind": "kidnap", "when": {"intervals": _PUSHED_S}}]
     if kind == "ids":
@@ -133,6 +144,13 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     return FAILURES[cell.case].chain(recorded)
 
 
+def _changes(cell: Cell, recorded: Recorded) -> dict[str, Any]:
+    """Of the configuration."""
+    if cell.case == GIVEN:
+        return {"estimator": {"initial_pose": recorded.truth[0, 1:].tolist()}}
+    return {FOREIGN: _FOREIGN_MODEL, WHEELS: _WHEELS_ALONE}.get(cell.case, {})
+
+
 def _scored(cell: Cell, recorded: Recorded, chain: Sequence[Failure], made: Replayed, acted: dict[str, int]) -> Outcome:
     config, online, batch = recorded.config, made.online, made.batch
     lifted = [] if cell.case == PUSHED else [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap | Lift)]
@@ -140,7 +158,7 @@ def _scored(cell: Cell, recorded: Recorded, chain: Sequence[Failure], made: Repl
     figures = score(recorded, 0, config, online, None, chain, made.given)
     reasons = {d.reason for d in online.decisions if d.kind == "wheels"} & _NAMED_KINDS
     right = {_KINDS[cell.case]} if cell.case in _KINDS else set()
-    slips = figures.slips
+    slips, moved = figures.slips, frozenset() if cell.case == GIVEN else figures.moved
     simulated = slips is not None and not isinstance(cell.source, int)
     return Outcome(
         online=errors(online, config, unknown),
@@ -148,9 +166,9 @@ def _scored(cell: Cell, recorded: Recorded, chain: Sequence[Failure], made: Repl
         poses=len(online.trajectory),
         lost_share=lost_share(online.modes, online.trajectory.stamps_ns, unknown),
         named=tuple(sorted(figures.named)),
-        moved=tuple(sorted(figures.moved)),
-        wrong_names=len(figures.named - figures.moved) + len(reasons - right),
-        missed_names=len(figures.moved - figures.named) + len(right - reasons),
+        moved=tuple(sorted(moved)),
+        wrong_names=len(figures.named - moved) + len(reasons - right),
+        missed_names=len(moved - figures.named) + len(right - reasons),
         delays_s=slips.delays_s if slips and simulated else (),
         found_m=slips.found_m if slips and simulated else (),
         missed_m=slips.missed_m if slips and simulated else (),

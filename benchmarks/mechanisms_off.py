@@ -2,8 +2,9 @@
 
 A mechanism adapts a weight, a covariance, an association or a state by evidence. Not in the table: the graph itself
 with its installation parameters and the marginal covariances, noise that is calibrated and follows no evidence (blur of
-corners, correlation of wheels and learned motion), checks of single messages (``intake``, encoder resets), the handling
-of errors inside GTSAM, and what only an unknown map needs. What only works together is one row, and so is one filter.
+corners, correlation of the errors of one landmark, or of wheels and learned motion), checks of single messages
+(``intake``, encoder resets), the handling of errors inside GTSAM, and what only an unknown map needs. What only works
+together is one row, and so is one filter.
 """
 
 from __future__ import annotations

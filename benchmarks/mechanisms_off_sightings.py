@@ -15,18 +15,10 @@ from benchmarks.mechanisms_switch import (
 )
 
 _GATE = "fgloc.robust.association"
-_POSE_FIT = "fgloc.relocalization.pose_fit"
 _MODES = "fgloc.robust.landmark_modes:LandmarkModes"
-_NO_KERNEL = 1e6  # sigmas
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
-    Mechanism(
-        "fit_kernel",
-        "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not corrupt the pose.",
-        ("relocalization/pose_fit.py",),
-        (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
-    ),
     Mechanism(
         "gate",
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
@@ -49,13 +41,6 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         (Switch(f"{_GATE}:Association._reassociate", Returns(())),),
         Probe(f"{_GATE}:Association._reassociate", something),
         batch=True,
-    ),
-    Mechanism(
-        "shared_information",
-        "Sightings of one landmark within the correlation time of its errors share their information.",
-        ("robust/association.py",),
-        (Switch(f"{_GATE}:Association._share_information", lambda real: lambda self, m: (m, 1.0)),),
-        Probe(f"{_GATE}:Association._share_information", lambda result, *_: result[1] != 1.0),
     ),
     Mechanism(
         "overruled_prediction",

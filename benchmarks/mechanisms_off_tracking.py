@@ -26,10 +26,6 @@ def _never(real: Any) -> property:
     return property(lambda self: False)
 
 
-def _always(real: Any) -> property:
-    return property(lambda self: True)
-
-
 OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "place_search",
@@ -73,12 +69,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "A place is fitted again to the sightings that it explains.",
         ("relocalization/place_search.py",),
         (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
-    ),
-    Mechanism(
-        "jump_compelling",
-        "A place other than the tracked one has to explain nearly all, sharply, by two landmarks.",
-        ("relocalization/pose_consensus.py",),
-        (Switch("fgloc.relocalization.pose_consensus:PoseConsensus.overrides_prior", _always),),
     ),
 )
 

@@ -14,13 +14,13 @@ from benchmarks.common import Row
 from benchmarks.installed_recordings import Take
 from benchmarks.installed_runs import CASES as INSTALLED_CASES
 from benchmarks.installed_scores import Errors
-from benchmarks.mechanisms_cells import FOREIGN, PUSHED, Cell, Outcome
+from benchmarks.mechanisms_cells import LIKE, OWN_CASES, Cell, Outcome
 from benchmarks.mechanisms_effect import MODES, failed, mean, ratio
 from benchmarks.mechanisms_robots import ROBOT_CASES
 from benchmarks.mechanisms_switch import Mechanism
 
 Outcomes = Mapping[Cell, Outcome]
-CASES = (*INSTALLED_CASES, FOREIGN, PUSHED)
+CASES = (*INSTALLED_CASES, *OWN_CASES)
 SLIP_CASES = ("none", "slip", "mu01")
 MOVED_CASES, MISREAD_CASES = ("moved_30", "moved_70", "moved_150"), ("ids_10", "ids_30", "ids_50")  # cm; percent
 _LEAST_M = 0.03  # of a slip
@@ -56,7 +56,8 @@ class Scope:
         """A failure on the recordings of all seeds; ``robot_none`` and so on are those of MRCLAM 6."""
         if case.startswith("robot_"):
             return tuple(Cell(robot, case.removeprefix("robot_"), off) for robot in self.robots)
-        floor = FAILURES["slip" if case == FOREIGN else case].floor if case in {FOREIGN, *FAILURES} else "unequal_radii"
+        like = LIKE.get(case, case)
+        floor = FAILURES[like].floor if like in FAILURES else "unequal_radii"
         return tuple(Cell(Take("installed", floor, self.split, seed), case, off) for seed in self.seeds)
 
     @property

@@ -38,11 +38,11 @@ class PlaceSearch:
         self._window_ns = round(config.estimator.initialise_s * 1e9)
 
     def find(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> PoseConsensus | None:
-        """The place that nearly all sightings agree on; None: there is none, or it is not certain.
+        """The place that most sightings agree on; None: there is none, or it is not certain.
 
         Args:
             sightings: as seen from the pose that is looked for.
-            known: the robot has an estimated pose elsewhere, so that it takes more to find it here.
+            known: the robot has an estimated pose elsewhere, so that one landmark is not enough to find it here.
         """
         here = _spread(sightings, _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
@@ -60,9 +60,7 @@ class PlaceSearch:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
-        if not best.certain or (known and not best.overrides_prior):
-            return None
-        return best
+        return best if best.certain else None
 
     def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
@@ -91,7 +89,6 @@ class PlaceSearch:
             sum(residuals.values()) - se2.DOF,
             frozenset(seen - information_of.keys()),
             all(isinstance(m, PoseMeasurement) for m in agreeing),
-            _lasting(agreeing, self._window_ns),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:

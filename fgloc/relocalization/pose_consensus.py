@@ -35,8 +35,7 @@ class PoseConsensus:
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
-    by_sensors: bool = False  # from registered sensors alone ...
-    lasting: bool = False  # ... over as long as is collected
+    by_sensors: bool = False  # from registered sensors alone
 
     @property
     def certain(self) -> bool:
@@ -53,13 +52,6 @@ class PoseConsensus:
     @property
     def _sigmas(self) -> FloatArray:
         return np.sqrt(np.diag(self.fit.cov))
-
-    @property
-    def overrides_prior(self) -> bool:
-        """Whether it is evidence that the robot is not where it was estimated to be."""
-        known = bool((self._sigmas <= _SHARP_SIGMA).all())
-        checked = self.landmarks > 1 or self.lasting
-        return known and self.share >= WHOLE_SHARE and checked and self.fit.redundancy >= 2 * REDUNDANT
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:

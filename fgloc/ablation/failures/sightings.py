@@ -113,7 +113,8 @@ class MovedMarker(Failure):
     """Markers are not where the map has them, throughout the run.
 
     Each of ``ids`` (or ``count`` random markers) stands ``distance_m`` away in a random horizontal direction and turned
-    by ``yaw_rad`` about the vertical. That the map is moved instead of the marker is the same to the robot.
+    by ``yaw_rad`` about the vertical. That the map is moved instead of the marker is the same to the robot: all of
+    them ``together`` are a map that is shifted as a whole.
     """
 
     timed: ClassVar[bool] = False
@@ -122,6 +123,7 @@ class MovedMarker(Failure):
     count: int = Field(1, ge=1, description="markers to be moved if no ids are given")
     distance_m: float = Field(0.3, ge=0, description="m")
     yaw_rad: float = Field(0.0, description="rad, counter-clockwise from above")
+    together: bool = Field(False, description="all in the same direction")
 
     def apply(self, events: Any, scene: Scene) -> Any:
         """All events as they were."""
@@ -133,8 +135,10 @@ class MovedMarker(Failure):
         chosen = set(self.ids) or set(order[: self.count])
         turn = rpy_matrix(0.0, 0.0, -self.yaw_rad)
         moved = dict(landmark_map.landmarks)
-        for i in sorted(chosen & set(moved)):
-            direction = scene.rng.uniform(-np.pi, np.pi)
+        direction = scene.rng.uniform(-np.pi, np.pi)
+        for n, i in enumerate(sorted(chosen & set(moved))):
+            if n > 0 and not self.together:
+                direction = scene.rng.uniform(-np.pi, np.pi)
             shift = self.distance_m * np.array([np.cos(direction), np.sin(direction), 0.0])
             landmark = moved[i]
             rotation = turn @ landmark.rotation if landmark.size_m > 0 else landmark.rotation
