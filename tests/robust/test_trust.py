@@ -181,6 +181,16 @@ def test_a_failure_whose_kind_shows_later_is_one_failure():
     assert trust.flags == Counter({"wheels.left_wheel_dead": 1})
 
 
+@pytest.mark.parametrize("told", [sides(0.0, 0.0), sides(0.0, 0.5 * RIGHT)])
+def test_wheels_at_rest_while_the_robot_slides_on_are_neither_dead_nor_frozen(told):
+    trust = trust_in()
+    run(trust, 20, sides(LEFT, RIGHT))
+    slides = run(trust, 3, told, first=20)
+    stands = run(trust, 20, sides(0.0, 0.0), did=sides(0.0, 0.0), first=23)
+    assert any(t.budget.rejected for t in slides)
+    assert {t.budget.rejected.get("wheels", "slip") for t in (*slides, *stands)} == {"slip"}
+
+
 def test_without_the_track_no_wheel_is_accused():
     found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
     assert found[-1].budget.rejected == {"wheels": "slip"}
