@@ -33,8 +33,9 @@ WHEELS = "wheels"  # a case: ``dark60`` of a robot that has wheels and a camera 
 _WHEELS_ALONE = {"motion": {"use": False}, "gyro": {"use": False}}
 GIVEN = "given"  # a case: the first pose is given and right, while the map is shifted as a whole ...
 _SHIFTED_M = 0.5  # ... by this
-LIKE = {FOREIGN: "slip", WHEELS: "dark60"}  # the case whose recording they are
-OWN_CASES = (FOREIGN, PUSHED, WHEELS, GIVEN)
+CARRIED30 = "carried30"  # a case: carried away, with 30 % of the ids misread
+LIKE = {FOREIGN: "slip", WHEELS: "dark60", CARRIED30: "kidnap"}  # the case whose recording they are
+OWN_CASES = (FOREIGN, PUSHED, WHEELS, GIVEN, CARRIED30)
 _FOREIGN_MODEL = {"motion": {"model": "shipped:mrclam/all"}}
 _NAMED_KINDS = {"frozen", "left_wheel_dead", "right_wheel_dead"}
 
@@ -127,6 +128,8 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     kind, _, amount = cell.case.partition("_")
     if kind == FOREIGN:
         return []
+    if kind == CARRIED30:
+        return [*FAILURES[LIKE[CARRIED30]].chain(recorded), *FAILURES["ids30"].chain(recorded)]
     if kind == WHEELS:
         return FAILURES[LIKE[WHEELS]].chain(recorded)
     if kind == GIVEN:

@@ -15,10 +15,19 @@ from benchmarks.mechanisms_switch import (
 )
 
 _GATE = "fgloc.robust.association"
+_POSE_FIT = "fgloc.relocalization.pose_fit"
+_NO_KERNEL = 1e6  # sigmas
 _MODES = "fgloc.robust.landmark_modes:LandmarkModes"
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
+    Mechanism(
+        "fit_kernel",
+        "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not corrupt the pose.",
+        ("relocalization/pose_fit.py",),
+        (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
+        batch=True,
+    ),
     Mechanism(
         "gate",
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",

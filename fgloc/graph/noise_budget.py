@@ -105,7 +105,7 @@ class NoiseBudget:
 
     def _with_slip(self, wheels: MotionMeasurement, rules: FusionRules) -> MotionMeasurement:
         """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip."""
-        slips = self.rejected[wheels.source] == "slip"
+        slips = self.rejected[wheels.source] == "slip" and wheels.motion.any()
         speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
         speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds

@@ -174,8 +174,9 @@ class GlobalSearch:
         steps = (*self._earlier, *self._steps)
         *_, oldest = _back(newest, steps)
         self.forget()
-        first = PoseWithCovariance(oldest.pose, COVARIANCE_FACTOR * oldest.cov)  # it has these sightings already
-        return InitialPose(steps, first, newest, gathered, displaced)
+        # The sightings that follow are in it already; those of markers say themselves which of them are wrong
+        cov = ANYWHERE.copy() if displaced is None else COVARIANCE_FACTOR * oldest.cov
+        return InitialPose(steps, PoseWithCovariance(oldest.pose, cov), newest, gathered, displaced)
 
     def _compensated(self) -> Iterator[LandmarkMeasurement]:
         """Every collected sighting as seen from the newest step."""

@@ -38,7 +38,7 @@ class PlaceSearch:
         self._window_ns = round(config.estimator.initialise_s * 1e9)
 
     def find(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> PoseConsensus | None:
-        """The place that most sightings agree on; None: there is none, or it is not certain.
+        """The place that nearly all sightings agree on; None: there is none, or it is not certain.
 
         Args:
             sightings: as seen from the pose that is looked for.
@@ -60,7 +60,7 @@ class PlaceSearch:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
-        return best if best.certain else None
+        return best if (best.overrides_prior if known else best.certain) else None
 
     def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
@@ -89,6 +89,7 @@ class PlaceSearch:
             sum(residuals.values()) - se2.DOF,
             frozenset(seen - information_of.keys()),
             all(isinstance(m, PoseMeasurement) for m in agreeing),
+            _lasting(agreeing, self._window_ns),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:

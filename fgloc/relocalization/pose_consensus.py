@@ -35,7 +35,8 @@ class PoseConsensus:
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
-    by_sensors: bool = False  # from registered sensors alone
+    by_sensors: bool = False  # from registered sensors alone ...
+    lasting: bool = False  # ... over as long as is collected
 
     @property
     def certain(self) -> bool:
@@ -52,6 +53,11 @@ class PoseConsensus:
     @property
     def _sigmas(self) -> FloatArray:
         return np.sqrt(np.diag(self.fit.cov))
+
+    @property
+    def overrides_prior(self) -> bool:
+        """Whether it is evidence that the robot is elsewhere than estimated: one landmark alone may have been moved."""
+        return self.certain and (self.landmarks > 1 or self.lasting)
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:

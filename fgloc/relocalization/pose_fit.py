@@ -28,7 +28,7 @@ _TELLS_NOTHING = 1.0 / _RANK  # times its own: variance by the installation of a
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A pose that sightings alone give: covariance of the right perturbation, χ² cost, number of residuals."""
+    """A pose that sightings alone give: covariance of the right perturbation, robust cost, number of residuals."""
 
     pose: FloatArray
     cov: FloatArray
@@ -53,7 +53,8 @@ def fit_pose(
 ) -> Fit | None:
     """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
 
-    Gauss-Newton. What is not known of the installation is taken for noise of each sighting by itself.
+    Gauss-Newton with Cauchy weights, so that one wrong sighting does not corrupt the place. What is not known of the
+    installation is taken for noise of each sighting by itself.
     """
     fitted = PoseFit(sightings, factors, config)
     return fitted.solve(start)
@@ -65,6 +66,7 @@ class PoseFit:
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
+        self._k = np.array([cauchy_k(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray) -> Fit | None:
@@ -72,9 +74,10 @@ class PoseFit:
         pose, previous = start, math.inf
         for step in range(_ITERATIONS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
-            for r, J, behind, d in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
-                weight = np.where(behind, 0.0, 1.0)
-                cost += float(np.where(behind, UNEXPLAINED, np.einsum("ni,ni->n", r, r)).sum())
+            for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
+                square = np.einsum("ni,ni->n", r, r)
+                weight = np.where(behind, 0.0, k**2 / (k**2 + 2.0 * square / d))  # as if of two-dimensional sightings
+                cost += float(np.where(behind, UNEXPLAINED, _robust_costs(square, d, k)).sum())
                 dof += int(d.sum())
                 normal += np.einsum("n,nij,nik->jk", weight, J, J)
                 pull += np.einsum("n,nij,ni->j", weight, J, r)
@@ -88,10 +91,11 @@ class PoseFit:
         return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
 
     def costs(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
-        """χ² cost of each sighting at a pose (infinite: it cannot have been made there), and its residuals."""
+        """Robust cost of each sighting at a pose (infinite: it cannot have been made there), and its residuals."""
         costs, dofs = np.zeros(len(self._observed)), np.zeros(len(self._observed), dtype=int)
-        for (rows, _), (r, _, behind, d) in zip(self._observed.batches, self._white(pose, anew=True), strict=True):
-            costs[rows] = np.where(behind, np.inf, np.einsum("ni,ni->n", r, r))
+        for (rows, _), (r, _, behind, d, k) in zip(self._observed.batches, self._white(pose, anew=True), strict=True):
+            square = np.einsum("ni,ni->n", r, r)
+            costs[rows] = np.where(behind, np.inf, _robust_costs(square, d, k))
             dofs[rows] = d
         return costs, dofs
 
@@ -111,19 +115,30 @@ class PoseFit:
 
     def _white(
         self, pose: FloatArray, anew: bool
-    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_], IntArray]]:
-        """Of each kind: residuals, Jacobians, what is behind the camera, residuals of each."""
+    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray]]:
+        """Of each kind: residuals, Jacobians, what is behind the camera, residuals of each, Cauchy constants."""
         for i, (rows, batch) in enumerate(self._observed.batches):
             stack = batch.evaluate(np.broadcast_to(pose, (len(rows), 3)), self._theta, by_installation=anew)
             if anew:
                 self._whitening[i] = self._whiten(batch, stack)
             W = self._whitening[i]
             r = np.einsum("nij,nj->ni", W, stack.residual)
-            yield r, W @ stack.J, stack.behind, np.array(batch.rows)
+            yield r, W @ stack.J, stack.behind, np.array(batch.rows), self._k[rows]
 
 
 def sighting_costs(
     pose: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
 ) -> tuple[FloatArray, IntArray]:
-    """χ² cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
+    """Robust cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
     return PoseFit(sightings, factors, config).costs(pose)
+
+
+def cauchy_k(m: LandmarkMeasurement) -> float:
+    """Cauchy constant of a sighting in a fit, in units of its sigma."""
+    return m.cauchy_k
+
+
+def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:
+    """Cauchy's costs of squared whitened residuals, as if they were those of two-dimensional sightings."""
+    pairs = dof / 2.0
+    return np.asarray(k**2 * np.log1p(square / pairs / k**2) * pairs)

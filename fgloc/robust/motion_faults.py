@@ -17,11 +17,11 @@ from fgloc.robust.source_difference import source_difference
 from fgloc.sensors import registry
 from fgloc.types import FloatArray, MotionReadings, Step
 
-_MOVED = 0.25  # of the reference source's travel: a wheel that turned less than this while it did more stood still
+_MOVED = 0.25  # of the reference source's travel: a wheel that turned less stood still, one that lacks less turned
 # Travel by the reference source from which a wheel is known to have turned or to have stood. Over a shorter way a robot
 # slides on with its wheels at rest: 0.08 m from 0.4 m/s at a friction of 0.1.
 _LEAST_M = 0.15
-_EVIDENCE_S = 1.0  # of travel from which the kind of failure is determined
+_LONGEST_S = 3.0  # of travel from which the kind of failure is determined
 _MODEL_WRONG_S = 10.0  # a model that was wrong is used again when it has agreed for this long: it mostly stays wrong
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
@@ -79,7 +79,7 @@ class MotionFaultMonitor:
         self._attribution = attribution
         self._track_m = track_m
         self._glr = GlrTest(config)
-        self._travels: deque[tuple[float, FloatArray, FloatArray]] = deque()  # dt, motion of wheels and reference
+        self._travels: deque[FloatArray] = deque()  # (5,): dt, ways of left and right wheel by wheels and by reference
         self._first_ns: int | None = None  # of the run
         self._wrong_before: dict[str, str] = {}  # as of the step before: sources, and why
         self._reason = "slip"  # of the wheels
@@ -182,23 +182,28 @@ class MotionFaultMonitor:
         reference = readings.learned or readings.gyro
         if readings.wheels is None or reference is None:
             return
-        self._travels.append((dt, readings.wheels.motion, reference.motion))
-        while sum(t for t, _, _ in self._travels) - self._travels[0][0] > _EVIDENCE_S:
-            self._travels.popleft()
+        self._travels.append(np.array([dt, *self._sides(readings.wheels.motion), *self._sides(reference.motion)]))
+        total = np.sum(self._travels, axis=0)
+        while total[0] > _LONGEST_S or (total[3:] - self._travels[0][3:] > _LEAST_M).all():
+            total -= self._travels.popleft()
 
     def _failure(self, since: int) -> str:
         """What kind of failure it looks like: which wheel stood still while the robot went on, and which one turned."""
-        newest = list(self._travels)[-since:] if since else list(self._travels)
-        half = 0.5 * (self._track_m or 0.0)
-
-        def sides(motion: FloatArray) -> FloatArray:
-            return np.array([motion[0] - half * motion[2], motion[0] + half * motion[2]])
-
-        by_wheels = sum((np.abs(sides(w)) for _, w, _ in newest), np.zeros(2))
-        did = sum((np.abs(sides(n)) for _, _, n in newest), np.zeros(2))
-        went, turned = did > _LEAST_M, by_wheels >= _MOVED * did
-        if (went & ~turned).all():
+        if since:  # what was before is no evidence
+            self._travels = deque(list(self._travels)[-since:])
+        _, *ways = np.sum(self._travels, axis=0)
+        by_wheels, did = np.reshape(ways, (2, 2))
+        went = did > _LEAST_M
+        stood, turned = went & (by_wheels < _MOVED * did), went & (by_wheels > (1.0 - _MOVED) * did)
+        if stood.all():
             return "frozen"
-        if self._track_m is None or not went.all() or turned.all():
-            return "slip" if since else self._reason
-        return "right_wheel_dead" if turned[0] else "left_wheel_dead"
+        if self._track_m is not None and stood[0] and turned[1]:
+            return "left_wheel_dead"
+        if self._track_m is not None and stood[1] and turned[0]:
+            return "right_wheel_dead"
+        return "slip" if since else self._reason
+
+    def _sides(self, motion: FloatArray) -> tuple[float, float]:
+        """How far the left and the right wheel went [m]."""
+        forward, turn = float(motion[0]), 0.5 * (self._track_m or 0.0) * float(motion[2])
+        return abs(forward - turn), abs(forward + turn)

@@ -132,7 +132,7 @@ class PoseMeasurement(ABC):
     cov: FloatArray  # (d, d) of the residual
     target: int = -1  # which anchor or beacon was measured, in the sensor's own numbering; -1: none
     observes_yaw: bool = False  # whether one reading determines the yaw, as a compass does
-    cauchy_k: float = 3.0  # as in PixelMeasurement
+    cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
     T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
     motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
 

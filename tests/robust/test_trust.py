@@ -191,6 +191,13 @@ def test_wheels_at_rest_while_the_robot_slides_on_are_neither_dead_nor_frozen(to
     assert {t.budget.rejected.get("wheels", "slip") for t in (*slides, *stands)} == {"slip"}
 
 
+@pytest.mark.parametrize("did", [(0.1, 0.0), (0.0, 0.8)])
+def test_frozen_encoders_of_a_slow_or_turning_robot_are_named(did):
+    trust = trust_in()
+    run(trust, 30, did, did=did)
+    assert run(trust, 40, (0.0, 0.0), did=did, first=30)[-1].budget.rejected == {"wheels": "frozen"}
+
+
 def test_without_the_track_no_wheel_is_accused():
     found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
     assert found[-1].budget.rejected == {"wheels": "slip"}

@@ -114,7 +114,7 @@ class MovedMarker(Failure):
 
     Each of ``ids`` (or ``count`` random markers) stands ``distance_m`` away in a random horizontal direction and turned
     by ``yaw_rad`` about the vertical. That the map is moved instead of the marker is the same to the robot: all of
-    them ``together`` are a map that is shifted as a whole.
+    them ``together`` are a map that is shifted as a whole (each turns about itself).
     """
 
     timed: ClassVar[bool] = False
