@@ -1,12 +1,14 @@
 """What each mechanism is for: ``python -m benchmarks.mechanisms [--quick] [--json FILE] [--split validation]``.
 
-Every adaptive mechanism of fgloc (`benchmarks.mechanisms_off`) is taken away by itself, under every failure of
-`benchmarks.installed`, on simulated recordings as installed, and on robots of MRCLAM 6, whose landmarks are beacons
-(``robot_*``, online).
+Every adaptive mechanism of fgloc (`benchmarks.mechanisms_off`) is taken away by itself, under failures of
+`benchmarks.installed` and others, on simulated recordings as installed, and on robots of MRCLAM 6, whose landmarks are
+beacons (``robot_*``, online).
 
-- ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios.
-- ``mechanisms.without_effect``: those whose removal worsens nothing, as `benchmarks.mechanisms_effect` defines it.
-  ``off.together.*`` is with all of these off at once, or with those that ``--together`` names.
+- ``mechanisms.without_effect``: those whose removal worsens nothing, as `benchmarks.mechanisms_effect` defines it. Each
+  is taken away under the failure that it is for, and, only if nothing gets worse there, under one after another of
+  the rest. ``off.together.*`` is with all of these off at once, or with those that ``--together`` names.
+- ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios. They are
+  of the failures that were run for the row before, or of all of them (hours) with ``--rows off.``.
 - ``mechanisms.constants``, ``.lines``: as `benchmarks.mechanisms_count` defines them; ``--list`` prints the constants.
 - ``rules66.*``: ATE of the textbook's pipeline with three rules over that of fgloc without learned motion, online.
 - ``*.over_before``: ATE over that of an earlier file of `benchmarks.installed`, given by ``--before``.
@@ -38,7 +40,7 @@ from benchmarks.installed_recordings import SEEDS, Take, prepare
 from benchmarks.installed_runs import Cell as InstalledCell
 from benchmarks.installed_runs import floor
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
-from benchmarks.mechanisms_report import report, without_effect
+from benchmarks.mechanisms_report import cells, order, report, without_effect
 from benchmarks.mechanisms_robots import SOURCE
 from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, of_one, over_before, wanted
 from benchmarks.mechanisms_runs import run_all, run_plain
@@ -62,6 +64,11 @@ class Options:
     seeds: int | None = None
     together: tuple[str, ...] = ()
     jobs: int = os.cpu_count() or 1
+
+    @property
+    def every_mechanism(self) -> bool:
+        """Whether rows of mechanisms were asked for by name."""
+        return any(prefix.startswith("off.") for prefix in self.prefixes)
 
     def wants(self, row_id: str) -> bool:
         """Whether a row was asked for."""
@@ -106,25 +113,37 @@ def counted() -> Iterator[Row]:
 def _of_runs(chosen: Scope, options: Options) -> Iterator[Row]:
     every = [w for w in wanted(chosen) if w.cells]
     before = _earlier(options.before)
+    rows = [w for w in every if _wanted(w, options) and (options.every_mechanism or not w.id.startswith("off."))]
     effect = options.wants("mechanisms.without_effect")
-    rows = [w for w in every if _wanted(w, options) or (effect and w.id.startswith("off."))]
-    if not rows:
-        return
-    cells = {cell for w in rows for cell in w.cells}
-    prepare(cell.source for cell in cells if isinstance(cell.source, Take))
-    found = run_all(cells, options.jobs)
+    prepare(cell.source for w in (every if effect else rows) for cell in w.cells if isinstance(cell.source, Take))
+    found: Outcomes = run_all({cell for w in rows for cell in w.cells}, options.jobs)
     if effect:
+        found = taken_away(chosen, found, options.jobs)
         useless = without_effect(chosen, found)
         yield Row("mechanisms.without_effect", len(useless), n=len(chosen.mechanisms))
         print(report(chosen, found))
         yield from _together(chosen, [BY_NAME[name] for name in useless], found, options)
+        more = [w for w in every if w.id.startswith("off.") and w not in rows]
+        rows += [w for w in more if all(cell in found for cell in w.cells)]
     for w in rows:
         row = w.row(w.id, found)
-        if options.wants(w.id):
+        if options.wants(w.id) or w.id.startswith("off."):
             yield row
         name = w.id.replace(".ate_mm", ".over_before")
         if w.id.endswith(".ate_mm") and before is not None and options.wants(name):
             yield over_before(name, row, before)
+
+
+def taken_away(chosen: Scope, found: Outcomes, jobs: int) -> Outcomes:
+    """Outcomes without each mechanism, under one failure after another until something gets worse."""
+    pending = {m.name: order(chosen, m) for m in chosen.mechanisms}
+    while pending:
+        tried = {name: cases[0] for name, cases in pending.items()}
+        pairs = [pair for name, case in tried.items() for pair in cells(chosen, BY_NAME[name], case)]
+        found = {**found, **run_all({cell for pair in pairs for cell in pair if cell not in found}, jobs)}
+        useless = without_effect(chosen, found)
+        pending = {name: cases[1:] for name, cases in pending.items() if name in useless and cases[1:]}
+    return found
 
 
 def _together(chosen: Scope, useless: Sequence[Mechanism], found: Outcomes, options: Options) -> Iterator[Row]:

@@ -45,6 +45,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch("fgloc.robust.glr_test:GlrTest._worst", Returns((0.0, 1))),),
         Probe("fgloc.robust.glr_test:GlrTest.judge", lambda verdict, *_: verdict.flagged),
         batch=True,
+        case="onewheel",
     ),
     Mechanism(
         "fault_attribution",
@@ -53,6 +54,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch("fgloc.robust.fault_attribution:FaultAttribution.contradicted", Returns(None)),),
         Probe("fgloc.robust.fault_attribution:FaultAttribution.contradicted", _model_contradicted),
         batch=True,
+        case="foreign",
     ),
     Mechanism(
         "disagreement_scale",
@@ -61,6 +63,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch(f"{_BUDGET}:NoiseBudget.combine", _unscaled),),
         Probe(f"{_BUDGET}:NoiseBudget.combine", _scaled),
         batch=True,
+        case="dark60",
     ),
     Mechanism(
         "disagreement_level",
@@ -69,6 +72,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch("fgloc.robust.glr_test:COVARIANCE_FACTOR", Constant(1.0)),),
         Probe("fgloc.robust.glr_test:GlrTest.judge", lambda _, before, test, *args: test._level < 1.0),
         batch=True,
+        case="dark60",
     ),
     Mechanism(
         "learned_alone",
@@ -77,6 +81,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch(f"{_BUDGET}:COVARIANCE_FACTOR", Constant(1.0)),),
         Probe(f"{_BUDGET}:NoiseBudget.combine", _without_wheels),
         batch=True,
+        case="dark60",
     ),
     Mechanism(
         "onset_reweighing",
@@ -85,6 +90,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch("fgloc.robust.motion_judge:MotionJudge._revise", Returns(())),),
         Probe("fgloc.robust.motion_judge:MotionJudge._revise", lambda result, _, self, verdict: verdict.span > 1),
         batch=True,
+        case="foreign",
     ),
     Mechanism(
         "failure_kind",
@@ -92,6 +98,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         ("robust/motion_faults.py",),
         (Switch(f"{_TRUST}:MotionFaultMonitor._failure", Returns("slip")),),
         Probe(f"{_TRUST}:MotionFaultMonitor._failure", lambda kind, *_: kind != "slip"),
+        case="onewheel",
     ),
     Mechanism(
         "doubtful_wheels",
@@ -100,6 +107,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch(f"{_BUDGET}:NoiseBudget._with_slip", Argument(1)),),
         Probe(f"{_BUDGET}:NoiseBudget._with_slip", called),
         batch=True,
+        case="foreign",
     ),
     Mechanism(
         "gyro_bias",
@@ -108,5 +116,6 @@ OF_MOTION: tuple[Mechanism, ...] = (
         (Switch("fgloc.sensors.gyro.rate:Gyro._learn", Returns(None)),),
         Probe("fgloc.sensors.gyro.rate:Gyro._learn", called),
         batch=True,
+        case="dark60",
     ),
 )

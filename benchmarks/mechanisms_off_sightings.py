@@ -27,6 +27,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         ("relocalization/pose_fit.py",),
         (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
         batch=True,
+        case="carried30",
     ),
     Mechanism(
         "gate",
@@ -34,6 +35,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         ("robust/association.py",),
         (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
         batch=True,
+        case="kidnap",
     ),
     Mechanism(
         "joint_compatibility",
@@ -42,6 +44,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         (Switch(f"{_GATE}:Association._agreed", Argument(3)),),
         Probe(f"{_GATE}:Association._agreed", lambda result, _, *args: result != args[3]),
         batch=True,
+        case="ids30",
     ),
     Mechanism(
         "misread_ids",
@@ -50,6 +53,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         (Switch(f"{_GATE}:Association._reassociate", Returns(())),),
         Probe(f"{_GATE}:Association._reassociate", something),
         batch=True,
+        case="ids30",
     ),
     Mechanism(
         "overruled_prediction",
@@ -58,6 +62,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
         batch=True,
+        case="pushed",
     ),
 )
 
@@ -69,5 +74,6 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
         (Switch(f"{_MODES}.observe", Returns(None)),),
         Probe(f"{_MODES}.observe", not_none),
         batch=True,
+        case="moved",
     ),
 )

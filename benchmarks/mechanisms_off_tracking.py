@@ -39,6 +39,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
         batch=True,
+        case="kidnap",
     ),
     Mechanism(
         "lost_by_covariance",
@@ -47,6 +48,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         (Switch(f"{_WHERE}.is_unlocalized", Returns(False)),),
         Probe(f"{_WHERE}.is_unlocalized", something),
         batch=True,
+        case="robot_moved",
     ),
     Mechanism(
         "lift",
@@ -55,6 +57,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         (Switch("fgloc.robust.lift:LiftMonitor.observe", Returns([])),),
         Probe("fgloc.robust.lift:LiftMonitor.observe", something),
         batch=True,
+        case="lifted",
     ),
     Mechanism(
         "given_pose_held",
@@ -63,12 +66,14 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         (Switch(f"{_WHERE}.keeps_initial_pose", _never),),
         Probe(f"{_WHERE}.gate_initial_pose", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,
+        case="given",
     ),
     Mechanism(
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
         ("relocalization/place_search.py",),
         (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
+        case="ids30",
     ),
 )
 
@@ -80,5 +85,6 @@ OF_ESTIMATION: tuple[Mechanism, ...] = (
         (Switch(f"{_WINDOW}._relinearize", Returns(None)),),
         Probe(f"{_WINDOW}._relinearize", called),
         batch=True,
+        case="wheels",
     ),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.mechanisms_cells import Outcome
+from benchmarks.mechanisms_cells import Cell
 from benchmarks.mechanisms_effect import MODES, Change, changes
 from benchmarks.mechanisms_rows import Outcomes, Scope
 from benchmarks.mechanisms_switch import Mechanism
@@ -10,24 +10,33 @@ from benchmarks.mechanisms_switch import Mechanism
 _SHOWN = 4  # changes of a mechanism, each way
 
 
+def order(chosen: Scope, mechanism: Mechanism) -> list[str]:
+    """The failures, the one that the mechanism is for first."""
+    return sorted(chosen.all_cases, key=lambda case: case != mechanism.case)
+
+
+def cells(chosen: Scope, mechanism: Mechanism, case: str) -> list[tuple[Cell, Cell]]:
+    """The runs of a failure with the mechanism off, and with it on."""
+    return list(zip(*(chosen.cells(case, name) for name in (mechanism.name, "")), strict=True))
+
+
 def effect(chosen: Scope, mechanism: Mechanism, found: Outcomes) -> list[Change]:
-    """What taking a mechanism away does, over all failures; those that it makes worse most come first."""
+    """What taking a mechanism away does, over the failures that were run; what it makes worse most comes first."""
     out: list[Change] = []
     for case in chosen.all_cases:
-        offs, ons = (chosen.cells(case, name) for name in (mechanism.name, ""))
-        pairs: list[tuple[Outcome, Outcome]] = [(found[a], found[b]) for a, b in zip(offs, ons, strict=True)]
-        if pairs:
-            out += changes(case, pairs, MODES if mechanism.batch else MODES[:1])
+        runs = cells(chosen, mechanism, case)
+        if runs and all(cell in found for pair in runs for cell in pair):
+            out += changes(case, [(found[a], found[b]) for a, b in runs], MODES if mechanism.batch else MODES[:1])
     return sorted(out, key=lambda change: -change.size)
 
 
 def without_effect(chosen: Scope, found: Outcomes) -> list[str]:
-    """Mechanisms whose removal worsens nothing."""
+    """Mechanisms whose removal worsens nothing that was run."""
     return [m.name for m in chosen.mechanisms if not any(c.counts and c.size > 0.0 for c in effect(chosen, m, found))]
 
 
 def report(chosen: Scope, found: Outcomes) -> str:
-    """One paragraph for each mechanism."""
+    """One paragraph for each mechanism, of the failures that were run."""
     out = []
     for mechanism in chosen.mechanisms:
         every = effect(chosen, mechanism, found)
@@ -43,9 +52,8 @@ def report(chosen: Scope, found: Outcomes) -> str:
 def _acts(chosen: Scope, mechanism: Mechanism, found: Outcomes) -> str:
     if mechanism.probe is None:
         return "no probe"
-    acted = {
-        case: sum(found[cell].acted.get(mechanism.name, 0) for cell in chosen.cells(case)) for case in chosen.all_cases
-    }
+    ran = [case for case in chosen.all_cases if all(cell in found for cell in chosen.cells(case))]
+    acted = {case: sum(found[cell].acted.get(mechanism.name, 0) for cell in chosen.cells(case)) for case in ran}
     return "acts in " + (", ".join(f"{case} {n}" for case, n in acted.items() if n) or "none")
 
 

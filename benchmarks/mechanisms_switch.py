@@ -118,6 +118,7 @@ class Mechanism:
         switches: all of them together take it away.
         probe: observes where it acts; None: it acts always, or no single function shows it.
         batch: whether the smoothed result can depend on it.
+        case: a failure that it is for; it is run first.
     """
 
     name: str
@@ -126,6 +127,7 @@ class Mechanism:
     switches: tuple[Switch, ...]
     probe: Probe | None = None
     batch: bool = False
+    case: str = "none"
 
     @contextmanager
     def off(self) -> Iterator[None]:
