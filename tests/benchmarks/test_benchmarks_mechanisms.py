@@ -226,6 +226,29 @@ def test_the_table_is_well_formed_and_names_what_has_no_effect():
     assert Outcome.from_json(asdict(on)) == on
 
 
+def test_a_mechanism_is_taken_away_where_it_is_for_something_and_elsewhere_only_if_nothing_gets_worse_there(
+    monkeypatch,
+):
+    chosen, ran = scope("place_search", "misread_ids"), []
+
+    def run_all(cells, jobs):
+        ran.append({(cell.case, cell.off) for cell in cells})
+        return {
+            cell: result(2.0 if cell.off == "place_search" or (cell.case == "slip" and cell.off) else 1.0)
+            for cell in cells
+        }
+
+    monkeypatch.setattr(mechanisms, "run_all", run_all)
+    found = mechanisms.taken_away(chosen, {}, 1)
+    assert [{pair for pair in pairs if pair[1]} for pairs in ran] == [
+        {("kidnap", "place_search"), ("none", "misread_ids")},  # ids30, which it is for, is not in the scope
+        {("slip", "misread_ids")},
+    ]
+    assert without_effect(chosen, found) == []
+    assert "kidnap.online.ate: 1 -> 2" in report(chosen, found)
+    assert without_effect(chosen, {cell: result() for cell in found}) == ["place_search", "misread_ids"]
+
+
 def test_the_command_line_chooses_split_seeds_and_rows():
     options, listing, rest = mechanisms.parsed(["--split", "validation", "--rows", "off.gate.,motion.", "--quick"])
     assert (options.split, listing, rest) == ("validation", False, ["--quick"])
