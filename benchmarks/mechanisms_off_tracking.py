@@ -17,6 +17,7 @@ from benchmarks.mechanisms_switch import (
 
 _GATE = "fgloc.robust.association"
 _SEARCH = "fgloc.relocalization.place_search"
+_CONSENSUS = "fgloc.relocalization.pose_consensus:PoseConsensus"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 _WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
@@ -73,6 +74,15 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "A place is fitted again to the sightings that it explains.",
         ("relocalization/place_search.py",),
         (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
+        case="ids30",
+    ),
+    Mechanism(
+        "jump_compelling",
+        "A place other than the tracked one needs two landmarks, and nearly all sightings of an image or two images.",
+        ("relocalization/pose_consensus.py",),
+        (Switch(f"{_CONSENSUS}.overrides_prior", Returns(True)),),
+        Probe(f"{_CONSENSUS}.overrides_prior", lambda result, *_: not result),
+        batch=True,
         case="ids30",
     ),
 )

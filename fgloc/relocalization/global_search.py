@@ -120,8 +120,9 @@ class GlobalSearch:
             motions: factors of the motion over it.
             sightings: made in it.
             readings: what the motions were made of, kept for the replay.
-            tracked: where the robot is estimated to be after the step. Then it takes two markers to agree on another
-                place. Among beacons another place has to be so much more probable.
+            tracked: where the robot is estimated to be after the step. Then it takes two markers, and nearly
+                everything to agree on another place: some wrong ids agree with some place always. Among beacons another
+                place has to be so much more probable.
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
         horizon = step.stamp_ns - self._window_ns

@@ -42,7 +42,7 @@ class PlaceSearch:
 
         Args:
             sightings: as seen from the pose that is looked for.
-            known: the robot has an estimated pose elsewhere, so that one landmark is not enough to find it here.
+            known: the robot has an estimated pose elsewhere, so that it takes more to find it here.
         """
         here = _spread(sightings, _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
@@ -60,7 +60,9 @@ class PlaceSearch:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
-        return best if (best.overrides_prior if known else best.certain) else None
+        if not best.certain or (known and not best.overrides_prior()):
+            return None
+        return best
 
     def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
@@ -90,6 +92,7 @@ class PlaceSearch:
             frozenset(seen - information_of.keys()),
             all(isinstance(m, PoseMeasurement) for m in agreeing),
             _lasting(agreeing, self._window_ns),
+            len({m.stamp_ns for m in agreeing}),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:

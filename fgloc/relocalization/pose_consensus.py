@@ -37,6 +37,7 @@ class PoseConsensus:
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
     by_sensors: bool = False  # from registered sensors alone ...
     lasting: bool = False  # ... over as long as is collected
+    images: int = 1  # that show what agrees, or readings of beacons and sensors
 
     @property
     def certain(self) -> bool:
@@ -54,10 +55,15 @@ class PoseConsensus:
     def _sigmas(self) -> FloatArray:
         return np.sqrt(np.diag(self.fit.cov))
 
-    @property
     def overrides_prior(self) -> bool:
-        """Whether it is evidence that the robot is elsewhere than estimated: one landmark alone may have been moved."""
-        return self.certain and (self.landmarks > 1 or self.lasting)
+        """Whether it is evidence that the robot is elsewhere than estimated.
+
+        One landmark alone may have been moved, and two in one image may be misread so that they agree, unless nearly
+        everything else agrees with them.
+        """
+        sharp = bool((self._sigmas <= _SHARP_SIGMA).all())
+        whole = sharp and self.share >= WHOLE_SHARE and self.fit.redundancy >= 2 * REDUNDANT
+        return (self.landmarks > 1 and (whole or self.images > 1)) or (whole and self.lasting)
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
