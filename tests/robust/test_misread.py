@@ -6,7 +6,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from robot_world import Chain, World, config, position_error, room, standing
+import pytest
+from robot_world import START_NS, Chain, World, config, position_error, room, standing
 
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.types import Landmark
@@ -56,6 +57,17 @@ def test_a_misread_marker_is_used_as_what_hangs_there():
     read = {(e.stamp_ns, d.landmark_id) for e in without for d in e.decisions if d.kind == "corners" and not d.reason}
     assert len(believed) > 1.3 * len(read)
     assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[20:]) < 0.03  # nothing is taken as exact
+
+
+@pytest.mark.parametrize("seed", [6, 8])
+def test_a_robot_that_was_carried_away_is_found_among_misread_markers(seed):
+    """Two that agree in two images are enough, whatever the misread ones say."""
+    world = World(room(), seed=seed, seconds=13.0, kidnap_s=10.0)
+    events, _ = misread(world.events(), sorted(room().landmarks), 0.3, seed=seed)
+    _, estimates = follow(room(), events)
+    after = [e for e in estimates if e.stamp_ns > START_NS + round(10.3e9)]
+    assert len(after) > 20
+    assert max(position_error(e, world.truth(e.stamp_ns)) for e in after) < 0.1
 
 
 def test_sound_markers_are_not_read_again():
