@@ -20,7 +20,7 @@ from benchmarks.mechanisms_robots import ROBOT_CASES
 from benchmarks.mechanisms_switch import Mechanism
 
 Outcomes = Mapping[Cell, Outcome]
-CASES = (*INSTALLED_CASES, *OWN_CASES)
+CASES = (*INSTALLED_CASES, "lifted", *OWN_CASES)
 SLIP_CASES = ("none", "slip", "mu01")
 MOVED_CASES, MISREAD_CASES = ("moved_30", "moved_70", "moved_150"), ("ids_10", "ids_30", "ids_50")  # cm; percent
 _LEAST_M = 0.03  # of a slip
