@@ -190,6 +190,8 @@ def test_a_change_counts_where_it_is_large_enough():
     assert better(result(nees=2.0), result(nees=4.0)) == {"online.nees"}
     assert worse(result(wrong_names=1), result()) == {"names"} == better(result(), result(missed_names=1))
     assert worse(Outcome(failed="lost"), result()) == {"failed"}
+    assert worse(result(lifted_nees=60.0), result(lifted_nees=1.0)) == {"nees_while_lifted"}
+    assert worse(result(lifted_nees=60.0), result()) == set()
     assert worse(replace(result(), poses=90), result()) == {"poses"}
     assert outside(1.0) == 0.0
     assert outside(2.8) == pytest.approx(math.log(2.0))
