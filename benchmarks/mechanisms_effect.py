@@ -1,8 +1,9 @@
 """What a mechanism is worth: its runs with it off compared with those with it on, for `benchmarks.mechanisms`.
 
 Taking a mechanism away *worsens* a failure if the mean ATE over the seeds grows by 5 % or more, if ln(NEES/3), of the
-run or while a robot is lifted, gets farther from the band of 0.7 to 1.4 by 0.05 or more, if more names are wrong or missed, if a run fails, or if one pose
-in a hundred is missing; it *improves* it if the ATE falls, the NEES gets nearer or the names get better by as much.
+run or while a robot is lifted, gets farther from the band of 0.7 to 1.4 by 0.05 or more, if more names are wrong or
+missed, if a run fails, or if one pose in a hundred is missing; it *improves* it if the ATE falls, the NEES gets nearer
+or the names get better by as much.
 """
 
 from __future__ import annotations
