@@ -67,15 +67,18 @@ def _run_group(cells: Sequence[Cell]) -> dict[Cell, Outcome]:
 
 
 def outcome(cell: Cell) -> Outcome:
-    """Figures of one cell; of a mechanism that does not act, those of the run with all of them on."""
-    if JOIN in cell.off:
-        with named(cell.off).off():
-            return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case)))))
-    if cell.off and (probe := BY_NAME[cell.off].probe):
+    """Figures of one cell; of mechanisms that do not act, those of the run with all of them on."""
+    if not cell.off:
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+    alone = [BY_NAME[name] for name in cell.off.split(JOIN)]
+    if all(m.probe for m in alone):
         on = outcome(Cell(cell.source, cell.case))
-        if probe and not on.acted.get(cell.off):
+        if not any(on.acted.get(m.name) for m in alone):
             return on
-    return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+    if len(alone) == 1:
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+    with named(cell.off).off():
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case)))))
 
 
 def named(off: str) -> Mechanism:
