@@ -104,7 +104,10 @@ class NoiseBudget:
         return m if self.overruled_cov is None else replace(m, cov=m.cov + self.overruled_cov)
 
     def _with_slip(self, wheels: MotionMeasurement, rules: FusionRules) -> MotionMeasurement:
-        """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip."""
+        """Rejected wheels: the true speed may be anything between theirs and zero, or off by that of a slip.
+
+        Where they report no motion at all their encoders may have stopped, and the robot may drive as fast as it can.
+        """
         slips = self.rejected[wheels.source] == "slip" and wheels.motion.any()
         speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9

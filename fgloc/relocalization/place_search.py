@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -92,7 +93,7 @@ class PlaceSearch:
             frozenset(seen - information_of.keys()),
             all(isinstance(m, PoseMeasurement) for m in agreeing),
             _lasting(agreeing, self._window_ns),
-            len({m.stamp_ns for m in agreeing}),
+            sum(n > 1 for n in Counter(i for i, _ in {(m.landmark_id, m.stamp_ns) for m in agreeing}).values()),
         )
 
     def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:

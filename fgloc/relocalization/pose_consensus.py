@@ -37,7 +37,7 @@ class PoseConsensus:
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
     by_sensors: bool = False  # from registered sensors alone ...
     lasting: bool = False  # ... over as long as is collected
-    images: int = 1  # that show what agrees, or readings of beacons and sensors
+    repeated: int = 0  # landmarks that agree in two images or more
 
     @property
     def certain(self) -> bool:
@@ -63,7 +63,7 @@ class PoseConsensus:
         """
         sharp = bool((self._sigmas <= _SHARP_SIGMA).all())
         whole = sharp and self.share >= WHOLE_SHARE and self.fit.redundancy >= 2 * REDUNDANT
-        return (self.landmarks > 1 and (whole or self.images > 1)) or (whole and self.lasting)
+        return self.repeated > 1 or (whole and (self.landmarks > 1 or self.lasting))
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:

@@ -184,7 +184,7 @@ class MotionFaultMonitor:
             return
         self._travels.append(np.array([dt, *self._sides(readings.wheels.motion), *self._sides(reference.motion)]))
         total = np.sum(self._travels, axis=0)
-        while total[0] > _LONGEST_S or (total[3:] - self._travels[0][3:] > _LEAST_M).all():
+        while len(self._travels) > 1 and (total[0] > _LONGEST_S or (total[3:] - self._travels[0][3:] > _LEAST_M).all()):
             total -= self._travels.popleft()
 
     def _failure(self, since: int) -> str:

@@ -198,6 +198,18 @@ def test_frozen_encoders_of_a_slow_or_turning_robot_are_named(did):
     assert run(trust, 40, (0.0, 0.0), did=did, first=30)[-1].budget.rejected == {"wheels": "frozen"}
 
 
+def test_fault_21_a_step_longer_than_what_is_kept_of_the_travel_is_taken_in():
+    trust, start = trust_in(), 10**18
+    for i in range(3):
+        stamp = start + (i + 1) * 4 * 10**9
+        moved = [
+            MotionMeasurement(source, stamp - 4 * 10**9, stamp, np.array([2.0, 0.0, 0.1]), COV / 2)
+            for source in ("wheels", "learned")
+        ]
+        verdict = trust.judge(Step(i, 0, stamp - 4 * 10**9, stamp), MotionReadings(moved[0], learned=moved[1]))
+        assert not verdict.budget.rejected
+
+
 def test_without_the_track_no_wheel_is_accused():
     found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
     assert found[-1].budget.rejected == {"wheels": "slip"}
