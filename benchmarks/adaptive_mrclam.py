@@ -1,7 +1,7 @@
 """Failures injected into MRCLAM 6: the first minutes of five real robots, for `benchmarks.adaptive`.
 
-The robots recorded commands and no wheels. So that wheels can slip here, an odometry is made that repeats the commands,
-and spoiled; the motion model reads the commands themselves. Each robot's model and constants come from the other four.
+The robots recorded commands and no wheels. So that wheels can slip here, an odometry is made that repeats the commands
+and is corrupted; the learned motion reads the commands. Each robot's model and constants come from the other four.
 *Fixed* keeps the covariances of ``robot.yaml``; the oracle is fixed and given the times when the wheels are wrong.
 """
 

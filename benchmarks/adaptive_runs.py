@@ -178,8 +178,8 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
 
     with tempfile.TemporaryDirectory() as folder:
         map_path, landmarks = recorded.map_path, recorded.landmarks
-        for spoiler, scene in zip(chain, scenes, strict=True):
-            landmarks = spoiler.spoil_map(landmarks, scene)
+        for failure, scene in zip(chain, scenes, strict=True):
+            landmarks = failure.corrupt_map(landmarks, scene)
         if landmarks is not recorded.landmarks:
             map_path = Path(folder) / "map.yaml"
             write_map(landmarks, map_path)

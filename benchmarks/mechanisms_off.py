@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from benchmarks.mechanisms_off_motion import OF_MOTION
 from benchmarks.mechanisms_off_sightings import OF_LANDMARKS, OF_SIGHTINGS
-from benchmarks.mechanisms_off_tracking import OF_ESTIMATION, OF_TRACKING
+from benchmarks.mechanisms_off_tracking import OF_TRACKING
 from benchmarks.mechanisms_switch import Mechanism
 
-MECHANISMS: tuple[Mechanism, ...] = (*OF_SIGHTINGS, *OF_LANDMARKS, *OF_MOTION, *OF_TRACKING, *OF_ESTIMATION)
+MECHANISMS: tuple[Mechanism, ...] = (*OF_SIGHTINGS, *OF_LANDMARKS, *OF_MOTION, *OF_TRACKING)
 BY_NAME = {m.name: m for m in MECHANISMS}

@@ -10,7 +10,6 @@ from benchmarks.mechanisms_switch import (
     Probe,
     Returns,
     Switch,
-    called,
     not_none,
     something,
 )
@@ -20,7 +19,6 @@ _SEARCH = "fgloc.relocalization.place_search"
 _CONSENSUS = "fgloc.relocalization.pose_consensus:PoseConsensus"
 _WHERE = "fgloc.relocalization.tracking_state:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
-_WINDOW = "fgloc.graph.isam2:IncrementalEstimator"
 
 
 def _never(real: Any) -> property:
@@ -84,17 +82,5 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         Probe(f"{_CONSENSUS}.overrides_prior", lambda result, *_: not result),
         batch=True,
         case="ids30",
-    ),
-)
-
-OF_ESTIMATION: tuple[Mechanism, ...] = (
-    Mechanism(
-        "window_relinearisation",
-        "The window is built again at its present poses after a large correction of the yaw.",
-        ("graph/isam2.py",),
-        (Switch(f"{_WINDOW}._relinearize", Returns(None)),),
-        Probe(f"{_WINDOW}._relinearize", called),
-        batch=True,
-        case="wheels",
     ),
 )

@@ -216,7 +216,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         if landmark_map is not None:
             corrupted = landmark_map
             for failure, scene in zip(cell.chain, scenes, strict=True):
-                corrupted = failure.spoil_map(corrupted, scene)
+                corrupted = failure.corrupt_map(corrupted, scene)
             if corrupted is not landmark_map:
                 map_file = Path(folder) / "map.yaml"
                 write_map(corrupted, map_file)

@@ -133,7 +133,7 @@ class Diagnosis:
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """What is surely wrong with the configuration, and spoils the poses: a sentence each."""
+        """What is surely wrong with the configuration, and makes the poses wrong: a sentence each."""
         sentence = None if self._floor is None else self._floor.sentence
         return () if sentence is None else (sentence,)
 

@@ -30,7 +30,7 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_key
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
-from fgloc.graph.joint import LINEAR_RAD, correct, is_linear
+from fgloc.graph.joint import correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.uneven import ground_factors, ground_prior, is_level_known, step_of
 from fgloc.types import (
@@ -64,8 +64,6 @@ class IncrementalEstimator(Estimator):
             graph, values = self._graph_of(frame, initial, frame.prior)
             self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
             frame.belief = self._newest(frame.k)
-            if abs(se2.wrap(float(frame.belief.pose[2] - predicted.pose[2]))) > LINEAR_RAD and frame.prior is None:
-                self._relinearize(frame)
         except _GTSAM_ERRORS:
             frame.belief = predicted  # which the sightings have no part in
             self._solve_carefully(frame, initial)
@@ -85,15 +83,6 @@ class IncrementalEstimator(Estimator):
             frame.belief = self._replayed([*self._window(frame), frame], initial)
         except _GTSAM_ERRORS:
             self._rebuild(frame, predicted)
-
-    def _relinearize(self, newest: Keyframe) -> None:
-        """The window was turned by much, as after dead reckoning: build it again at where its poses are now."""
-        window = self._window(newest)
-        poses = {f.k: self._backend.pose(f.k) for f in window if self._backend is not None and self._backend.holds(f.k)}
-        for frame in window:
-            frame.linearized_at = poses.get(frame.k)
-        newest.linearized_at = newest.belief.pose
-        newest.belief = self._replayed([*window, newest], newest.belief)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
         """Where to linearize: at the prediction or, where sightings are far from linear over it, where they put it."""
@@ -175,7 +164,7 @@ class IncrementalEstimator(Estimator):
             motions = step_of(motions, self._theta_before(frame), self.installation).motions
         installed = self._config.motion_kernel == "none" and before is not None
         return [
-            installed_motion_factor(frame.k, m, before.at, self.factors.installation)
+            installed_motion_factor(frame.k, m, before.belief.pose, self.factors.installation)
             if installed and before is not None
             else motion_factor(frame.k, m, self._config.motion_kernel)
             for m in motions
@@ -275,7 +264,7 @@ class IncrementalEstimator(Estimator):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
-            start = initial if held.k == newest else PoseWithCovariance(held.at, held.belief.cov)
+            start = initial if held.k == newest else PoseWithCovariance(held.belief.pose, held.belief.cov)
             graph, values = self._graph_of(held, start, prior)
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
         return self._newest(newest)

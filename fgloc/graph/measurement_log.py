@@ -46,7 +46,7 @@ class Keyframe:
     k: int
     stamp_ns: int
     elapsed_s: float  # the estimator's own time: runs on through clock jumps
-    belief: PoseWithCovariance  # filtered: initial value for the batch, prior for a rebuilt window
+    belief: PoseWithCovariance  # filtered; factors are linear about it, and a rebuilt window or the batch start there
     prior: PoseWithCovariance | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
     sightings: tuple[LandmarkFactor, ...] = ()
@@ -56,14 +56,8 @@ class Keyframe:
     readings: MotionReadings = field(default_factory=MotionReadings)  # what the motions were made of ...
     budget: NoiseBudget = field(default_factory=NoiseBudget)  # ... and with which noise
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
-    linearized_at: FloatArray | None = None  # pose (3,), if another one than that of the belief
     ground_clock_cov: FloatArray | None = None  # (6, 6) as `added_cov`, of x, y, z, roll, pitch, yaw
     ground: FloatArray | None = None  # (3,) height, roll and pitch, as of the belief; on uneven ground
-
-    @property
-    def at(self) -> FloatArray:
-        """Pose ``(3,)`` about which factors are linear."""
-        return self.belief.pose if self.linearized_at is None else self.linearized_at
 
 
 @dataclass(slots=True)

@@ -40,7 +40,7 @@ def events_of(sensor: str) -> tuple[type[Event], ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a failure may know of the run that it spoils.
+    """What a failure may know of the run that it corrupts.
 
     Attributes:
         start_ns: receive time of the recording's first message.
@@ -162,7 +162,7 @@ class Failure(Section):
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The corrupted events, in order of receive time."""
 
-    def spoil_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
+    def corrupt_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
         """The map that the run is given; few failures change it."""
         return landmark_map
 

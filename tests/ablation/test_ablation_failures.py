@@ -275,7 +275,7 @@ def test_duplicated_id_renames_one_marker():
 
 def test_moved_marker_moves_the_map_by_the_distance():
     failure, at = make("moved_marker", count=2, distance_m=0.4, yaw_rad=0.5), scene()
-    moved = failure.spoil_map(MAP, at).landmarks
+    moved = failure.corrupt_map(MAP, at).landmarks
     shifts = {i: np.linalg.norm(moved[i].position - MAP.landmarks[i].position) for i in MAP.landmarks}
     assert sorted(round(s, 9) for s in shifts.values()) == [0.0, 0.0, 0.0, 0.4, 0.4]
     assert at.affected["moved_marker"] == 2

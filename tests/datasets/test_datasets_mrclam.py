@@ -219,8 +219,8 @@ def test_the_fit_finds_the_sensor_again() -> None:
 def test_a_robots_own_truth_never_reaches_its_constants() -> None:
     runs = {k: _simulated(seed=k, delay=0.16 + 0.02 * k) for k in range(1, 5)}
     before = left_out(runs)
-    spoiled = {**runs, 2: replace(runs[2], truth=runs[2].truth * [3.0, -2.0, 0.5])}
-    after = left_out(spoiled)
+    corrupted = {**runs, 2: replace(runs[2], truth=runs[2].truth * [3.0, -2.0, 0.5])}
+    after = left_out(corrupted)
     assert after[2] == before[2]
     assert after[1] != before[1]
     assert before[2].delay_s == pytest.approx(0.22, abs=0.015)  # the median of robots 1, 3, 4

@@ -257,11 +257,11 @@ def test_whitening_makes_unit_noise_of_residual_and_installation():
     assert W @ cov @ W.T == pytest.approx(np.eye(8), abs=1e-9)
 
 
-def test_whitening_survives_a_covariance_that_rounding_has_spoiled():
+def test_whitening_survives_a_covariance_that_rounding_has_corrupted():
     rng = np.random.default_rng(0)
     S = rng.normal(size=(8, 1)) * 1e9
-    spoiled = np.eye(8) + S @ S.T  # eigenvalues 1 and 1e19
-    W = sighting_whitening(spoiled)
+    inexact = np.eye(8) + S @ S.T  # eigenvalues 1 and 1e19
+    W = sighting_whitening(inexact)
     assert np.isfinite(W).all()
     assert np.linalg.norm(W, 2) <= 1.0 + 1e-6  # no residual counts for more than its own noise lets it
     assert np.linalg.norm(W @ S) < 10.0

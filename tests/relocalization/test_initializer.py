@@ -137,7 +137,7 @@ def search_map(search: Search, number: int) -> Landmark:
     return search.map.landmarks[number]
 
 
-def test_one_wrong_sighting_among_many_does_not_spoil_the_place():
+def test_one_wrong_sighting_among_many_does_not_move_the_place():
     rng = np.random.default_rng(4)
     landmarks = [point(i, *rng.uniform(-4, 4, 2)) for i in range(6)]
     search = Search(landmark_map(*landmarks))

@@ -123,7 +123,7 @@ def test_the_bias_is_learned_between_fixes_and_as_well_as_it_says(seed):
     assert math.sqrt(gyro.bias_variance) < 0.0015
 
 
-def test_a_bias_learned_at_rest_does_not_spoil_the_turn_since_the_last_fix():
+def test_a_bias_learned_at_rest_does_not_change_the_turn_since_the_last_fix():
     """The turn was measured with the bias of then: what has been learned since must not be counted twice."""
     gyro, bias = Gyro(GyroConfig()), 0.02
     gyro.fix(0.0, 1e-6)

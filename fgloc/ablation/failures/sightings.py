@@ -129,7 +129,7 @@ class MovedMarker(Failure):
         """All events as they were."""
         return events
 
-    def spoil_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
+    def corrupt_map(self, landmark_map: LandmarkMap, scene: Scene) -> LandmarkMap:
         """The map with some markers elsewhere."""
         order = [scene.landmark_ids[k] for k in scene.rng.permutation(len(scene.landmark_ids))]
         chosen = set(self.ids) or set(order[: self.count])

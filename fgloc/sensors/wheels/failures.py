@@ -175,7 +175,7 @@ class _Odometer:
         if before is None or dt <= 0.0:
             return event if self._reported is None else self._with_pose(event, self._reported)
         twist = np.array([event.linear[0], event.angular[2]])
-        corrupted = self._spoiled(f"{event.topic} rates", twist, dt, corrupt)
+        corrupted = self._of_wheels(f"{event.topic} rates", twist, dt, corrupt)
         changed = event
         if not np.array_equal(corrupted, twist, equal_nan=True):
             linear, angular = event.linear.copy(), event.angular.copy()
@@ -183,14 +183,14 @@ class _Odometer:
             changed = replace(event, linear=linear, angular=angular)
         moved = se2.log(se2.between(before[1], pose))
         rates = np.array([moved[0], moved[2]]) / dt
-        reported = self._spoiled(f"{event.topic} positions", rates, dt, corrupt)
+        reported = self._of_wheels(f"{event.topic} positions", rates, dt, corrupt)
         if self._reported is None and np.array_equal(reported, rates, equal_nan=True):
             return changed
         start = before[1] if self._reported is None else self._reported
         self._reported = se2.compose(start, se2.exp((reported[0] * dt, moved[1], reported[1] * dt)))
         return self._with_pose(changed, self._reported)
 
-    def _spoiled(self, source: str, rates: FloatArray, dt: float, corrupt: Corrupt) -> FloatArray:
+    def _of_wheels(self, source: str, rates: FloatArray, dt: float, corrupt: Corrupt) -> FloatArray:
         """Forward speed and yaw rate ``(2,)`` by way of the wheels."""
         v, omega = rates
         half = 0.5 * self._track

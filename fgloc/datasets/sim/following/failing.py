@@ -49,7 +49,7 @@ class FailingSensors:
         scenes = [Scene(EPOCH_NS, duration_s, config, ids, rng) for rng in rngs]
         self.landmark_map = landmarks
         for failure, scene in zip(failures, scenes, strict=True):
-            self.landmark_map = failure.spoil_map(self.landmark_map, scene)
+            self.landmark_map = failure.corrupt_map(self.landmark_map, scene)
         self._waiting: deque[Event] = deque()
         self._now_ns = 0
         self._out = corrupt(failures, "recorded", self._arriving(), scenes)
