@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc import se2
-from fgloc.relocalization.pose_fit import Fit
+from fgloc.relocalization.pose_fit import REDUNDANT, Fit
 from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
@@ -19,7 +19,6 @@ WHOLE_SHARE = 0.8
 # ... has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a
 # short way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SHARP_SIGMA = 0.1  # m, rad
-REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 
 
 @dataclass(frozen=True, slots=True, eq=False)

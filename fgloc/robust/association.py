@@ -13,7 +13,6 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition
-from fgloc.relocalization.pose_consensus import REDUNDANT
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
@@ -150,8 +149,8 @@ class Association:
         gated = [s for s, d in zip(rejected, decisions, strict=True) if d.reason == "gate"]
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
-        fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
-        if fit is None or fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability):
+        fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors)
+        if fit is None or not fit.is_checked(self._config.estimator.gate_probability):
             return None
         x, y, yaw = se2.between(predicted.pose, fit.pose)
         if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
@@ -235,7 +234,7 @@ class Association:
         seen = [measurements[i] for i in rows]
         together = correct(predicted, known, seen, self._factors)
         dof = sum(m.dof for m in seen)
-        return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
+        return together is not None and together[1] <= self._gate(dof)
 
     def _agreeing_with(
         self,
@@ -253,7 +252,7 @@ class Association:
         lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
         found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
         ratios = {
-            i: math.inf if one.behind else nis / chi2_bound(self._config.estimator.gate_probability, len(one.residual))
+            i: math.inf if one.behind else nis / self._gate(len(one.residual))
             for i, one, nis in zip(others, lines, found, strict=True)
         }
         return corrected[1], sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])

@@ -141,7 +141,6 @@ class _TurnTest:
 
     def __init__(self) -> None:
         self._turned = self._variance = 0.0
-        self._steps = 0
 
     def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
         """Squared ratio of turn and standard deviation since the robot stands, and its bound."""

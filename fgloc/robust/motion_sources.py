@@ -91,7 +91,7 @@ class MotionSources:
                 self._turn = turn
                 if reported is not None and wheels is not None:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
-        learned = self._with_drift(self._measure_learned(step), step)
+        learned = self._with_drift(self._measure_learned(step))
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
         readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
@@ -117,7 +117,7 @@ class MotionSources:
         by = self._wheels.derivatives(step, m, self.factors.installation.index, (weight, rates))
         return {name: (by[name], assumed) for name, (_, assumed) in known.items()}
 
-    def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
+    def _with_drift(self, learned: MotionMeasurement | None) -> MotionMeasurement | None:
         """The learned motion with the drift of the gyro that it reads, where no fix observes the yaw by itself."""
         if learned is None or self._turn is None or not self._learned_has_gyro or self._yaw_indirect_s == 0.0:
             return learned
