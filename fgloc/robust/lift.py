@@ -25,7 +25,6 @@ _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
 _LEARN_S = 2.0  # before the first test
-_LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
 _ONSET_S = 0.5  # from the start of a lift to its alarm
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
@@ -97,7 +96,7 @@ class _RiseTest:
 
     def __init__(self) -> None:
         self._level = math.nan  # m/s²: of the magnitude at rest, with the sensor's bias
-        self._variance = _LEAST_SIGMA**2  # of a window of full length
+        self._variance = 0.0  # of a window of full length
         self._learned_s = 0.0
         self._newest_ns = 0
         self._samples: deque[tuple[float, float]] = deque()  # seconds it stands for, magnitude
@@ -125,9 +124,8 @@ class _RiseTest:
             self._level = mean
         rises = np.cumsum(((forces - self._level) * seconds)[::-1])
         spans = np.cumsum(seconds[::-1])
-        sigmas = np.sqrt(np.maximum(self._variance * spans / _WINDOW_S, _LEAST_SIGMA**2))
-        nis = np.where(np.abs(rises) > _LEAST_RISE, (rises / sigmas) ** 2, 0.0)
         bound = alarm_bound(dt, len(spans), 1)
+        nis = rises**2 / np.maximum(self._variance * spans / _WINDOW_S, _LEAST_RISE**2 / bound)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)
