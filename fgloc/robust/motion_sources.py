@@ -21,7 +21,6 @@ from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
-_LEAST_S = 0.01  # of a step without a motion source: its covariance is not singular
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 
@@ -154,7 +153,7 @@ class MotionSources:
             carried_s: since when the robot is carried, so that its wheels do not measure [s]; None: it is not.
         """
         before = self._silent_s if carried_s is None else carried_s
-        after = before + max(step.dt, _LEAST_S)
+        after = before + step.dt
         if carried_s is None:
             self._silent_s = after
         gate = self._config.gate
