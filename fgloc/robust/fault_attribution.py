@@ -40,10 +40,14 @@ class FaultAttribution:
     of another floor, is wrong all the time.
 
     Source: Gertler 1998, "Fault detection and diagnosis in engineering systems", structured residuals.
+
+    Attributes:
+        memory_s: how far back the log goes [s].
     """
 
     def __init__(self, config: Config, estimator: Estimator) -> None:
         """Take the estimator, whose log has the readings and sightings of the newest keyframes."""
+        self.memory_s = config.estimator.lag_s
         self._config = config
         self._estimator = estimator
         self._fits: dict[int, Fit | None] = {}
@@ -91,7 +95,7 @@ class FaultAttribution:
             began = steps is not None and k <= newest + 1 - steps
             if len(stretch) > 1 and seen and (began or age_s >= self._config.weights.window_s):
                 return stretch[::-1]
-            if frame.prior is not None or age_s > self._config.estimator.lag_s:
+            if frame.prior is not None or age_s > self.memory_s:
                 return None
         return None
 

@@ -27,8 +27,7 @@ _MEMORY_S = 60.0  # over which level and standard deviation of the specific forc
 _LEARN_S = 2.0  # before the first test
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
 _ONSET_S = 0.5  # from the start of a lift to its alarm
-_SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
-_LONGEST_S = 10.0  # ... and without sightings it has been set down by then
+_SETTLED_S = 2.0  # after the last sign: a sighting then ends it
 
 
 class LiftMonitor:
@@ -38,7 +37,9 @@ class LiftMonitor:
         carried: the robot may be in the air, or was set down a short time ago.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, longest_s: float) -> None:
+        """Take how long after the last sign it has been set down, if no sighting tells it earlier [s]."""
+        self._longest_s = longest_s
         self.carried = False
         self._rise = _RiseTest()
         self._turn = _TurnTest()
@@ -67,7 +68,7 @@ class LiftMonitor:
             self._quiet_s = 0.0
             if not self.carried:
                 self.carried, self._since_fix_s = True, _ONSET_S
-        elif self.carried and self._quiet_s > _LONGEST_S:
+        elif self.carried and self._quiet_s > self._longest_s:
             self.carried = False
         if self.carried and not told:
             told = [Decision(k, step.stamp_ns, "lift", -1, math.nan, math.nan, 0, 0.0, "carried")]
