@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from fgloc.types import FloatArray
 
 MAX_COST_PER_DOF = 4.0
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
-_SAME_PLACE = 0.3  # m, rad: candidates nearer than this are one place
+_NEAR = 0.5  # m, rad: as far as a wheel may slip from one fix to the next; farther is another place
 # Of sightings of several landmarks a place has to explain more than half, as any other place explains less then: the
 # rest have wrong ids, or were moved. One that explains less than this ...
 WHOLE_SHARE = 0.8
@@ -67,4 +68,5 @@ class PoseConsensus:
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
     """Whether two poses are two places."""
-    return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())
+    x, y, yaw = se2.between(a, b)
+    return math.hypot(x, y) > _NEAR or abs(yaw) > _NEAR

@@ -7,12 +7,12 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition
+from fgloc.relocalization.pose_consensus import apart
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
@@ -23,8 +23,6 @@ from fgloc.types import (
     PixelMeasurement,
     PoseMeasurement,
 )
-
-NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
 class Association:
@@ -150,10 +148,8 @@ class Association:
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
         fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors)
-        if fit is None or not fit.is_checked(self._config.estimator.gate_probability):
-            return None
-        x, y, yaw = se2.between(predicted.pose, fit.pose)
-        if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
+        checked = fit is not None and fit.is_checked(self._config.estimator.gate_probability)
+        if fit is None or not checked or apart(predicted.pose, fit.pose):
             return None
         self.rejections.subtract(
             f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
