@@ -11,7 +11,8 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, WHOLE_SHARE, PoseConsensus, apart
+from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose
 from fgloc.sensors.pnp import planar_base_candidates
 from fgloc.types import (
@@ -71,7 +72,7 @@ class PlaceSearch:
         for _ in range(MOST_STEPS):
             before = agreeing
             costs, dofs = fitted.costs(fit.pose)
-            explained = costs < MAX_COST_PER_DOF * dofs
+            explained = costs < COVARIANCE_FACTOR * dofs
             agreeing = [m for m, kept in zip(sightings, explained.tolist(), strict=True) if kept]
             if len(agreeing) == len(before):
                 break

@@ -11,7 +11,6 @@ from fgloc import se2
 from fgloc.relocalization.pose_fit import REDUNDANT, Fit
 from fgloc.types import FloatArray
 
-MAX_COST_PER_DOF = 4.0
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
 _NEAR = 0.5  # m, rad: as far as a wheel may slip from one fix to the next; farther is another place
 # Of sightings of several landmarks a place has to explain more than half, as any other place explains less then: the
@@ -41,13 +40,13 @@ class PoseConsensus:
 
     @property
     def certain(self) -> bool:
-        """Whether it explains enough, well enough, and is known well enough."""
+        """Whether it explains enough, and is known well enough."""
         whole = self.share >= WHOLE_SHARE
         if not (whole or (self.landmarks > 1 and self.share > 0.5)) or self.fit.redundancy < 1:
             return False
         if (self.outlier_landmarks or not whole) and self.redundancy < REDUNDANT:
             return False
-        if self.fit.cost > MAX_COST_PER_DOF * self.fit.dof or (self.by_sensors and self._sigmas[2] > _SHARP_SIGMA):
+        if self.by_sensors and self._sigmas[2] > _SHARP_SIGMA:
             return False
         return bool((self._sigmas <= (MAX_SIGMA if whole else _SHARP_SIGMA)).all())
 
