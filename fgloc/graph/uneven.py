@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.graph.ground import Gravity, GroundStep, gravity, ground_key, ground_step
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
-from fgloc.graph.joint import fuse_installed, joint_cov
+from fgloc.graph.joint import LINEAR_RAD, fuse_installed, joint_cov
 from fgloc.graph.joint import predict as predict_on_plane
 from fgloc.graph.linear_factors import INSTALLATION, linear_factor
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -19,7 +19,6 @@ from fgloc.graph.noise_models import whitening_of
 from fgloc.types import FloatArray, Ground, MotionMeasurement
 
 _N = len(GROUND)
-_LINEAR_RAD = 0.02  # sigma of roll and pitch up to which a sighting is linear in them
 
 
 def predict(
@@ -188,4 +187,4 @@ def ground_at(ground: FloatArray, cov: FloatArray, yaw: float) -> Ground:
 
 def is_level_known(known: InstallationEstimate, installation: Installation) -> bool:
     """Whether sightings are as good as linear over what roll and pitch may be."""
-    return not installation.ground or bool((np.diag(known.cov)[-2:] < _LINEAR_RAD**2).all())
+    return not installation.ground or bool((np.diag(known.cov)[-2:] < LINEAR_RAD**2).all())

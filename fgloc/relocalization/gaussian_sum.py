@@ -33,16 +33,16 @@ from fgloc.robust.landmark_modes import MOST_HYPOTHESES
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
 
-WRONG_LANDMARK = 0.05  # prior probability that a landmark is not where the map has it, each independently
+# Prior probability that a landmark is not where the map has it, each independently; and that an id is wrong, which is
+# learned from then on
+WRONG_LANDMARK = 0.05
 CARRIED = 1e-3  # prior probability that a robot was carried away when a sighting contradicts its pose
 _IN_PLACE, _MOVED = math.log(1.0 - WRONG_LANDMARK), math.log(WRONG_LANDMARK)
-_CERTAIN = 0.99  # probability from which the graph begins at a place
+_CERTAIN = 0.99  # probability from which the graph begins at a place; and that a robot is among its beacons
 _UNIFORM = -math.log(2.0 * math.pi * math.sqrt(FAR_M2))  # log density of a sighting: any bearing [rad] and range [m]
-_MISREAD = 0.02  # share of sightings with a wrong id, as long as nothing is known of it
 # Log weight below the most probable one's that a hypothesis may yet gain: what carrying costs, and two sightings.
 _NEGLIGIBLE = math.log(RING / CARRIED) - 2.0 * math.log(1.0 - GATE)
-_AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least ...
-_FAR = 0.01  # ... but may be anywhere with this share of the density among them
+_AROUND, _LEAST_AROUND_M = 2.0, 2.0  # a robot is where the beacons are: prior sigmas, in theirs, and at least
 _SAME = np.array([LINEAR_M, LINEAR_M, LINEAR_RAD])  # two hypotheses this near are one
 
 
@@ -79,7 +79,7 @@ class GaussianSum:
         self._log_prior = np.zeros(0)  # (n,), with what was merged into each
         self._log_elsewhere = 0.0  # log prior of all places but a tracked one
         # Sightings with right ids, and with wrong ones, by the most probable hypothesis; the prior counts as well
-        self._ids = np.array([1.0 / _MISREAD - 1.0, 1.0])
+        self._ids = np.array([1.0 / WRONG_LANDMARK - 1.0, 1.0])
         self._last_ns: dict[int, int] = {}  # by landmark
         self._rows: dict[int, int] = {}  # of landmarks in what follows
         self._in_place = np.zeros((0, 0))  # (n, L) log likelihood of each one's sightings if it is where the map has it
@@ -208,7 +208,7 @@ class GaussianSum:
         """Hypotheses all around the beacon of a sighting, with this prior and ``(L,)`` evidence of those before it."""
         poses, covs = ring(self.places[self._index[m.landmark_id]], m, R)
         off = poses[:, :2] - self._middle
-        near = np.logaddexp(-0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off), math.log(_FAR))
+        near = np.logaddexp(-0.5 * np.einsum("ni,ij,nj->n", off, self._nearness, off), math.log(1.0 - _CERTAIN))
         self.poses = np.concatenate([self.poses, poses])
         self.covs = np.concatenate([self.covs, covs])
         self._log_prior = np.concatenate([self._log_prior, log_prior + near - math.log(RING)])

@@ -11,8 +11,9 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.relocalization.pose_consensus import MAX_COST_PER_DOF, WHOLE_SHARE, PoseConsensus, apart
-from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose, sighting_costs
+from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
+from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose
 from fgloc.sensors.pnp import planar_base_candidates
 from fgloc.types import (
     FloatArray,
@@ -35,7 +36,7 @@ class PlaceSearch:
     """Looks for the robot by sightings alone, without regard to where it may have been before."""
 
     def __init__(self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors) -> None:
-        self._config, self._map, self._factors = config, landmark_map, factors
+        self._map, self._factors = landmark_map, factors
         self._window_ns = round(config.estimator.initialise_s * 1e9)
 
     def find(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> PoseConsensus | None:
@@ -48,7 +49,7 @@ class PlaceSearch:
         here = _spread(sightings, _MAX_FITTED)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
-        fitted = PoseFit(here, self._factors, self._config)
+        fitted = PoseFit(here, self._factors)
         candidates = sorted(
             self._candidates(here, known), key=lambda c: float(np.minimum(fitted.costs(c)[0], UNEXPLAINED).sum())
         )
@@ -57,7 +58,7 @@ class PlaceSearch:
         for fit in sorted(fits, key=lambda fit: fit.cost):
             if all(apart(fit.pose, other.pose) for other in places):
                 places.append(fit)
-        found = [agreed for fit in places if (agreed := self._agreed(fit, here)) is not None]
+        found = [agreed for fit in places if (agreed := self._agreed(fit, fitted, here)) is not None]
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
@@ -65,15 +66,17 @@ class PlaceSearch:
             return None
         return best
 
-    def _agreed(self, fit: Fit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
+    def _agreed(self, fit: Fit, fitted: PoseFit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
         agreeing = list(sightings)
         for _ in range(MOST_STEPS):
             before = agreeing
-            agreeing = self._explained(fit.pose, sightings)
+            costs, dofs = fitted.costs(fit.pose)
+            explained = costs < COVARIANCE_FACTOR * dofs
+            agreeing = [m for m, kept in zip(sightings, explained.tolist(), strict=True) if kept]
             if len(agreeing) == len(before):
                 break
-            trimmed = self._fit(fit.pose, agreeing) if agreeing else None
+            trimmed = fit_pose(fit.pose, agreeing, self._factors) if agreeing else None
             if trimmed is None:
                 return None
             fit = trimmed
@@ -95,14 +98,6 @@ class PlaceSearch:
             _lasting(agreeing, self._window_ns),
             sum(n > 1 for n in Counter(i for i, _ in {(m.landmark_id, m.stamp_ns) for m in agreeing}).values()),
         )
-
-    def _explained(self, pose: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
-        costs, dofs = sighting_costs(pose, sightings, self._factors, self._config)
-        explained = (costs < MAX_COST_PER_DOF * dofs).tolist()
-        return [m for m, kept in zip(sightings, explained, strict=True) if kept]
-
-    def _fit(self, start: FloatArray, sightings: Sequence[LandmarkMeasurement]) -> Fit | None:
-        return fit_pose(start, sightings, self._factors, self._config)
 
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.relocalization.pose_fit import Fit
+from fgloc.relocalization.pose_fit import REDUNDANT, Fit
 from fgloc.types import FloatArray
 
-MAX_COST_PER_DOF = 4.0
 MAX_SIGMA = np.array([1.0, 1.0, 0.5])  # m, m, rad: a place less certain than this is not one yet
-_SAME_PLACE = 0.3  # m, rad: candidates nearer than this are one place
+_NEAR = 0.5  # m, rad: as far as a wheel may slip from one fix to the next; farther is another place
 # Of sightings of several landmarks a place has to explain more than half, as any other place explains less then: the
 # rest have wrong ids, or were moved. One that explains less than this ...
 WHOLE_SHARE = 0.8
 # ... has to be known better. So has the yaw by positions and ranges alone, which tell it by the motion: over a
 # short way their fit has several minima. At 0.1 rad the way is ten times as long as the positions are uncertain.
 _SHARP_SIGMA = 0.1  # m, rad
-REDUNDANT = 3  # of what agrees where something else does not: two markers, but three beacons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,13 +40,13 @@ class PoseConsensus:
 
     @property
     def certain(self) -> bool:
-        """Whether it explains enough, well enough, and is known well enough."""
+        """Whether it explains enough, and is known well enough."""
         whole = self.share >= WHOLE_SHARE
         if not (whole or (self.landmarks > 1 and self.share > 0.5)) or self.fit.redundancy < 1:
             return False
         if (self.outlier_landmarks or not whole) and self.redundancy < REDUNDANT:
             return False
-        if self.fit.cost > MAX_COST_PER_DOF * self.fit.dof or (self.by_sensors and self._sigmas[2] > _SHARP_SIGMA):
+        if self.by_sensors and self._sigmas[2] > _SHARP_SIGMA:
             return False
         return bool((self._sigmas <= (MAX_SIGMA if whole else _SHARP_SIGMA)).all())
 
@@ -68,4 +67,5 @@ class PoseConsensus:
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
     """Whether two poses are two places."""
-    return bool((np.abs(se2.log(se2.between(a, b))) > _SAME_PLACE).any())
+    x, y, yaw = se2.between(a, b)
+    return math.hypot(x, y) > _NEAR or abs(yaw) > _NEAR

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc import se2
-from fgloc.config import Config
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import CONVERGED
@@ -22,6 +21,7 @@ from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
 _ITERATIONS = 16
 _RANK = 1e-9  # of the least eigenvalue of the information, relative to the largest
+REDUNDANT = se2.DOF  # residuals more than a pose needs that check it: two markers, but three beacons
 UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
 _TELLS_NOTHING = 1.0 / _RANK  # times its own: variance by the installation of a sighting next to the image plane
 
@@ -40,30 +40,28 @@ class Fit:
         """How many residuals there are more than are needed for a pose."""
         return self.dof - se2.DOF
 
-    def bound(self, probability: float) -> float:
-        """What the cost exceeds as seldom as one minus this."""
-        return chi2_bound(probability, max(self.redundancy, 1))
+    def is_checked(self, probability: float) -> bool:
+        """Whether sightings that fit it so well check each other; a sound fit passes with this probability."""
+        return self.redundancy >= REDUNDANT and self.cost <= chi2_bound(probability, self.redundancy)
 
 
 def fit_pose(
     start: FloatArray,
     sightings: Sequence[LandmarkMeasurement],
     factors: LandmarkFactors,
-    config: Config,
 ) -> Fit | None:
     """Best pose of one base for sightings all made from it, from a starting pose; None if it is not determined.
 
     Gauss-Newton with Cauchy weights, so that one wrong sighting does not corrupt the place. What is not known of the
     installation is taken for noise of each sighting by itself.
     """
-    fitted = PoseFit(sightings, factors, config)
-    return fitted.solve(start)
+    return PoseFit(sightings, factors).solve(start)
 
 
 class PoseFit:
     """Sightings of one base, to be fitted from several starting poses."""
 
-    def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config) -> None:
+    def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
         self._k = np.array([cauchy_k(m) for m in sightings])
@@ -124,13 +122,6 @@ class PoseFit:
             W = self._whitening[i]
             r = np.einsum("nij,nj->ni", W, stack.residual)
             yield r, W @ stack.J, stack.behind, np.array(batch.rows), self._k[rows]
-
-
-def sighting_costs(
-    pose: FloatArray, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors, config: Config
-) -> tuple[FloatArray, IntArray]:
-    """Robust cost of each sighting made from a pose (infinite: it cannot have been), and degrees of freedom."""
-    return PoseFit(sightings, factors, config).costs(pose)
 
 
 def cauchy_k(m: LandmarkMeasurement) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import CARRIED, WRONG_LANDMARK
 from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
-from fgloc.robust.association import NEAR_M, NEAR_RAD
+from fgloc.relocalization.pose_consensus import apart
 from fgloc.types import (
     Decision,
     FloatArray,
@@ -250,8 +249,7 @@ class Tracking:
         started = self._search.collect(step, motions, outliers, readings, predicted)
         if started is None or self.keeps_initial_pose or started.gathered:
             return started  # what is gathered has no consensus nearby: that may need all of the collected time
-        x, y, yaw = se2.between(predicted.pose, started.newest.pose)
-        return started if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD else None
+        return started if apart(predicted.pose, started.newest.pose) else None
 
     def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """The robot was found at another place than it was estimated at."""

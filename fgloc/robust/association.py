@@ -7,13 +7,12 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise_models import repetition
-from fgloc.relocalization.pose_consensus import REDUNDANT
+from fgloc.relocalization.pose_consensus import apart
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes
 from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
@@ -24,8 +23,6 @@ from fgloc.types import (
     PixelMeasurement,
     PoseMeasurement,
 )
-
-NEAR_M, NEAR_RAD = 0.5, 0.5  # as far as a wheel may slip from one fix to the next; farther, the robot is elsewhere
 
 
 class Association:
@@ -150,11 +147,9 @@ class Association:
         gated = [s for s, d in zip(rejected, decisions, strict=True) if d.reason == "gate"]
         if not self._config.weights.adaptive or len({s.measurement.landmark_id for s in gated}) < 2:
             return None
-        fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors, self._config)
-        if fit is None or fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability):
-            return None
-        x, y, yaw = se2.between(predicted.pose, fit.pose)
-        if math.hypot(x, y) > NEAR_M or abs(yaw) > NEAR_RAD:
+        fit = fit_pose(predicted.pose, [s.measurement for s in gated], self._factors)
+        checked = fit is not None and fit.is_checked(self._config.estimator.gate_probability)
+        if fit is None or not checked or apart(predicted.pose, fit.pose):
             return None
         self.rejections.subtract(
             f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
@@ -235,7 +230,7 @@ class Association:
         seen = [measurements[i] for i in rows]
         together = correct(predicted, known, seen, self._factors)
         dof = sum(m.dof for m in seen)
-        return together is not None and together[1] <= chi2_bound(self._config.estimator.gate_probability, dof)
+        return together is not None and together[1] <= self._gate(dof)
 
     def _agreeing_with(
         self,
@@ -253,7 +248,7 @@ class Association:
         lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
         found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
         ratios = {
-            i: math.inf if one.behind else nis / chi2_bound(self._config.estimator.gate_probability, len(one.residual))
+            i: math.inf if one.behind else nis / self._gate(len(one.residual))
             for i, one, nis in zip(others, lines, found, strict=True)
         }
         return corrected[1], sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])

@@ -13,7 +13,6 @@ from fgloc.config import Config
 from fgloc.graph.estimator import Estimator
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.graph.noise_budget import COVARIANCE_FACTOR
-from fgloc.relocalization.pose_consensus import REDUNDANT
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.sensors import registry
 from fgloc.stats import chi2_bound
@@ -41,10 +40,14 @@ class FaultAttribution:
     of another floor, is wrong all the time.
 
     Source: Gertler 1998, "Fault detection and diagnosis in engineering systems", structured residuals.
+
+    Attributes:
+        memory_s: how far back the log goes [s].
     """
 
     def __init__(self, config: Config, estimator: Estimator) -> None:
         """Take the estimator, whose log has the readings and sightings of the newest keyframes."""
+        self.memory_s = config.estimator.lag_s
         self._config = config
         self._estimator = estimator
         self._fits: dict[int, Fit | None] = {}
@@ -92,7 +95,7 @@ class FaultAttribution:
             began = steps is not None and k <= newest + 1 - steps
             if len(stretch) > 1 and seen and (began or age_s >= self._config.weights.window_s):
                 return stretch[::-1]
-            if frame.prior is not None or age_s > self._config.estimator.lag_s:
+            if frame.prior is not None or age_s > self.memory_s:
                 return None
         return None
 
@@ -100,12 +103,9 @@ class FaultAttribution:
         """The pose that a keyframe's sightings give by themselves, where they check each other."""
         if frame.k not in self._fits:
             sightings = [s.alone for s in (*frame.sightings, *frame.rejected)]
-            fit = fit_pose(frame.belief.pose, sightings, self._estimator.factors, self._config)
-            if fit is not None and (
-                fit.redundancy < REDUNDANT or fit.cost > fit.bound(self._config.estimator.gate_probability)
-            ):
-                fit = None
-            self._fits[frame.k] = fit
+            fit = fit_pose(frame.belief.pose, sightings, self._estimator.factors)
+            checked = fit is not None and fit.is_checked(self._config.estimator.gate_probability)
+            self._fits[frame.k] = fit if checked else None
         return self._fits[frame.k]
 
     def _nis(self, motions: Sequence[MotionMeasurement], went: FloatArray, cov: FloatArray) -> float:

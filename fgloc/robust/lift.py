@@ -25,11 +25,9 @@ _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
 _LEARN_S = 2.0  # before the first test
-_LEAST_SIGMA = 0.005  # m/s: of a window; quantization of the accelerometer
 _LEAST_TURN = 0.05  # rad: less is a shaken floor
 _ONSET_S = 0.5  # from the start of a lift to its alarm
-_SETTLED_S = 2.0  # after the last sign: a sighting then ends it ...
-_LONGEST_S = 10.0  # ... and without sightings it has been set down by then
+_SETTLED_S = 2.0  # after the last sign: a sighting then ends it
 
 
 class LiftMonitor:
@@ -39,7 +37,9 @@ class LiftMonitor:
         carried: the robot may be in the air, or was set down a short time ago.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, longest_s: float) -> None:
+        """Take how long after the last sign it has been set down, if no sighting tells it earlier [s]."""
+        self._longest_s = longest_s
         self.carried = False
         self._rise = _RiseTest()
         self._turn = _TurnTest()
@@ -68,7 +68,7 @@ class LiftMonitor:
             self._quiet_s = 0.0
             if not self.carried:
                 self.carried, self._since_fix_s = True, _ONSET_S
-        elif self.carried and self._quiet_s > _LONGEST_S:
+        elif self.carried and self._quiet_s > self._longest_s:
             self.carried = False
         if self.carried and not told:
             told = [Decision(k, step.stamp_ns, "lift", -1, math.nan, math.nan, 0, 0.0, "carried")]
@@ -97,7 +97,7 @@ class _RiseTest:
 
     def __init__(self) -> None:
         self._level = math.nan  # m/s²: of the magnitude at rest, with the sensor's bias
-        self._variance = _LEAST_SIGMA**2  # of a window of full length
+        self._variance = 0.0  # of a window of full length
         self._learned_s = 0.0
         self._newest_ns = 0
         self._samples: deque[tuple[float, float]] = deque()  # seconds it stands for, magnitude
@@ -125,9 +125,8 @@ class _RiseTest:
             self._level = mean
         rises = np.cumsum(((forces - self._level) * seconds)[::-1])
         spans = np.cumsum(seconds[::-1])
-        sigmas = np.sqrt(np.maximum(self._variance * spans / _WINDOW_S, _LEAST_SIGMA**2))
-        nis = np.where(np.abs(rises) > _LEAST_RISE, (rises / sigmas) ** 2, 0.0)
         bound = alarm_bound(dt, len(spans), 1)
+        nis = rises**2 / np.maximum(self._variance * spans / _WINDOW_S, _LEAST_RISE**2 / bound)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)
@@ -141,7 +140,6 @@ class _TurnTest:
 
     def __init__(self) -> None:
         self._turned = self._variance = 0.0
-        self._steps = 0
 
     def test(self, step: Step, readings: MotionReadings) -> tuple[float, float]:
         """Squared ratio of turn and standard deviation since the robot stands, and its bound."""

@@ -22,7 +22,6 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 # slides on with its wheels at rest: 0.08 m from 0.4 m/s at a friction of 0.1.
 _LEAST_M = 0.15
 _LONGEST_S = 3.0  # of travel from which the kind of failure is determined
-_MODEL_WRONG_S = 10.0  # a model that was wrong is used again when it has agreed for this long: it mostly stays wrong
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
 
@@ -127,8 +126,8 @@ class MotionFaultMonitor:
         self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)
         contradicted = frozenset() if found is None else found.sources
-        if names.model in contradicted:
-            self._model_wrong_s = _MODEL_WRONG_S
+        if self._attribution is not None and names.model in contradicted:
+            self._model_wrong_s = self._attribution.memory_s  # until it has agreed for as long: it mostly stays wrong
             if not was_left_out:
                 self._glr.reset()  # wheels are compared with another source from now on
         elif found is not None:

@@ -21,7 +21,6 @@ from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.rest import commanded_to_move
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
-_LEAST_S = 0.01  # of a step without a motion source: its covariance is not singular
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 _LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 
@@ -91,7 +90,7 @@ class MotionSources:
                 self._turn = turn
                 if reported is not None and wheels is not None:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
-        learned = self._with_drift(self._measure_learned(step), step)
+        learned = self._with_drift(self._measure_learned(step))
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
         readings = MotionReadings(wheels, learned, gyro, inertial)
         if readings.wheels is not None or readings.learned is not None:
@@ -117,7 +116,7 @@ class MotionSources:
         by = self._wheels.derivatives(step, m, self.factors.installation.index, (weight, rates))
         return {name: (by[name], assumed) for name, (_, assumed) in known.items()}
 
-    def _with_drift(self, learned: MotionMeasurement | None, step: Step) -> MotionMeasurement | None:
+    def _with_drift(self, learned: MotionMeasurement | None) -> MotionMeasurement | None:
         """The learned motion with the drift of the gyro that it reads, where no fix observes the yaw by itself."""
         if learned is None or self._turn is None or not self._learned_has_gyro or self._yaw_indirect_s == 0.0:
             return learned
@@ -154,7 +153,7 @@ class MotionSources:
             carried_s: since when the robot is carried, so that its wheels do not measure [s]; None: it is not.
         """
         before = self._silent_s if carried_s is None else carried_s
-        after = before + max(step.dt, _LEAST_S)
+        after = before + step.dt
         if carried_s is None:
             self._silent_s = after
         gate = self._config.gate

@@ -86,7 +86,7 @@ def alarms(monitor, steps):
 
 def test_no_alarm_of_a_shaken_robot():
     rng = np.random.default_rng(3)
-    monitor, told = LiftMonitor(), []
+    monitor, told = LiftMonitor(10.0), []
     for k in range(3000):  # 10 minutes with the noise of a floor
         s = step(k, 9.78 + rng.normal(0.0, 0.4, 20), command=0.3)
         told += monitor.observe(k, s, readings(s, forward=0.06))
@@ -94,7 +94,7 @@ def test_no_alarm_of_a_shaken_robot():
 
 
 def test_a_rise_is_told_within_half_a_second_and_ends_with_a_fix():
-    rng, monitor = np.random.default_rng(5), LiftMonitor()
+    rng, monitor = np.random.default_rng(5), LiftMonitor(10.0)
     calm = [step(k, 9.78 + rng.normal(0.0, 0.4, 20)) for k in range(100)]
     assert not any(alarms(monitor, [(s, readings(s)) for s in calm]))
     rising = [step(100, 10.6 + rng.normal(0.0, 0.4, 20)), step(101, 10.9 + rng.normal(0.0, 0.4, 20))]
@@ -112,14 +112,14 @@ def test_a_rise_is_told_within_half_a_second_and_ends_with_a_fix():
 
 @pytest.mark.parametrize(("command", "told"), [(0.0, True), (0.3, False), (None, False)])
 def test_a_turn_at_rest_is_a_push_only_where_the_robot_was_told_to_stand(command, told):
-    monitor = LiftMonitor()
+    monitor = LiftMonitor(10.0)
     steps = [step(k, 9.78, omega=0.3, command=command) for k in range(20)]
     found = alarms(monitor, [(s, readings(s, turn=0.06)) for s in steps])
     assert any("turned_at_rest" in reasons for reasons in found) == told
 
 
 def test_an_imu_without_accelerometer_and_one_that_fails_tell_nothing():
-    monitor = LiftMonitor()
+    monitor = LiftMonitor(10.0)
     steps = [step(k, 0.0 if k < 30 else math.nan) for k in range(60)]
     assert not any(alarms(monitor, [(s, readings(s)) for s in steps]))
 
