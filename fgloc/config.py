@@ -288,6 +288,8 @@ def load_config(path: Path) -> Config:
         ConfigError: the file is missing, is not YAML, or has an unknown key or a value out of range; all are named.
     """
     settings = Settings(path, "give a YAML file with --config")
+    if isinstance(settings.content.get("landmarks"), list):
+        raise ConfigError(f"{path} is a map, expected settings of a robot; give a map with --map")
     for section, key in files_of(config_type()):
         part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(SHIPPED):

@@ -29,7 +29,10 @@ def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> N
     if map_file is not None and not map_file.exists():
         raise MapError(f"{map_file}: there is no such file; give the map, or leave --map out")
     map_path = map_file or find_beside(bag, "map.yaml")
-    say(format_info(inspect_all(bag, map_path, configured(bag, config, None))), nl=False)
+    found = inspect_all(bag, map_path, configured(bag, config, None))
+    say(format_info(found), nl=False)
+    if found.exit_code:
+        raise typer.Exit(found.exit_code)
 
 
 def evaluate(

@@ -81,14 +81,15 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
             setup, detector = search.begin(recording)
         except FglocError as error:
             info = inspect_recording(recording, config)
-            return replace(info, findings=(str(error), *info.findings))
+            return replace(info, problems=(str(error), *info.problems))
         collector = ExcerptCollector(recording, config, detector)
         info = inspect_recording(recording, config, collector.add)
         try:
             search.go_on(recording, setup, collector.found)
         except FglocError as error:
-            return replace(info, findings=(str(error), *info.findings))
-    return replace(info, findings=(*search.sentences, *info.findings))
+            return replace(info, problems=(str(error), *info.problems))
+    mistakes = tuple(search.sentences)
+    return replace(info, findings=(*mistakes, *info.findings), mistakes=mistakes)
 
 
 class _Search:
@@ -168,6 +169,11 @@ class _Search:
         image: Role = "image" if parts.detector is not None else "sightings"
         up = base_up(recording, self.config)
         checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
+        if checked.unexplained:
+            self.sentences.append(
+                f"What the camera saw does not fit {self._map_path}, and no single mistake of the set-up explains it: "
+                "check that it is the map of this place, then the positions of its markers and the camera's transform."
+            )
         if checked.correction is not None:
             self.sentences.append(checked.correction.sentence)
             self.config, changed = checked.correction.config, checked.correction.landmark_map

@@ -43,12 +43,14 @@ class Checked:
         correction: of the mistake; None if there is none, or none that is sure.
         corrected: the fit without the mistake, or `fit`; None where neither determines the poses.
         stretches: that were fitted.
+        unexplained: whether the sightings fit the map nowhere, and no mistake explains it.
     """
 
     fit: Fit | None
     correction: Correction | None
     corrected: Fit | None
     stretches: Sequence[Stretch]
+    unexplained: bool = False
 
 
 def check_fit(
@@ -88,7 +90,8 @@ def check_fit(
     ended = [e for e in (_ended(change, stretches, starts) for change in last) if e is not None]
     sure = [e for e in ended if gross(e[0], setup) and _explains(fit, e[1], expected)]
     if not sure:
-        return Checked(fit, None, fit if fit is not None and fit.misfit < _SEEN_RIGHT else None, stretches)
+        seen_right = fit is not None and fit.misfit < _SEEN_RIGHT
+        return Checked(fit, None, fit if seen_right else None, stretches, not seen_right)
     change, better = min(sure, key=lambda e: e[1].cost)
     wheels: Role = "joints" if excerpt.wheel_source == "ticks" else "odometry"
     sentence = correction(change, setup, excerpt.wheel_source, image, wheels)

@@ -65,8 +65,9 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
 
 def _size(given: Setup, factor: float) -> Correction:
     sizes = sorted({m.size_m for m in given.landmark_map.landmarks.values() if m.size_m > 0.0})
-    line = f"set size: {sizes[0] * factor:.4g}" if len(sizes) == 1 else f"multiply every size by {factor:.4f}"
-    shown = f"{sizes[0]:.4g} m" if len(sizes) == 1 else f"{sizes[0]:.4g} to {sizes[-1]:.4g} m"
+    shown, line = f"{sizes[0]:.4g} to {sizes[-1]:.4g} m", f"multiply every size by {factor:.4f}"
+    if len(sizes) == 1:
+        shown, line = f"{sizes[0]:.4g} m", f"set size: {sizes[0] * factor:.4g} for every marker"
     known = {i: replace(m, size_m=factor * m.size_m) for i, m in given.landmark_map.landmarks.items()}
     return Correction(
         f"The markers' size is {shown} by the map, and {factor:.3f} times that by their places and the images: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from fgloc.errors import ConfigError
 from fgloc.files.documents import Item, plain, read_document
@@ -16,6 +18,13 @@ from fgloc.files.documents import Item, plain, read_document
 MAX_BYTES = 1_000_000  # of a settings file; PyYAML takes 6 s for it
 _MOST_SHOWN = 20  # wrong values
 _LONGEST = 80  # characters of a wrong value that are shown
+_EXPECTED = {  # by the kind of error
+    "bool_parsing": "expected true or false",
+    "float_parsing": "expected a number alone, its unit is in the documentation",
+    "int_parsing": "expected a whole number",
+    "model_type": "expected keys with values",
+    "model_attributes_type": "expected keys with values",
+}
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -58,13 +67,14 @@ class Settings:
         try:
             return model.model_validate(self.content)
         except ValidationError as error:
-            found = error.errors()
+            found = _own(error)
             wrong = sorted(
                 (self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False)
             )
-            lines = [f"  {self.path}:{line}: {text}" for line, text in wrong]
-            count = "1 wrong value" if len(found) == 1 else f"{len(found)} wrong values"
-            raise ConfigError(f"{self.path}: {count}\n" + "\n".join(lines)) from error
+            lines = [f"{self.path}:{line}: {text}" for line, text in wrong]
+            if len(found) > 1:
+                lines = [f"{self.path}: {len(found)} wrong values", *(f"  {line}" for line in lines)]
+            raise ConfigError("\n".join(lines)) from error
 
     def _line(self, loc: Sequence[int | str]) -> int:
         """Line of a value, or of the innermost thing around it that there is."""
@@ -85,23 +95,46 @@ def sentences(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """What is wrong with each value, the first ones of many: its key, why, what it is, what may have been meant."""
     schema: dict[str, Any] | None = None
     found = []
-    for e in error.errors()[:_MOST_SHOWN]:
+    for e in _own(error)[:_MOST_SHOWN]:
         where = ".".join(str(part) for part in e["loc"]) or "file"
         if e["type"] == "extra_forbidden":
             schema = schema or model.model_json_schema()
-            near = get_close_matches(str(e["loc"][-1]), _keys(schema, e["loc"][:-1]), n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
+            hint = _meant(str(e["loc"][-1]), _keys(schema, e["loc"][:-1]))
             found.append(f"{where}: unknown key{hint} (got {short(e['input'])})")
         else:
-            found.append(f"{where}: {_complaint(e['msg'], e['type'], e['input'])}")
+            found.append(f"{where}: {_complaint(e)}")
     return found
 
 
-def _complaint(text: str, kind: str, value: object) -> str:
+def _own(error: ValidationError) -> list[ErrorDetails]:
+    """The errors, without that of a list which is too short only because what it holds is wrong."""
+    found = error.errors()
+    return [e for e in found if e["type"] != "too_short" or not any(_is_within(o["loc"], e["loc"]) for o in found)]
+
+
+def _is_within(inner: Sequence[int | str], outer: Sequence[int | str]) -> bool:
+    return len(inner) > len(outer) and tuple(inner[: len(outer)]) == tuple(outer)
+
+
+def _meant(word: str, known: Sequence[str]) -> str:
+    """The known word that is most like another one, as the end of a complaint."""
+    near = get_close_matches(word, known, n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _complaint(e: ErrorDetails) -> str:
     """What is wrong with a value, in the words of this program where it is not the model's own."""
+    kind, value, context = e["type"], e["input"], e.get("ctx", {})
     if kind == "missing":
         return "is missing"
-    text = text.removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    if kind == "union_tag_invalid":
+        known = re.findall(r"'([^']*)'", context["expected_tags"])
+        hint = _meant(context["tag"], known) or f"; known are {', '.join(known)}"
+        return f"there is no {context['discriminator'].strip(chr(39))} '{context['tag']}'{hint}"
+    if kind == "literal_error":
+        hint = _meant(str(value), re.findall(r"'([^']*)'", context["expected"]))
+        return f"expected {context['expected']}{hint} (got {short(value)})"
+    text = _EXPECTED.get(kind) or e["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     text = text.replace("Input should be", "expected").replace("a valid ", "a ")
     return text if kind == "value_error" and isinstance(value, dict) else f"{text} (got {short(value)})"
 

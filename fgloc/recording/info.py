@@ -39,6 +39,12 @@ class RecordingInfo:
     problems: tuple[str, ...]  # what must be settled before a run
     findings: tuple[str, ...]  # what looks wrong
     notes: tuple[str, ...]
+    mistakes: tuple[str, ...] = ()  # those of the findings that surely make the poses of a run wrong
+
+    @property
+    def exit_code(self) -> int:
+        """Of ``fgloc info``, as a run would end: 1 if none is possible, 3 if its poses would be wrong, else 0."""
+        return 1 if self.problems else 3 if self.mistakes else 0
 
 
 def inspect(path: Path, config: Config) -> RecordingInfo:
@@ -196,7 +202,7 @@ def format_info(info: RecordingInfo) -> str:
         parts.append(f"Marker ids seen (times): {seen}")
     for title, lines in (
         ("To be settled before a run:", info.problems),
-        ("What looks wrong:", info.findings or ("nothing",)),
+        ("What looks wrong:", info.findings or (() if info.problems else ("nothing",))),
         ("Notes:", info.notes),
     ):
         if lines:

@@ -275,3 +275,23 @@ def test_info_names_the_mistake_first(looked, tmp_path):
     arguments = ["--map", str(SAMPLE / "map.yaml"), "--config", str(tmp_path / "robot.yaml")]
     shown = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), *arguments])
     assert "What looks wrong:\n  - The left and the right wheel are exchanged: set wheels.left_joint:" in shown.output
+    assert shown.exit_code == EXIT_LOST
+
+
+@pytest.mark.parametrize(("bag", "of"), [("installed_run", "first_run"), ("first_run", "installed_run")])
+def test_info_names_the_map_of_another_place(bag, of):
+    arguments = ["--map", str(SAMPLES / of / "map.yaml"), "--config", str(SAMPLES / bag / "robot.yaml")]
+    shown = CliRunner().invoke(cli.app, ["info", str(SAMPLES / bag / "bag"), *arguments])
+    assert f"What looks wrong:\n  - What the camera saw does not fit {SAMPLES / of / 'map.yaml'}" in shown.output
+    assert shown.exit_code == EXIT_LOST
+
+
+def test_info_of_a_sound_set_up_ends_with_0_and_of_one_that_cannot_run_with_1(tmp_path):
+    sound = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), "--config", str(SAMPLE / "robot.yaml")])
+    assert sound.exit_code == 0
+    (tmp_path / "robot.yaml").write_text("recording: {topics: {odometry: /odm}}")
+    arguments = ["--map", str(SAMPLE / "map.yaml"), "--config", str(tmp_path / "robot.yaml")]
+    unsettled = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), *arguments])
+    assert unsettled.exit_code == 1
+    assert "/odm is not in the recording" in unsettled.output
+    assert "nothing" not in unsettled.output

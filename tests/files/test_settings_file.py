@@ -67,6 +67,10 @@ def test_every_default_is_within_its_bounds():
         ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: expected 'auto', 'twist'"),
         ("wheels:\n  noise:\n    x_per_sqrt_mm: 1\n", r"robot.yaml:3: wheels.noise.x_per_sqrt_mm.*'x_per_sqrt_m'\?"),
         ("gate:\n\n  max_speed: fast\n", r"robot.yaml:3: gate.max_speed: .*number.*got 'fast'"),
+        ("wheels: {source: tick}\n", r"^\S*robot.yaml:1: wheels.source: .*; did you mean 'ticks'\?"),
+        ("wheels: 3\n", r"robot.yaml:1: wheels: expected keys with values \(got 3\)"),
+        ("motion: {use: perhaps}\n", r"robot.yaml:1: motion.use: expected true or false"),
+        ("size: 0.2\nlandmarks:\n- {id: 0}\n", r"robot.yaml is a map, .* --map"),
         ("a: 1\na: 2\n", r"robot.yaml:2: key 'a' is given twice"),
         ("x: !!int ''\n", r"robot.yaml:1: '' is not a value of kind int"),
     ],
@@ -83,6 +87,11 @@ def test_suite_errors_name_line_and_correction(write):
     )
     with pytest.raises(ConfigError, match=r"suite.yaml:7: .*gian: unknown key; did you mean 'gain'\?"):
         load_suite(write(text, "suite.yaml"))
+    unknown = text.replace("darkness, gian: 0.5", "darknes")
+    with pytest.raises(
+        ConfigError, match=r"^\S*suite.yaml:7: \S*: there is no kind 'darknes'; did you mean 'darkness'\?$"
+    ):
+        load_suite(write(unknown, "suite.yaml"))
     many = text.replace("gian", "gain") + f"seeds: {list(range(1000))}\nvariants:\n"
     many += "".join(f"  - {{name: v{i}}}\n" for i in range(2000))
     with pytest.raises(ConfigError, match="asks for 2002000 runs"):

@@ -305,6 +305,9 @@ def test_ambiguous_or_missing_wheels_are_named():
     arm = run(stepper(), [joints(t, 1, 2, names=("shoulder", "elbow")) for t in times(1, 4, 20)])
     with pytest.raises(ConfigError, match="shoulder, elbow"):
         total(arm, WheelsConfig(source="ticks", **GEOMETRY))
+    misspelled = WheelsConfig(source="ticks", left_joint="sholder", right_joint="elbow", **GEOMETRY)
+    with pytest.raises(ConfigError, match=r"\(wheels.left_joint: sholder, did you mean 'shoulder'\?\)"):
+        total(arm, misspelled)
     _, _, wheels = total(arm, WheelsConfig(**GEOMETRY))
     assert any("none holds both wheels" in note for note in wheels.notes)
     with pytest.raises(ConfigError, match=r"wheels\.track"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 from fgloc.errors import ConfigError
 from fgloc.sensors.wheels.config import WheelsConfig
@@ -99,13 +100,23 @@ class TicksTrack(Track):
         self._without += 1
         if self._without == _PATIENCE and self._last_ns is None:
             text = (
-                f"{_PATIENCE} messages of joint states, and none holds both wheels (the last: {', '.join(names)}); set "
-                "wheels.left_joint and wheels.right_joint"
+                f"{_PATIENCE} messages of joint states, and none holds both wheels{self._configured(names)}; the last "
+                f"holds {', '.join(names)}: set wheels.left_joint and wheels.right_joint"
             )
             if self._config.source == "ticks":
                 raise ConfigError(text)
             self.notes["joints"] = text
         return None
+
+    def _configured(self, names: Sequence[str]) -> str:
+        """The configured joints that are not among the names, with the name that is most like each."""
+        wanted = {"left_joint": self._config.left_joint, "right_joint": self._config.right_joint}
+        missing = []
+        for key, joint in wanted.items():
+            if joint is not None and joint not in names:
+                near = get_close_matches(joint, names, n=1)
+                missing.append(f"wheels.{key}: {joint}" + (f", did you mean '{near[0]}'?" if near else ""))
+        return f" ({'; '.join(missing)})" if missing else ""
 
 
 def wheel_names(names: Sequence[str], left: str | None, right: str | None) -> tuple[str, str] | None:
