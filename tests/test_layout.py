@@ -12,6 +12,7 @@ import pytest
 from config_rows import rows, sections, tables
 
 import fgloc
+from fgloc.training.config import TrainConfig
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 GENERATED = {ROOT / "docs" / "reference" / "cli.md"}  # by docs/hooks.py, when the site is built
@@ -128,6 +129,13 @@ def test_configuration_reference_is_complete():
     text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     assert text.endswith(tables()), "out of date: run `python tests/config_rows.py`"
     assert text.count("\n| `") == sum(len(list(rows(model))) for _, model in sections()) > 60
+
+
+def test_reference_of_training_configurations_is_complete():
+    """`fgloc train --init` names this page in what it writes."""
+    text = (ROOT / "docs" / "identification.md").read_text(encoding="utf-8")
+    assert text.endswith(tables(TrainConfig)), "out of date: run `python tests/config_rows.py`"
+    assert "|  |" not in tables(TrainConfig), "a key without a description"
 
 
 def test_readme_names_the_packages_that_ci_installs():
