@@ -52,6 +52,8 @@ def on_page_markdown(markdown, page, config, files):
         path = (folder / target).resolve().relative_to(DOCS.parent).as_posix()
         return f"`{path}`" if path in text or text in path else f"{text} (`{path}`)"
 
+    if page.file.src_uri == "index.md":  # only the site has this page
+        markdown = re.sub(r"command line \(`fgloc --help`[^)]*\)", "[command line](reference/cli.md)", markdown)
     markdown = re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", plain, markdown)
     return markdown.replace("](decisions/)", "](decisions/index.md)")
 

@@ -1,13 +1,17 @@
-"""Smooth a recording and plot its trajectory: ``python examples/smooth_and_plot.py BAG MAP.yaml ROBOT.yaml OUT``."""
+"""Smooth a recording and plot its trajectory."""
 
-import sys
+import argparse
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 
 import fgloc
 
-bag, map_file, robot, out = map(Path, sys.argv[1:5])
+parser = argparse.ArgumentParser(description=__doc__)
+for name in ("BAG", "MAP.yaml", "ROBOT.yaml", "OUT"):
+    parser.add_argument(name, type=Path)
+bag, map_file, robot, out = vars(parser.parse_args()).values()
+
 result = fgloc.run(bag, map_file, fgloc.load_config(robot), "batch")
 result.write(out)  # trajectory.tum, covariance.csv, report.html, ...
 x, y, _ = result.trajectory.poses.T

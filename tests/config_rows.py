@@ -1,21 +1,26 @@
-"""The tables of docs/configuration.md, from the configuration's models; `python tests/config_rows.py` rewrites them.
+"""The tables of docs/configuration.md and docs/identification.md, from the models of what they describe.
 
-With them it rewrites the JSON schemas of docs/schema/.
+`python tests/config_rows.py` rewrites them, and with them the JSON schemas of docs/schema/.
 """
 
+import typing
 from pathlib import Path
 
 import schema_files
 from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
 
 from fgloc.config import Config
+from fgloc.training.config import TrainConfig
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGES = {"configuration.md": Config, "identification.md": TrainConfig}
 
 
 def sections(model=Config, path=""):
     """Dotted name and model of every section, outermost first."""
     for name, field in model.model_fields.items():
-        kind = field.annotation
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
+        if (kind := _section(field)) is not None:
             yield f"{path}{name}", kind
             yield from sections(kind, f"{path}{name}.")
 
@@ -23,11 +28,20 @@ def sections(model=Config, path=""):
 def rows(model):
     """One line of a Markdown table per value of a section."""
     for name, field in model.model_fields.items():
-        if not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+        if _section(field) is None:
             yield f"| `{name}` | {_default(field.default)} | {(field.description or '').replace('|', '/')} |"
 
 
+def _section(field):
+    """The model of a field that is a section, also of one that may be left out; None: it is a value."""
+    kinds = [kind for kind in typing.get_args(field.annotation) if kind is not type(None)] or [field.annotation]
+    kind = kinds[0]
+    return kind if len(kinds) == 1 and isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
 def _default(value):
+    if value is PydanticUndefined:
+        return "needed"
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -35,20 +49,19 @@ def _default(value):
     return f"`{list(value) if isinstance(value, tuple) else value}`"
 
 
-def tables():
-    """All tables, as they stand in the document."""
+def tables(model=Config):
+    """All tables, as they stand in the document; first that of the values outside every section."""
     parts = []
-    for name, model in sections():
-        if lines := list(rows(model)):
-            head = (
-                f"### {name}\n\n{model.__doc__.strip().splitlines()[0]}\n\n| key | default | meaning |\n|---|---|---|"
-            )
+    for name, section in (("top level", model), *sections(model)):
+        if lines := list(rows(section)):
+            about = section.__doc__.strip().splitlines()[0]
+            head = f"### {name}\n\n{about}\n\n| key | default | meaning |\n|---|---|---|"
             parts.append("\n".join([head, *lines]) + "\n")
     return "\n".join(parts)
 
 
 if __name__ == "__main__":
-    page = Path(__file__).parent.parent / "docs" / "configuration.md"
-    start = page.read_text(encoding="utf-8").partition("\n### ")[0]
-    page.write_text(f"{start}\n{tables()}", encoding="utf-8")
+    for page, described in PAGES.items():
+        start = (DOCS / page).read_text(encoding="utf-8").partition("\n### ")[0]
+        (DOCS / page).write_text(f"{start}\n{tables(described)}", encoding="utf-8")
     schema_files.write()

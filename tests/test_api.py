@@ -97,15 +97,24 @@ def test_write_makes_the_folder_of_a_run(tmp_path):
     assert first.startswith(f"{START_NS // 10**9}.")
 
 
-def test_example_smooths_and_plots(tmp_path):
-    arguments = [str(SAMPLE / name) for name in ("bag", "map.yaml", "robot.yaml")]
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "smooth_and_plot.py"), *arguments, str(tmp_path / "out")],
+def run_example(*arguments):
+    return subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "smooth_and_plot.py"), *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
     )
+
+
+def test_example_without_arguments_says_which():
+    done = run_example()
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: smooth_and_plot.py [-h] BAG MAP.yaml ROBOT.yaml OUT\n")
+
+
+def test_example_smooths_and_plots(tmp_path):
+    done = run_example(*(SAMPLE / name for name in ("bag", "map.yaml", "robot.yaml")), tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "path.png").stat().st_size > 5000
     assert "trajectory.tum" in {path.name for path in (tmp_path / "out").iterdir()}

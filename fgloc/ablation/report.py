@@ -162,7 +162,12 @@ def _worths(suite: Suite, runs: Sequence[Run]) -> list[str]:
 
 def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str, ...]]:
     units = {f.name: f.severity.unit if f.severity is not None else "" for f in suite.failures}
-    texts = {(e.failure, e.severity, e.variant): e.text for e in entries if e.metric.key == key}
+    fixed = str.maketrans({" ": "\u00a0"})  # a line breaks before the number of runs only
+    texts = {}
+    for e in entries:
+        if e.metric.key == key:
+            figure, _, count = e.text.rpartition(" (")
+            texts[e.failure, e.severity, e.variant] = f"{figure.translate(fixed)} ({count.translate(fixed)}"
     return [
         (
             failure,

@@ -14,6 +14,7 @@ from scipy import stats
 from fgloc.ablation.jobs import Job
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Cell, Suite
+from fgloc.stats import rounded
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +90,11 @@ class Entry:
         """``mean ± spread (n)``, or how many of the runs failed."""
         if self.mean is None:
             return f"no result (0 of {self.runs})"
-        spread = "" if self.spread is None else f" ± {self.spread:{self.metric.form}}"
+        shown = f"{self.mean:{self.metric.form}}"
+        if self.spread is not None:
+            shown = " ± ".join(rounded(self.mean, self.spread))
         count = f"{len(self.values)}" if len(self.values) == self.runs else f"{len(self.values)} of {self.runs}"
-        return f"{self.mean:{self.metric.form}}{spread} ({count})"
+        return f"{shown} ({count})"
 
 
 def join(jobs: Iterable[Job], records: Mapping[str, Record]) -> list[Run]:
@@ -144,15 +147,33 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     lost = f"; {len(here) - len(pairs)} of {len(here)} runs gave no figure" if len(pairs) < len(here) else ""
     if not pairs:
         return f"{name}{at} left no run of '{variant}' with a figure ({len(here)} asked for)."
+    return f"{name}{at}: {_change(pairs, variant)}{lost}."
+
+
+def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
+    """How the mean error changes from the first of each pair to the second, if it measurably does."""
     before, after = np.mean(pairs, axis=0)
-    change = f"the mean error of '{variant}' "
+    runs = f"over {len(pairs)} run{'s' if len(pairs) > 1 else ''}"
+    if len(pairs) > 1:
+        more = np.diff(pairs)
+        within = "" if _measurable(pairs) else ", within its spread"
+        runs += f" (change {' ± '.join(rounded(float(more.mean()), float(more.std(ddof=1)), '+'))} mm{within})"
+        if within:
+            return f"no measurable change of the mean error of '{variant}', {before:.3g} mm, {runs}"
     if abs(after - before) < _NOTHING * before:
-        change += f"stays at {after:.3g} mm"
-    else:
-        change += f"{'rises' if after > before else 'falls'} from {before:.3g} to {after:.3g} mm"
-    more = np.array([b - a for a, b in pairs])
-    spread = f" (change {more.mean():+.3g} ± {more.std(ddof=1):.3g} mm)" if len(more) > 1 else ""
-    return f"{name}{at}: {change} over {len(pairs)} run{'s' if len(pairs) > 1 else ''}{spread}{lost}."
+        return f"the mean error of '{variant}' stays at {after:.3g} mm {runs}"
+    way = "rises" if after > before else "falls"
+    return f"the mean error of '{variant}' {way} from {before:.3g} to {after:.3g} mm {runs}"
+
+
+def _measurable(pairs: Sequence[tuple[float, float]]) -> bool:
+    """Whether the mean change exceeds its spread, or of many runs what chance makes of it; one run has no spread."""
+    if len(pairs) < 2:
+        return True
+    more, n = np.diff(pairs), len(pairs)
+    spread = float(more.std(ddof=1))
+    by_chance = float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
+    return abs(float(more.mean())) > min(spread, by_chance)
 
 
 def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
@@ -173,18 +194,26 @@ def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
         ]
         if pairs:
             ours, other = np.mean(pairs, axis=0).tolist()
-            found.append((other / max(ours, 1e-9), failure, severity, ours, other, len(pairs)))
+            ratio = other / max(ours, 1e-9)
+            found.append((_measurable(pairs), ratio, failure, severity, ours, other, len(pairs)))
     if not found:
         return None
-    plain = next((f for f in found if f[1] == NOTHING), None)
-    ratio, failure, severity, ours, other, n = max(found, key=lambda f: f[0])
+    plain = next((f for f in found if f[2] == NOTHING), None)
+    measurable, ratio, failure, severity, ours, other, n = max(found, key=lambda f: f[:2])
     units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
     at = "" if severity is None else f" at {severity:g} {units.get(failure, '')}".rstrip()
     under = "without failure" if failure == NOTHING else f"under '{failure}'{at}"
+    count = f"{n} run{'s' if n > 1 else ''}"
+    if not measurable:
+        most = f"{other:.3g} mm instead of {ours:.3g} mm {under}"
+        return (
+            f"'{variant}': no measurable change against '{first}'; the largest, {most}, is within its spread ({count})."
+        )
     text = f"'{variant}': mean error {other:.3g} mm instead of {ours:.3g} mm of '{first}' {under} "
-    text += f"({ratio:.1f} times, {n} run{'s' if n > 1 else ''})"
+    text += f"({ratio:.1f} times, {count})"
     if plain is not None and failure != NOTHING:
-        text += f"; without failure {plain[4]:.3g} instead of {plain[3]:.3g} mm"
+        text += f"; without failure {plain[5]:.3g} instead of {plain[4]:.3g} mm"
+        text += "" if plain[0] else ", within its spread"
     return f"{text}."
 
 

@@ -216,6 +216,6 @@ def _summary(node: Node, seconds: float) -> str:
     rows += [(f"undecodable {topic}", str(n)) for topic, n in node.intake.undecodable.items()]
     rows += [(f"dropped {role}", str(n)) for role, n in status.dropped.items()]
     rows += [
-        (f"{of.role} {topic}", f"{of.count}, delay {of.delay_s * 1e3:.0f} ms") for topic, of in status.topics.items()
+        (f"{of.role} {topic}", f"{of.count}, delay {of.delay_s * 1e3:z.0f} ms") for topic, of in status.topics.items()
     ]
     return columns(None, rows)

@@ -137,6 +137,7 @@ def calibrate(
     config: ConfigOption = None,
 ) -> None:
     """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
+    from fgloc.calibration import shown
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
@@ -146,8 +147,8 @@ def calibrate(
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
-    rows = [(s.name, f"{s.given:.4f}", f"{s.found:.4f} ± {s.sigma:.4f}") for s in settings]
-    say_table(("setting", "given", "found"), rows)
+    rows = [(s.name, shown.unit(s.name), shown.given(s), shown.found(s)) for s in settings]
+    say_table(("setting", "unit", "given", "found"), rows)
     say(f"configuration: {out}")
     paths = " ".join(shown_path(bag) for bag in bags)
     next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")

@@ -245,7 +245,7 @@ def _reasons(kind: Kind, rows: Sequence[Decision]) -> str:
     if kind in ("misread", "outlier"):
         ids = sorted({d.landmark_id for d in rows})
         more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
-        return f" (landmarks {', '.join(map(str, ids[:_NAMED]))}{more})"
+        return f" (landmark id{'s' if len(ids) > 1 else ''} {', '.join(map(str, ids[:_NAMED]))}{more})"
     return ""
 
 

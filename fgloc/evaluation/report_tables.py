@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.calibration import shown
 from fgloc.calibration.contradictions import contradicted
 from fgloc.evaluation.judgements import GRAVITY, Judgement
 from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.metrics import Metrics
+from fgloc.stats import rounded
 from fgloc.types import Mode, RunResult
 
 _MOST_ROWS = 60  # of the table of judgements
@@ -158,9 +160,10 @@ def _installation(result: RunResult) -> list[Row]:
     return [
         (
             s.name + (" (contradicts the given value)" if contradicted(s) else ""),
-            f"{s.given:.6g} ± {s.prior_sigma:.2g}",
-            f"{s.found:.6g} ± {s.sigma:.2g}",
-            f"{s.off:+.1f}",
+            shown.unit(s.name),
+            f"{shown.given(s)} ± {rounded(0.0, s.prior_sigma)[1]}",
+            shown.found(s),
+            f"{s.off:+z.1f}",
         )
         for s in (() if result.found is None else result.found.settings)
     ]

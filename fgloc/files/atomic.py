@@ -119,8 +119,8 @@ def _named(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        text = f"{path}: cannot be written ({error.strerror or error}); the old {what} is kept"
-        raise OutputError(text) from error
+        kept = f"; the old {what} is kept" if os.path.lexists(path) else ""
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}){kept}") from error
     except ValueError as error:
         if "\0" not in str(path):
             raise

@@ -211,4 +211,4 @@ def format_info(info: RecordingInfo) -> str:
 
 
 def _duration(seconds: float) -> str:
-    return f"{seconds * 1e3:.0f} ms" if abs(seconds) < 1.0 else f"{seconds:.4g} s"
+    return f"{seconds * 1e3:z.0f} ms" if abs(seconds) < 1.0 else f"{seconds:.4g} s"

@@ -34,7 +34,7 @@ class DataConfig(Section):
 class NetworkConfig(Section):
     """Form and size of the model."""
 
-    kind: Kind = "displacement"
+    kind: Kind = Field("displacement", description="form: naive, lag, arx, velocity, rate, displacement or gru")
     hidden: tuple[int, ...] = Field(
         (128, 128), description="gru: units of the cell, then of layers; naive, lag, arx: unused"
     )
@@ -52,9 +52,13 @@ class NetworkConfig(Section):
         (0.0,), description="limits of the ages before a sub-step over which measured signals are averaged, from 0 on"
     )
     gyro_bias_sigma: float = Field(0.0, ge=0, description="rad/s that the known bias may be off, drawn in training")
-    velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of that velocity [m/s, rad/s]")
-    velocity_decay_s: float = Field(0.3, gt=0)
-    hold_s: float = Field(1.5, gt=0)
+    velocity_sigma: tuple[float, float] = Field(
+        (0.02, 0.05), description="noise of the velocity among the inputs [m/s, rad/s]"
+    )
+    velocity_decay_s: float = Field(
+        0.3, gt=0, description="after which a measured velocity says little more than commands do"
+    )
+    hold_s: float = Field(1.5, gt=0, description="a command holds for this long when the next one is missing")
 
     @model_validator(mode="after")
     def _may_be_an_ensemble(self) -> NetworkConfig:
@@ -68,14 +72,14 @@ class NetworkConfig(Section):
 class OptimizationConfig(Section):
     """Multi-step loss, Adam, early stopping."""
 
-    seed: int = 0
+    seed: int = Field(0, description="of all that is drawn: first weights, batches, noise")
     horizon_s: float = Field(2.0, gt=0, description="length of the rollouts in the loss")
-    batch: int = Field(128, gt=0)
-    iterations: int = Field(1000, gt=0)
-    validate_every: int = Field(100, gt=0)
+    batch: int = Field(128, gt=0, description="rollouts in one step of the optimizer")
+    iterations: int = Field(1000, gt=0, description="steps of the optimizer, at most")
+    validate_every: int = Field(100, gt=0, description="iterations between two validations")
     validation_s: tuple[float, ...] = Field((10.0, 30.0), description="windows whose mean drift is validated")
     patience: int = Field(6, gt=0, description="validations without improvement after which to stop")
-    learning_rate: float = Field(3e-3, gt=0)
+    learning_rate: float = Field(3e-3, gt=0, description="of Adam")
     position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")
     yaw_sigma_rad: float = Field(0.05, gt=0, description="yaw errors weigh in this unit")
     variance_horizon_s: float = Field(
@@ -89,7 +93,7 @@ class OptimizationConfig(Section):
     nll_beta: float = Field(
         0.0, ge=0, le=1, description="β of the β-NLL: 0 is the likelihood, 1 gives sure and unsure windows equal weight"
     )
-    variance_iterations: int = Field(1500, ge=0)
+    variance_iterations: int = Field(1500, ge=0, description="steps of the optimizer for the variance")
 
 
 class CalibrationConfig(Section):
@@ -139,7 +143,7 @@ class SpeedLimits(Section):
 class TrainConfig(Section):
     """One training run, or one per recording left out."""
 
-    robot: str
+    robot: str = Field(description="name of the robot, for the model's card")
     recordings: dict[str, Path] = Field(description="bags by name, relative to --data")
     truth: dict[str, Path] = Field(
         {},

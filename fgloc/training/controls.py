@@ -15,8 +15,7 @@ from fgloc.training.plots import save
 from fgloc.types import FloatArray
 
 _BINS_V, _BINS_OMEGA = 4, 7  # odd, so that straight ahead is a range of its own
-_ENOUGH_S = 5.0  # in a range of one speed
-_ENOUGH_TOGETHER_S = 2.0  # in a range of both
+ENOUGH_S = 5.0  # in a range of one speed or of both
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,15 +38,15 @@ class Controls:
             (self.omega_edges, self.seconds.sum(axis=0), "ω", "rad/s"),
         ):
             for (low, high), spent in zip(pairwise(edges), seconds, strict=True):
-                if spent < _ENOUGH_S:
-                    found.append(f"{name} from {low:.2g} to {high:.2g} {unit}: {spent:.1f} s, want {_ENOUGH_S:.0f} s")
+                if spent < ENOUGH_S:
+                    found.append(f"{name} from {low:.2g} to {high:.2g} {unit}: {spent:.1f} s, want {ENOUGH_S:.0f} s")
         for side, fast in (("left", self.commanded[:, 1]), ("right", -self.commanded[:, 1])):
             both = (self.commanded[:, 0] > 0.5 * self.limits.v_mps) & (fast > 0.5 * self.limits.omega_radps)
             spent = self.seconds.sum() * float(both.mean())
-            if spent < _ENOUGH_TOGETHER_S:
+            if spent < ENOUGH_S:
                 found.append(
                     f"fast and turning {side} (v over {0.5 * self.limits.v_mps:.2g} m/s, |ω| over "
-                    f"{0.5 * self.limits.omega_radps:.2g} rad/s): {spent:.1f} s, want {_ENOUGH_TOGETHER_S:.0f} s"
+                    f"{0.5 * self.limits.omega_radps:.2g} rad/s): {spent:.1f} s, want {ENOUGH_S:.0f} s"
                 )
         return found
 
@@ -81,7 +80,7 @@ def draw_controls(path: Path, found: Controls) -> None:
     image = axes.pcolormesh(
         found.omega_edges, found.v_edges, np.log10(np.maximum(found.seconds, 0.1)), cmap="Blues", vmin=-1.0
     )
-    for i, j in np.argwhere(found.seconds < _ENOUGH_TOGETHER_S):
+    for i, j in np.argwhere(found.seconds < ENOUGH_S):
         (left, right), (low, high) = found.omega_edges[j : j + 2], found.v_edges[i : i + 2]
         axes.fill([left, right, right, left], [low, low, high, high], fill=False, hatch="//", color="C3", alpha=0.4)
     axes.plot(found.commanded[:, 1], found.commanded[:, 0], ".", color="0.2", markersize=1.5)
@@ -92,6 +91,6 @@ def draw_controls(path: Path, found: Controls) -> None:
             axes.text(*middle, f"{spent:.0f} s", ha="center", va="center", fontsize=8, bbox=box)
     figure.colorbar(image, label="log10 of seconds")
     limits = "the robot's limits" if found.limits is not None else "the largest commands"
-    axes.set(title=f"Commands up to {limits}; hatched: under {_ENOUGH_TOGETHER_S:.0f} s")
+    axes.set(title=f"Commands up to {limits}; hatched: under {ENOUGH_S:.0f} s")
     axes.set(xlabel="ω [rad/s]", ylabel="v [m/s]")
     save(figure, path)

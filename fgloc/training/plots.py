@@ -23,7 +23,8 @@ def draw_losses(path: Path, curves: dict[str, Curve]) -> None:
         if len(losses) > _SMOOTH:
             mean = np.convolve(losses, np.full(_SMOOTH, 1.0 / _SMOOTH), "valid")
             axes.plot(np.arange(_SMOOTH, len(losses) + 1), mean, color="C0", label=f"mean of {_SMOOTH} batches")
-        axes.set(title=name, xlabel="iteration", ylabel="training loss")
+        axes.set_title(name, pad=20)
+        axes.set(xlabel="iteration", ylabel="training loss")
         low, high = np.percentile(losses, [0.5, 99.5]) if len(losses) else (0.0, 1.0)
         axes.set_ylim(low - 0.05 * (high - low) - 1e-9, high + 0.05 * (high - low) + 1e-9)
         lines = list(axes.get_lines())
@@ -32,9 +33,11 @@ def draw_losses(path: Path, curves: dict[str, Curve]) -> None:
             at, scores = np.array(curve.scores).T
             lines += other.plot(at, scores, "o-", color="C1", markersize=3, label="validation")
             best = int(np.argmin(scores))
-            other.plot(at[best], scores[best], "o", color="C3")
+            lines += other.plot(at[best], scores[best], "o", color="C3", label="kept")
             other.set_ylabel("drift [%]" if name.startswith("mean") else "negative log-likelihood")
-        axes.legend(handles=lines, fontsize=8, loc="upper right")
+        axes.legend(
+            handles=lines, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(lines), frameon=False
+        )
     save(figure, path)
 
 

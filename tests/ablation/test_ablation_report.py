@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import typing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from fgloc.ablation.jobs import Job, execute, make_jobs
 from fgloc.ablation.records import Cost, Record
 from fgloc.ablation.report import _curves, write_report
 from fgloc.ablation.suite import Cell, Suite, expand, load_suite
-from fgloc.ablation.tables import ATE, join, matrix, rows, sentence, worst, worth
+from fgloc.ablation.tables import ATE, _measurable, join, matrix, rows, sentence, worst, worth
 from fgloc.config import Config
 from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 
@@ -92,7 +93,7 @@ def test_matrix_holds_mean_spread_and_counts(bag):
     assert mild.mean == pytest.approx(30.0)
     assert mild.spread == pytest.approx(10.0)
     assert mild.interval == pytest.approx((30.0 - 4.3027 * 10 / 3**0.5, 30.0 + 4.3027 * 10 / 3**0.5), rel=1e-4)
-    assert (len(harsh.values), harsh.runs, harsh.text) == (2, 3, "150 ± 70.7 (2 of 3)")
+    assert (len(harsh.values), harsh.runs, harsh.text) == (2, 3, "150 ± 71 (2 of 3)")
     assert entries["none", None, "full"].text == "10 (1)"
     assert entries["blind", 2.0, "bare"].values == (500.0,) * 3
 
@@ -103,6 +104,48 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     assert blind.startswith("Blind at 2 s: the mean error of 'full' rises from 10 to 150 mm over 2 runs")
     assert "1 of 3 runs gave no figure" in blind
     assert sentence(SUITE, runs, "dark") == "Dark changed no message of these recordings: they show nothing about it."
+
+
+def changed(runs, errors):
+    """The runs with these errors [m] of `full` by severity of blind; 'none' has 10 mm."""
+    out = []
+    for run in runs:
+        values = errors.get(run.cell.severity) if run.cell.variant == "full" else None
+        if values is not None:
+            figures = {"ate_mean_m": values[run.cell.seed]}
+            run = replace(run, record=run.record.model_copy(update={"figures": figures, "outcome": "done"}))
+        out.append(run)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ((0.0100, 0.0105, 0.0102), "no measurable change of the mean error of 'full', 10 mm, over 3 runs "
+         "(change +0.23 ± 0.25 mm, within its spread)."),
+        ((0.0103, 0.0105, 0.0107), "the mean error of 'full' rises from 10 to 10.5 mm over 3 runs "
+         "(change +0.50 ± 0.20 mm)."),
+        ((0.0080, 0.0085, 0.0080), "the mean error of 'full' falls from 10 to 8.17 mm over 3 runs "
+         "(change -1.83 ± 0.29 mm)."),
+    ],
+)  # fmt: skip
+def test_a_change_within_its_spread_is_no_change(bag, errors, said):
+    assert sentence(SUITE, changed(join(*made(bag)), {2.0: errors}), "blind") == f"Blind at 2 s: {said}"
+
+
+def test_of_many_runs_a_change_smaller_than_its_spread_is_one():
+    pairs = [(10.0, 10.0 + (3.0 if k % 2 else -1.0)) for k in range(40)]  # +1 ± 2, 0.3 for the mean
+    assert _measurable(pairs)
+    assert not _measurable(pairs[:4])
+
+
+def test_a_variant_that_changes_nothing_is_said_to(bag):
+    same = {1.0: (0.5, 0.49, 0.51), 2.0: (0.52, 0.49, 0.5)}
+    runs = [run for run in changed(join(*made(bag)), same) if run.cell.failure == "blind"]
+    assert worth(SUITE, runs, "bare") == (
+        "'bare': no measurable change against 'full'; the largest, 500 mm instead of 500 mm under 'blind' at 1 s, is "
+        "within its spread (3 runs)."
+    )
 
 
 def test_a_variant_is_compared_where_it_matters_most(bag):

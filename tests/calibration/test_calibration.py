@@ -10,12 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
+from fgloc.calibration import shown
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.datasets.bag import BagWriter
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.learned.config import model_path
+from fgloc.types import Setting
 
 START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (4.0, 0.5), 1: (0.5, 4.0), 2: (-4.0, -0.5), 3: (-0.5, -4.0)}
@@ -157,3 +159,23 @@ def test_a_written_configuration_is_read_back(tmp_path):
     assert "shipped:mrclam/all" in text
     assert "file: cameras/front.yaml" in text
     assert load_config(tmp_path / "robot.yaml") == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        (Setting("camera.roll", -0.0, -0.00001234, 0.00002, 0.01), ("rad", "0.000000", "-0.000012 ± 0.000020")),
+        (Setting("camera.z", 0.3, 0.30412, 0.0031, 0.01), ("m", "0.3000", "0.3041 ± 0.0031")),
+        (Setting("camera.cx_px", 320.0, 321.26, 1.4, 3.0), ("px", "320.0", "321.3 ± 1.4")),
+        (Setting("camera.k1", 0.0, -0.02, 0.3, 0.3), ("-", "0.00", "-0.02 ± 0.30")),
+        (Setting("stamp_offset_s.imu", 0.0, 0.0012, 0.00033, 0.01), ("s", "0.00000", "0.00120 ± 0.00033")),
+        (Setting("landmarks.bearing_bias_rad", 0.0, -0.001, 0.02, 0.02), ("rad", "0.000", "-0.001 ± 0.020")),
+        (Setting("wheels.scale_v", 1.0, 1.0123, 0.00046, 0.2), ("-", "1.00000", "1.01230 ± 0.00046")),
+        (Setting("wheels.yaw_per_m", 0.0, -0.0001, 0.00002, 0.2), ("rad/m", "0.000000", "-0.000100 ± 0.000020")),
+        (Setting("wheels.slowdown", 0.0, 0.4, 0.011, 1.0), ("s/rad", "0.000", "0.400 ± 0.011")),
+        (Setting("wheels.delay_s", 0.0, 0.0, 0.05, 0.05), ("s", "0.000", "0.000 ± 0.050")),
+    ],
+    ids=lambda value: value.name if isinstance(value, Setting) else "",
+)
+def test_a_setting_is_shown_with_unit_and_the_digits_of_its_sigma(setting, told):
+    assert (shown.unit(setting.name), shown.given(setting), shown.found(setting)) == told

@@ -169,6 +169,7 @@ def test_the_site_is_built_without_a_warning_and_asks_for_nothing(tmp_path):
         assert not loaded, f"{page.name} loads {loaded[:3]}"
     text = (tmp_path / "site" / "reference" / "cli.html").read_text("utf-8")
     assert "fgloc smooth" in text
+    assert 'href="reference/cli.html">command line</a>' in (tmp_path / "site" / "index.html").read_text("utf-8")
     assert "<math" in (tmp_path / "site" / "concepts.html").read_text("utf-8")
 
 

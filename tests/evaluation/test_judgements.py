@@ -66,7 +66,9 @@ def test_rejections_of_a_landmark_that_is_found_moved_belong_to_that():
     assert set(found) == {"landmark_moved", "outlier"}
     assert found["landmark_moved"].what == "landmark 7 moved"
     assert (found["landmark_moved"].from_s, found["landmark_moved"].rows) == (1.0, 9)
-    assert "landmarks 3" in found["outlier"].what
+    assert found["outlier"].what == "single sightings rejected (landmark id 3)"
+    several = judgements(run_of(other, row(10, "corners", "gate", landmark_id=9)))
+    assert [j.what for j in several] == ["single sightings rejected (landmark ids 3, 9)"]
 
 
 def test_an_outage_says_how_far_the_robot_went_and_how_well_it_is_known():

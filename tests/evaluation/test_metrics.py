@@ -12,6 +12,7 @@ from fgloc.evaluation import consistency, metrics
 from fgloc.evaluation.matching import Matched, align_se2, match, transform
 from fgloc.evaluation.metrics import relative_error
 from fgloc.frames import yaw_quaternion
+from fgloc.stats import rounded
 from fgloc.types import Trajectory
 
 START_NS = 1_700_000_000_123_456_789
@@ -194,3 +195,21 @@ def test_singular_covariance_is_refused():
 @pytest.fixture
 def rng():
     return np.random.default_rng(7)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "shown"),
+    [
+        (0.00516, 0.00592, "0.0052 ± 0.0059"),
+        (-0.00004, 0.0031, "0.0000 ± 0.0031"),
+        (-0.0000123, 0.00000456, "-0.0000123 ± 0.0000046"),
+        (1.0, 0.0996, "1.00 ± 0.10"),
+        (150.4, 70.7, "150 ± 71"),
+        (1234.5, 567.8, "1234 ± 568"),
+        (0.99, 0.0, "0.99 ± 0"),
+        (5.0, float("inf"), "5 ± inf"),
+    ],
+)
+def test_a_figure_has_the_decimals_of_its_sigma(value, sigma, shown):
+    assert " ± ".join(rounded(value, sigma)) == shown
+    assert rounded(abs(value), sigma, "+")[0].startswith("+")

@@ -270,6 +270,11 @@ def test_out_is_checked_before_the_run(tmp_path, out, said):
         check_out(tmp_path / out)
 
 
+def test_what_is_not_there_is_not_said_to_be_kept():
+    with pytest.raises(OutputError, match=r"^/proc/x: cannot be written \([^()]+\)$"):
+        check_out(Path("/proc/x"))
+
+
 def test_out_that_can_be_written_leaves_no_trace(tmp_path):
     check_out(tmp_path / "new" / "deep")
     check_out(tmp_path / "map.yaml", folder=False)

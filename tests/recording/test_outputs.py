@@ -130,7 +130,9 @@ def test_fault_71_disk_full_keeps_the_old_result(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OutputError, match=r"trajectory.tum: cannot be written \(No space left on device\)"):
+    with pytest.raises(
+        OutputError, match=r"trajectory.tum: cannot be written \(No space left on device\); the old file is kept"
+    ):
         outputs.write_tum(path, figure_eight().trajectory)
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["trajectory.tum"]

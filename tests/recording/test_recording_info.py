@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,8 @@ def test_a_sound_recording_has_no_findings(tmp_path):
     row = next(line for line in text.splitlines() if line.startswith("/odom"))
     assert re.sub(" +", " ", row) == "/odom nav_msgs/Odometry 200 20 Hz 0.05 s at 0.0 s 2 ms odometry"
     assert "What looks wrong:\n  - nothing" in text
+    early = replace(info, topics=(replace(odometry, delay_s=-0.0002),))
+    assert re.search(r"^/odom .* 0\.0 s +0 ms +odometry$", format_info(early), re.MULTILINE)
 
 
 def test_fault_15_clock_jumps_back_is_reported(tmp_path):

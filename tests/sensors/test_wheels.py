@@ -345,6 +345,16 @@ def test_a_refused_twist_without_pose_is_held_then_unknown():
     assert 0.5 * 3 < pose[0] < 0.5 * 4.9
 
 
+@pytest.mark.parametrize(("late_s", "told"), [(0.0005, None), (0.02, "20 ms in 1 step"), (0.3, "0.3 s in 6 steps")])
+def test_how_long_nothing_was_known_is_told_in_a_unit_that_shows_it(late_s, told):
+    """A command comes that much later than the one before it holds."""
+    commands = [command(t, 0.3, 0.0) for t in (1.0, 1.1, 1.2, 1.7 + late_s, 1.8 + late_s)]
+    steps = run(stepper(), in_order_of_receipt(commands, [corners(t) for t in times(1, 2.2, 20)]))
+    _, _, wheels = total(steps, WheelsConfig(source="command", hold_s=0.5))
+    said = [note for note in wheels.notes if "was known" in note]
+    assert said == ([] if told is None else [f"no wheel motion was known for {told}"])
+
+
 def test_the_same_step_measured_again_gives_the_same(drive):
     steps = run(stepper(), [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 18, 20)])
     wheels = WheelMotion(WheelsConfig())

@@ -232,7 +232,7 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
     for topic, of in status.topics.items():
         values[f"{of.role} topic"] = topic
         values[f"{of.role} rate [Hz]"] = f"{of.rate_hz:.1f}"
-        values[f"{of.role} delay [s]"] = f"{of.delay_s:.3f}"
+        values[f"{of.role} delay [s]"] = f"{of.delay_s:z.3f}"
     values |= {f"dropped {role}": str(n) for role, n in status.dropped.items()}
     values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
     values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}

@@ -104,9 +104,9 @@ class JointErrors(Section):
 class Split(Section):
     """Recordings by name: what the weights, the early stopping with the calibration, and the figures have seen."""
 
-    train: tuple[str, ...]
-    validation: tuple[str, ...]
-    test: tuple[str, ...] = ()
+    train: tuple[str, ...] = Field(description="the weights learn from these")
+    validation: tuple[str, ...] = Field(description="these say when to stop, and how sure the model may be")
+    test: tuple[str, ...] = Field((), description="the model is judged by these, and learns nothing of them")
 
 
 class ModelCard(Section):

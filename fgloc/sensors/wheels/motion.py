@@ -25,6 +25,7 @@ _TRACKS: dict[str, type[Track]] = {
 }
 
 _HALF_NS = 20_000_000
+_SHORTEST_TOLD_S = 1e-3  # without a known motion, in all; less is counted, but no note
 
 
 class WheelMotion:
@@ -89,8 +90,10 @@ class WheelMotion:
         explained = any(track.kind == self._chosen and "source" in track.notes for track in self._all)
         notes = [f"wheel motion comes from {_NAMES[self._chosen]}"] if self._chosen and not explained else []
         notes += of_tracks
-        if self._unknown_steps:
-            notes.append(f"no wheel motion was known for {self._unknown_s:.1f} s in {self._unknown_steps} steps")
+        if self._unknown_s >= _SHORTEST_TOLD_S:
+            short, s = self._unknown_s < 0.1, "" if self._unknown_steps == 1 else "s"
+            lasted = f"{1e3 * self._unknown_s:.0f} ms" if short else f"{self._unknown_s:.1f} s"
+            notes.append(f"no wheel motion was known for {lasted} in {self._unknown_steps} step{s}")
         return tuple(notes)
 
     @property
