@@ -16,7 +16,7 @@ from fgloc.training.config import TrainConfig
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
-BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
+BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats", "rounding"}
 UPWARD = {
     ("types", "fgloc.evaluation.report"),  # RunResult.write, imported when it is called
     ("config", "fgloc.sensors"),  # the registry: sensors bring their sections

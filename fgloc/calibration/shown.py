@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fgloc.stats import rounded
+from fgloc.rounding import rounded
 from fgloc.types import Setting
 
 _SUFFIXES = {"s": "s", "m": "m", "px": "px", "rad": "rad"}

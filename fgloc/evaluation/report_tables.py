@@ -14,7 +14,7 @@ from fgloc.calibration.contradictions import contradicted
 from fgloc.evaluation.judgements import GRAVITY, Judgement
 from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.metrics import Metrics
-from fgloc.stats import rounded
+from fgloc.rounding import rounded
 from fgloc.types import Mode, RunResult
 
 _MOST_ROWS = 60  # of the table of judgements
