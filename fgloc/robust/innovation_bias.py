@@ -14,28 +14,29 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgloc.graph.joint import MOST_JOINT
 from fgloc.graph.linearized import Linearized
 from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray
 
-# Eight innovations show a bias from 1.2 sigmas on; one of half a sigma, as a survey leaves it, passes however long it
-# lasts. What is older than 3 s may be of another place.
-_MOST, _WINDOW_NS = 8, 3_000_000_000
-
 
 @dataclass(slots=True)
 class _Window:
-    stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST))
-    innovations: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_MOST))
-    prediction: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_MOST))
+    stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST_JOINT))
+    innovations: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=MOST_JOINT))
+    prediction: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=MOST_JOINT))
 
 
 class InnovationBias:
     """The newest innovations of each source and target."""
 
-    def __init__(self, probability: float) -> None:
-        """Take the probability with which sound measurements pass."""
-        self._probability = probability
+    def __init__(self, probability: float, window_s: float) -> None:
+        """Take the probability with which sound measurements pass, and the time after which they are of another place.
+
+        `MOST_JOINT` innovations show a bias from one sigma on; one of half a sigma, as a survey leaves it, passes
+        however long it lasts.
+        """
+        self._probability, self._window_ns = probability, round(window_s * 1e9)
         self._windows: dict[tuple[str, int], _Window] = {}
 
     def forget(self) -> None:
@@ -54,8 +55,8 @@ class InnovationBias:
             pose_cov: ``(3, 3)`` of the prediction.
         """
         held = self._windows.setdefault(key, _Window())
-        while held.stamps_ns and not 0 < stamp_ns - held.stamps_ns[-1] < _WINDOW_NS:
-            if stamp_ns - held.stamps_ns[-1] >= _WINDOW_NS:
+        while held.stamps_ns and not 0 < stamp_ns - held.stamps_ns[-1] < self._window_ns:
+            if stamp_ns - held.stamps_ns[-1] >= self._window_ns:
                 self._windows[key] = held = _Window()
                 break
             for column in (held.stamps_ns, held.innovations, held.prediction):

@@ -22,7 +22,7 @@ class SensorMeasurements:
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
         self._adaptive = config.weights.adaptive
         self._factors = factors
-        self._bias = InnovationBias(config.estimator.gate_probability)
+        self._bias = InnovationBias(config.estimator.gate_probability, config.weights.window_s)
 
     def forget(self) -> None:
         """The pose was set anew."""
