@@ -21,7 +21,6 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 # Travel by the reference source from which a wheel is known to have turned or to have stood. Over a shorter way a robot
 # slides on with its wheels at rest: 0.08 m from 0.4 m/s at a friction of 0.1.
 _LEAST_M = 0.15
-_LONGEST_S = 3.0  # of travel from which the kind of failure is determined
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
 
@@ -183,7 +182,9 @@ class MotionFaultMonitor:
             return
         self._travels.append(np.array([dt, *self._sides(readings.wheels.motion), *self._sides(reference.motion)]))
         total = np.sum(self._travels, axis=0)
-        while len(self._travels) > 1 and (total[0] > _LONGEST_S or (total[3:] - self._travels[0][3:] > _LEAST_M).all()):
+        while len(self._travels) > 1 and (
+            total[0] > self._config.window_s or (total[3:] - self._travels[0][3:] > _LEAST_M).all()
+        ):
             total -= self._travels.popleft()
 
     def _failure(self, since: int) -> str:
