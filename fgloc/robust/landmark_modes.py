@@ -29,7 +29,6 @@ from fgloc.robust.displacement import MOVED, Explained, by_displacement, explain
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
-_MARGIN = 7.0  # twice the log-likelihood ratio to another landmark's displacement as the cause of the same sightings
 _LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
 _MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
 _PROVEN = 2  # other landmarks that have to be in place
@@ -272,7 +271,7 @@ class LandmarkModes:
                 break
             margins = ((self._evidence[row] - self._evidence) * (self._evidence[row] > 0.0)).sum(1)
             margins[row] = np.inf  # the others' are of what this one explains
-            if margins.min() >= _MARGIN and self._plausible(int(row)):
+            if margins.min() > 0.0 and self._plausible(int(row)):
                 return int(self._ids[row])
         return None
 
