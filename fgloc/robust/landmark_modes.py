@@ -29,7 +29,7 @@ from fgloc.robust.displacement import MOVED, Explained, by_displacement, explain
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
 
-_LEAST_M, _MOST_M = 0.15, 3.0  # of a displacement that is named: less may be a survey, more a misreading
+_LEAST_M = 0.15  # of a displacement that is named: less may be a survey
 _MISREAD_SHARE, _NEAR_M = 0.15, 1.0  # of the sightings of what stands there: rarer ones may be of that, misread
 _PROVEN = 2  # other landmarks that have to be in place
 _STILL_RIGHT_S = 1.0  # after a sighting was fused, the prediction can be held against other sightings
@@ -141,7 +141,7 @@ class LandmarkModes:
     def exclude_if_moved(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
         """Leave out a landmark that a search found to be moved, if that is far and clear enough; whether it is."""
         self.displacements.pop(landmark_id, None)
-        if evidence < self.alarm or not _LEAST_M < math.hypot(*moved) < _MOST_M:
+        if evidence < self.alarm or not self._is_usual(moved):
             return False
         self.displacements[landmark_id] = moved
         return True
@@ -275,12 +275,14 @@ class LandmarkModes:
                 return int(self._ids[row])
         return None
 
+    def _is_usual(self, moved: FloatArray) -> bool:
+        """Whether somebody moves a landmark so far: less may be the survey, more than the prior holds a misreading."""
+        return _LEAST_M < math.hypot(*moved) < MOVED * math.sqrt(chi2_bound(self._gate, 2))
+
     def _plausible(self, row: int) -> bool:
         """Whether it is far enough off beside others that are in place, and not these misread."""
         moved = self._moved[row]
-        if not _LEAST_M < math.hypot(*moved) < _MOST_M or moved @ self._information[row] @ moved < chi2_bound(
-            self._gate, 2
-        ):
+        if not self._is_usual(moved) or moved @ self._information[row] @ moved < chi2_bound(self._gate, 2):
             return False
         near = np.hypot(*(self._places - self._places[row] - moved).T) < _NEAR_M
         near[row] = False
