@@ -8,9 +8,11 @@ named to the user.
 from __future__ import annotations
 
 import math
+import sys
 from functools import lru_cache
 
 GATE = 0.9999  # a measurement that is less likely than one minus this is not fused
+ROUNDING = math.sqrt(sys.float_info.epsilon)  # relative error that rounding may leave in what is solved for
 _ALARM_EVERY_S = 86400.0  # where nothing is wrong: a robot drives all day, some 20 km
 
 

@@ -31,10 +31,10 @@ from fgloc.graph.factors import (
     prior_factor,
 )
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import CONVERGED, MOST_STEPS
+from fgloc.graph.joint import MOST_STEPS
 from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
-from fgloc.stats import chi2_bound
+from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import (
     FloatArray,
     IntArray,
@@ -214,7 +214,7 @@ class BatchSmoother:
             previous, self._error = self._error, self._solve(start)
             if not np.isfinite(self._error):
                 raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
-            if abs(previous - self._error) <= CONVERGED * self._error:
+            if abs(previous - self._error) <= ROUNDING * self._error:
                 break
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
@@ -257,7 +257,7 @@ class BatchSmoother:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self._config.max_iterations)
         params.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the multifrontal one overflows the stack in GTSAM's order
-        params.setRelativeErrorTol(CONVERGED)
+        params.setRelativeErrorTol(ROUNDING)
         if self._order is not None:
             params.setOrdering(self._order)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)

@@ -19,6 +19,7 @@ from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise_models import sighting_whitening
+from fgloc.stats import ROUNDING
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 FAR_M2 = 1e2  # m²: variance of a position that nothing tells
@@ -27,8 +28,7 @@ FAR_M2 = 1e2  # m²: variance of a position that nothing tells
 MOST_JOINT = 16
 MOST_STEPS = 6  # of Gauss-Newton: it has arrived after two or three, or does not
 LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
-CONVERGED = 1e-6  # relative change of a robust cost, after which a fit has arrived
-_STILL = math.sqrt(CONVERGED)  # sigmas: a step of Gauss-Newton this small is the last one
+_STILL = math.sqrt(ROUNDING)  # sigmas: a step of Gauss-Newton this small is the last one
 
 
 def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:

@@ -19,6 +19,7 @@ from fgloc.graph.noise_budget import COVARIANCE_FACTOR
 from fgloc.relocalization.gaussian_sum import Displacement, GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
 from fgloc.sensors.motion_compensation import compensated
+from fgloc.stats import ROUNDING
 from fgloc.types import (
     LandmarkMap,
     LandmarkMeasurement,
@@ -29,7 +30,7 @@ from fgloc.types import (
 )
 
 ANYWHERE = np.diag([FAR_M2, FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
-ORIGIN = 1e-6 * np.eye(se2.DOF)  # of a first pose that is the origin by definition
+ORIGIN = ROUNDING * np.eye(se2.DOF)  # of a first pose that is the origin by definition
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_S = 1.0
 

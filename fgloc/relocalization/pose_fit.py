@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import CONVERGED
 from fgloc.graph.linearized import Stacked
 from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
-from fgloc.stats import chi2_bound
+from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
 _ITERATIONS = 16
-_RANK = 1e-9  # of the least eigenvalue of the information, relative to the largest
 REDUNDANT = se2.DOF  # residuals more than a pose needs that check it: two markers, but three beacons
 UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
-_TELLS_NOTHING = 1.0 / _RANK  # times its own: variance by the installation of a sighting next to the image plane
+_TELLS_NOTHING = 1.0 / ROUNDING  # times its own: variance by the installation of a sighting next to the image plane
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +77,9 @@ class PoseFit:
                 dof += int(d.sum())
                 normal += np.einsum("n,nij,nik->jk", weight, J, J)
                 pull += np.einsum("n,nij,ni->j", weight, J, r)
-            if np.linalg.matrix_rank(normal, rtol=_RANK) < se2.DOF:
+            if np.linalg.matrix_rank(normal, rtol=ROUNDING) < se2.DOF:
                 return None
-            if abs(previous - cost) <= CONVERGED * cost:
+            if abs(previous - cost) <= ROUNDING * cost:
                 break
             previous = cost
             pose = se2.compose(pose, se2.exp(np.asarray(np.linalg.solve(normal, -pull), dtype=np.float64)))
