@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
 from fgloc.graph.noise_budget import COVARIANCE_FACTOR
 from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
-from fgloc.relocalization.pose_fit import UNEXPLAINED, Fit, PoseFit, fit_pose
+from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose
 from fgloc.sensors.pnp import planar_base_candidates
 from fgloc.types import (
     FloatArray,
@@ -51,7 +51,7 @@ class PlaceSearch:
             return None  # one landmark alone may have been moved, or misread
         fitted = PoseFit(here, self._factors)
         candidates = sorted(
-            self._candidates(here, known), key=lambda c: float(np.minimum(fitted.costs(c)[0], UNEXPLAINED).sum())
+            self._candidates(here, known), key=lambda c: float(fitted.costs(c)[0].sum())
         )
         fits = [fit for c in candidates[:_MAX_SEEDS] if (fit := fitted.solve(c)) is not None]
         places: list[Fit] = []

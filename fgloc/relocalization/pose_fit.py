@@ -20,8 +20,8 @@ from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
 _ITERATIONS = 16
 REDUNDANT = se2.DOF  # residuals more than a pose needs that check it: two markers, but three beacons
-UNEXPLAINED = 1e3  # cost of a sighting that cannot have been made from a pose
-_TELLS_NOTHING = 1.0 / ROUNDING  # times its own: variance by the installation of a sighting next to the image plane
+# Times its own: variance by the installation of a sighting next to the image plane, and squared residual of one behind
+_TELLS_NOTHING = 1.0 / ROUNDING
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -71,9 +71,9 @@ class PoseFit:
         for step in range(_ITERATIONS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
             for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
-                square = np.einsum("ni,ni->n", r, r)
+                square = np.where(behind, _TELLS_NOTHING, np.einsum("ni,ni->n", r, r))
                 weight = np.where(behind, 0.0, k**2 / (k**2 + 2.0 * square / d))  # as if of two-dimensional sightings
-                cost += float(np.where(behind, UNEXPLAINED, _robust_costs(square, d, k)).sum())
+                cost += float(_robust_costs(square, d, k).sum())
                 dof += int(d.sum())
                 normal += np.einsum("n,nij,nik->jk", weight, J, J)
                 pull += np.einsum("n,nij,ni->j", weight, J, r)
@@ -87,11 +87,11 @@ class PoseFit:
         return Fit(pose, 0.5 * (cov + cov.T), cost, dof)
 
     def costs(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Robust cost of each sighting at a pose (infinite: it cannot have been made there), and its residuals."""
+        """Robust cost of each sighting at a pose (the largest: it cannot have been made there), and its residuals."""
         costs, dofs = np.zeros(len(self._observed)), np.zeros(len(self._observed), dtype=int)
         for (rows, _), (r, _, behind, d, k) in zip(self._observed.batches, self._white(pose, anew=True), strict=True):
-            square = np.einsum("ni,ni->n", r, r)
-            costs[rows] = np.where(behind, np.inf, _robust_costs(square, d, k))
+            square = np.where(behind, _TELLS_NOTHING, np.einsum("ni,ni->n", r, r))
+            costs[rows] = _robust_costs(square, d, k)
             dofs[rows] = d
         return costs, dofs
 
