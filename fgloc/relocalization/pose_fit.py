@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.joint import MOST_STEPS
 from fgloc.graph.linearized import Stacked
 from fgloc.graph.planar_batch import PlanarBatch
 from fgloc.graph.pose_batch import PoseBatch
 from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 
-_ITERATIONS = 16
 REDUNDANT = se2.DOF  # residuals more than a pose needs that check it: two markers, but three beacons
 # Times its own: variance by the installation of a sighting next to the image plane, and squared residual of one behind
 _TELLS_NOTHING = 1.0 / ROUNDING
@@ -68,7 +68,7 @@ class PoseFit:
     def solve(self, start: FloatArray) -> Fit | None:
         """As `fit_pose`."""
         pose, previous = start, math.inf
-        for step in range(_ITERATIONS):
+        for step in range(MOST_STEPS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
             for r, J, behind, d, k in self._white(pose, anew=step < 2):  # the noise hardly depends on the pose then
                 square = np.where(behind, _TELLS_NOTHING, np.einsum("ni,ni->n", r, r))
