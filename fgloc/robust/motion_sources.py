@@ -19,10 +19,10 @@ from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.rest import commanded_to_move
+from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
 _MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
-_LIKELY = 0.2  # of the gate's bounds: sigma of the speed of a robot whose motion is not measured
 
 
 class MotionSources:
@@ -37,6 +37,8 @@ class MotionSources:
             factors: hold what is known of the installation; None: motions are taken as they are reported.
         """
         self._config = config
+        # Sigma of the speed of a robot whose motion is not measured, of the gate's bounds, which it keeps so probably
+        self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
         self.factors = LandmarkFactors(None) if factors is None else factors
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
@@ -51,8 +53,8 @@ class MotionSources:
             wheels_are_commands=self._wheels.from_commands,
             learned_has_gyro=self._learned_has_gyro,
             joint=self._joint,
-            stopped_speed=_LIKELY * self._config.gate.max_speed,
-            stopped_turn=_LIKELY * self._config.gate.max_yaw_rate,
+            stopped_speed=self._likely * self._config.gate.max_speed,
+            stopped_turn=self._likely * self._config.gate.max_yaw_rate,
         )
 
     @property
@@ -157,7 +159,7 @@ class MotionSources:
         if carried_s is None:
             self._silent_s = after
         gate = self._config.gate
-        speed, turn = _LIKELY * gate.max_speed, _LIKELY * gate.max_yaw_rate
+        speed, turn = self._likely * gate.max_speed, self._likely * gate.max_yaw_rate
         cov = np.diag(np.square([speed, speed, turn])) * (after**2 - before**2)
         motion, gyro = np.zeros(3), None if readings is None else readings.gyro
         if gyro is not None:
