@@ -10,7 +10,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.joint import MOST_STEPS
+from fgloc.graph.joint import MOST_JOINT, MOST_STEPS
 from fgloc.graph.noise_budget import COVARIANCE_FACTOR
 from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose
@@ -26,7 +26,7 @@ from fgloc.types import (
 )
 
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
-_MAX_FITTED, _MAX_SEEDS = 24, 6  # sightings for the fit; places to start from, and sightings that tell them
+_MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
 _YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
@@ -46,7 +46,7 @@ class PlaceSearch:
             sightings: as seen from the pose that is looked for.
             known: the robot has an estimated pose elsewhere, so that it takes more to find it here.
         """
-        here = _spread(sightings, _MAX_FITTED)
+        here = _spread(sightings, MOST_JOINT)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
         fitted = PoseFit(here, self._factors)
