@@ -12,6 +12,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, MOST_STEPS
 from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.relocalization.beacon_geometry import RING
 from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose
 from fgloc.sensors.pnp import planar_base_candidates
@@ -29,7 +30,7 @@ from fgloc.types import (
 _MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
-_YAWS = np.linspace(-np.pi, np.pi, 8, endpoint=False)  # ... with these yaws: a fit converges from 30 degrees off
+_YAWS = np.linspace(-np.pi, np.pi, RING, endpoint=False)  # ... with these yaws
 
 
 class PlaceSearch:
@@ -50,9 +51,7 @@ class PlaceSearch:
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
         fitted = PoseFit(here, self._factors)
-        candidates = sorted(
-            self._candidates(here, known), key=lambda c: float(fitted.costs(c)[0].sum())
-        )
+        candidates = sorted(self._candidates(here, known), key=lambda c: float(fitted.costs(c)[0].sum()))
         fits = [fit for c in candidates[:_MAX_SEEDS] if (fit := fitted.solve(c)) is not None]
         places: list[Fit] = []
         for fit in sorted(fits, key=lambda fit: fit.cost):
