@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from benchmarks.mechanisms_switch import (
     Argument,
     Constant,
@@ -42,7 +44,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
         "disagreement_test",
         "GLR test of wheels against learned motion or gyro: slipping or dead wheels are left out.",
         ("robust/glr_test.py", "robust/motion_faults.py"),
-        (Switch("fgloc.robust.glr_test:GlrTest._worst", Returns((0.0, 1))),),
+        (Switch("fgloc.robust.glr_test:GlrTest._nis_of_windows", Returns(np.zeros(1))),),
         Probe("fgloc.robust.glr_test:GlrTest.judge", lambda verdict, *_: verdict.flagged),
         batch=True,
         case="onewheel",

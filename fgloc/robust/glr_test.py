@@ -14,9 +14,7 @@ from fgloc.graph.noise_budget import COVARIANCE_FACTOR
 from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import FloatArray
 
-_LOW = 0.2  # quantile of the statistic that is watched: slips may take the rest of the time
-_LOW_EXPECTED = 3.2  # that quantile for white noise with the covariances as given
-_ADAPTS = 0.1  # share by which a step moves the quantile
+_MEDIAN = chi2_bound(0.5, se2.DOF)  # of the NIS of a step, if the covariances are as given
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +52,9 @@ class GlrTest:
     def __init__(self, config: WeightsConfig) -> None:
         self._config = config
         self.flagged = False
-        self._low = _LOW_EXPECTED  # quantile of the statistic
+        self._usual = _MEDIAN  # median of the NIS of a step
         self._steps: deque[tuple[float, FloatArray, FloatArray, FloatArray]] = deque()  # dt, value, cov, derivative
-        self._length_s = 0.0
-        self._calm_s = 0.0
+        self._length_s = self._calm_s = 0.0
 
     def reset(self) -> None:
         """Forget all: nothing connects what comes with what was."""
@@ -89,11 +86,12 @@ class GlrTest:
         self._length_s += dt
         while len(self._steps) > 1 and self._length_s - self._steps[0][0] >= self._config.window_s:
             self._length_s -= self._steps.popleft()[0]
-        nis, span = self._worst()
+        of_windows = self._nis_of_windows()
         if not self.flagged:
-            self._low *= math.exp(_ADAPTS * ((nis > self._low) - (1.0 - _LOW)))
-            self._low = min(max(self._low, _LOW_EXPECTED / COVARIANCE_FACTOR), _LOW_EXPECTED)
-        nis /= self._level
+            moved = math.copysign(dt / self._config.window_s, of_windows[0] - self._usual)
+            self._usual = min(max(self._usual * math.exp(moved), _MEDIAN / COVARIANCE_FACTOR), _MEDIAN)
+        span = int(np.argmax(of_windows)) + 1
+        nis = float(of_windows[span - 1]) / self._level
         bound = alarm_bound(dt, len(self._steps), se2.DOF)
         if not self.flagged:
             if nis <= bound:
@@ -103,32 +101,24 @@ class GlrTest:
         agrees = self._newest_nis() / self._level < chi2_bound(GATE, se2.DOF)
         self._calm_s = self._calm_s + dt if agrees else 0.0
         if self._calm_s >= self._config.release_s:
-            self.flagged = False
-            self._steps.clear()
-            self._length_s = 0.0
+            self.reset()
         return GlrResult(self.flagged, 0, nis, bound, span)
 
     @property
     def _level(self) -> float:
         """How large differences are while nothing is wrong, as a share of their covariances."""
-        return self._low / _LOW_EXPECTED
+        return self._usual / _MEDIAN
 
-    def _worst(self) -> tuple[float, int]:
-        """NIS of the least likely window that ends now, and the number of its steps."""
+    def _nis_of_windows(self) -> FloatArray:
+        """NIS ``(n,)`` of each window that ends now, the shortest first."""
         differences = np.cumsum([d for _, d, _, _ in reversed(self._steps)], axis=0)
         covs = np.cumsum([S for _, _, S, _ in reversed(self._steps)], axis=0)
         D = np.cumsum([D for _, _, _, D in reversed(self._steps)], axis=0)
         covs = covs + D @ self._installation_cov @ D.transpose(0, 2, 1)
-        nis = np.einsum("ni,ni->n", differences, np.linalg.solve(covs, differences[:, :, None])[:, :, 0])
-        worst = int(np.argmax(nis))
-        return float(nis[worst]), worst + 1
+        return np.asarray(np.einsum("ni,ni->n", differences, np.linalg.solve(covs, differences[:, :, None])[:, :, 0]))
 
     def _newest_nis(self) -> float:
         """NIS of the newest steps, as many as the release takes."""
-        d, S, length = np.zeros(3), np.zeros((3, 3)), 0.0
-        D = np.zeros_like(self._steps[-1][3])
-        for dt, difference, cov, derivative in reversed(self._steps):
-            d, S, D, length = d + difference, S + cov, D + derivative, length + dt
-            if length >= self._config.release_s:
-                break
-        return float(d @ np.linalg.solve(S + D @ self._installation_cov @ D.T, d))
+        seconds = np.cumsum([dt for dt, *_ in reversed(self._steps)])
+        steps = int(np.searchsorted(seconds, self._config.release_s)) + 1
+        return float(self._nis_of_windows()[:steps][-1])

@@ -272,8 +272,8 @@ def test_wheels_known_to_be_wrong_are_not_found_out_again():
 def test_wheels_that_differ_by_less_than_an_alarm_are_worth_less_back_to_the_onset():
     """A slip of one sigma a step; told as the number of steps for which the larger covariance holds."""
     trust = trust_in()
-    run(trust, 40, (SPEED, TURN))
-    found = run(trust, 6, (SPEED + 0.03, TURN), first=40)
+    run(trust, 300, (SPEED, TURN))
+    found = run(trust, 6, (SPEED + 0.03, TURN), first=300)
     assert not any(t.budget.rejected for t in found)
     assert [t.span for t in found] == [1, 2, 3, 4, 5, 6]
     assert [t.budget.scale for t in found] == sorted(t.budget.scale for t in found)
