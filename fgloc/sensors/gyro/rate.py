@@ -18,8 +18,7 @@ from fgloc.types import FloatArray, InertialEvent, Step
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
-_GOOD_YAW = 0.02  # rad: sigma of a yaw that the bias is learned from ...
-_APART_S = 2.0  # ... and another one after at least this long
+_APART_S = 2.0  # between two yaws that the bias is learned from, at least
 
 
 class Gyro:
@@ -112,8 +111,6 @@ class Gyro:
             variance: [rad²].
             apart_s: how far apart the two have to be at least, so that their errors do not depend on this gyro.
         """
-        if variance > _GOOD_YAW**2:
-            return
         if self._anchor is not None:
             if self._turned_s < max(_APART_S, apart_s):
                 return
