@@ -112,7 +112,7 @@ class NoiseBudget:
         speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
         speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds
-        density = np.square([max(speed_of_wheels, speed), 0.3 * max(speed_of_wheels, speed), max(turned, turn)])
+        density = np.square([max(speed_of_wheels, speed), max(speed_of_wheels, speed), max(turned, turn)])
         return replace(wheels, cov=wheels.cov + np.diag(density * _WRONG_LASTS_S * seconds))
 
 
