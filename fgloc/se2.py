@@ -18,6 +18,7 @@ FloatArray = NDArray[np.float64]
 Triple = Sequence[float] | FloatArray
 _SMALL = 1e-9
 DOF = 3  # of a pose or motion
+ANY_YAW = math.pi**2 / 3.0  # rad²: variance of a yaw that may be any, with equal probability
 
 
 def wrap(angle: float) -> float:

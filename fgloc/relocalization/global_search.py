@@ -29,7 +29,7 @@ from fgloc.types import (
     Step,
 )
 
-ANYWHERE = np.diag([FAR_M2, FAR_M2, math.pi**2 / 3.0])  # the yaw may be any, with equal probability
+ANYWHERE = np.diag([FAR_M2, FAR_M2, se2.ANY_YAW])  # the yaw may be any, with equal probability
 ORIGIN = ROUNDING * np.eye(se2.DOF)  # of a first pose that is the origin by definition
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_S = 1.0
