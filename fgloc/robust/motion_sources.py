@@ -22,7 +22,7 @@ from fgloc.sensors.rest import commanded_to_move
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 
-_MEMORIES = 5.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
+_MEMORIES = 2.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 
 
 class MotionSources:
