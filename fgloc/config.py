@@ -99,7 +99,7 @@ class GateConfig(Section):
     max_wheel_rate: float = Field(500.0, gt=0, le=1e6, description="rad/s")
     max_position: float = Field(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
     max_range: float = Field(50.0, gt=0, le=1e5, description="m, of a sighting")
-    min_range: float = Field(0.02, gt=0, le=1e5, description="m")
+    min_range: float = Field(0.0, ge=0, le=1e5, description="m: sightings have to be farther off than this")
     max_variance: float = Field(1e6, gt=0, le=1e12, description="above it a variance says 'unknown'")
     quaternion_tolerance: float = Field(
         0.05, gt=0, le=1, description="less off unit length: normalised; more: rejected"

@@ -158,11 +158,11 @@ class SightingsChecks:
         if rare:
             found.append(f"{topic}: seen fewer than {config.landmarks.min_sightings} times: id {', '.join(rare)}.")
         ranges = self._ranges.array()
-        bad = ~((ranges >= config.gate.min_range) & (ranges <= config.gate.max_range))
+        bad = ~((ranges > config.gate.min_range) & (ranges <= config.gate.max_range))
         if bad.any():
             found.append(
-                f"{topic}: {count(bad)} sightings are not within {config.gate.min_range:g} to "
-                f"{config.gate.max_range:g} m and will be rejected."
+                f"{topic}: {count(bad)} sightings are not farther than {config.gate.min_range:g} m and up to "
+                f"{config.gate.max_range:g} m off and will be rejected."
             )
         return found + self._axes(topic, config)
 

@@ -19,7 +19,7 @@ def marker_poses(checks: FieldChecks) -> Callable[[MarkerPosesEvent], Event | st
         distance = math.hypot(*sighting.position.tolist())
         if not math.isfinite(distance):
             return "non_finite"
-        if not bounds.min_range <= distance <= bounds.max_range:
+        if not bounds.min_range < distance <= bounds.max_range:
             return "range_bound"
         changes: Changes = {}
         reason = checks.quaternion(sighting.orientation, "orientation", changes)

@@ -20,7 +20,7 @@ def range_bearings(checks: FieldChecks) -> Callable[[RangeBearingEvent], Event |
         distance, bearing = sighting.range_m, sighting.bearing_rad
         if not math.isfinite(distance + bearing):
             return "non_finite"
-        if not bounds.min_range <= distance <= bounds.max_range:
+        if not bounds.min_range < distance <= bounds.max_range:
             return "range_bound"
         beyond = bearings.setdefault(topic, [0, 0])
         beyond[1] += 1
