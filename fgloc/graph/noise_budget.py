@@ -16,7 +16,7 @@ from fgloc.sensors import registry
 from fgloc.sensors.equipment import ErrorCorrelation
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
-_SLIP_SPEED, _SLIP_TURN = 0.1, 0.2  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
+_SLIP = 0.1  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
 # What a motion's covariance may be off by: squared errors of the learned motion over 1 s of a slip are 2 to 5 times it.
 COVARIANCE_FACTOR = 4.0
@@ -109,7 +109,7 @@ class NoiseBudget:
         Where they report no motion at all their encoders may have stopped, and the robot may drive as fast as it can.
         """
         slips = self.rejected[wheels.source] == "slip" and wheels.motion.any()
-        speed, turn = (_SLIP_SPEED, _SLIP_TURN) if slips else (rules.stopped_speed, rules.stopped_turn)
+        speed, turn = (_SLIP, _SLIP) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
         speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds
         density = np.square([max(speed_of_wheels, speed), max(speed_of_wheels, speed), max(turned, turn)])

@@ -13,7 +13,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.gaussian_sum import CARRIED, WRONG_LANDMARK
 from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
-from fgloc.relocalization.pose_consensus import apart
+from fgloc.relocalization.pose_consensus import MAX_SIGMA, apart
 from fgloc.types import (
     Decision,
     FloatArray,
@@ -27,7 +27,7 @@ from fgloc.types import (
 
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
-_NOWHERE_M, _NOWHERE_RAD = 3.0, 0.7  # sigmas above which no sighting can be judged by the prediction
+_NOWHERE_M = 3.0  # sigma of a position above which no sighting can be judged by the prediction
 
 
 class Tracking:
@@ -186,7 +186,7 @@ class Tracking:
         if belief is None or not self._known:
             return False
         x, y, yaw = np.sqrt(np.diag(belief.cov))
-        return bool(max(x, y) > _NOWHERE_M or yaw > _NOWHERE_RAD)
+        return bool(max(x, y) > _NOWHERE_M or yaw > MAX_SIGMA[2])
 
     def start_known(self) -> None:
         """The pose is known; stop looking for it."""

@@ -161,7 +161,7 @@ class SightingsChecks:
         bad = ~((ranges > config.gate.min_range) & (ranges <= config.gate.max_range))
         if bad.any():
             found.append(
-                f"{topic}: {count(bad)} sightings are not farther than {config.gate.min_range:g} m and up to "
+                f"{topic}: {count(bad)} sightings are not between {config.gate.min_range:g} and "
                 f"{config.gate.max_range:g} m off and will be rejected."
             )
         return found + self._axes(topic, config)

@@ -107,9 +107,9 @@ def test_a_changed_covariance_is_judged_anew(gate):
 
 
 def test_bad_entries_are_taken_out_of_sightings(gate):
-    event = gate.check(range_bearing(1.0, (1, 2.0, 0.0), (2, np.inf, 0.0), (3, 1e3, 0.0), (4, 3.0, 1.0)))
+    event = gate.check(range_bearing(1.0, (1, 2.0, 0.0), (2, np.inf, 0.0), (3, 1e3, 0.0), (4, 3.0, 1.0), (5, 0.0, 1.0)))
     assert [s.landmark_id for s in event.sightings] == [1, 4]
-    assert gate.rejections == {"sightings.non_finite": 1, "sightings.range_bound": 1}
+    assert gate.rejections == {"sightings.non_finite": 1, "sightings.range_bound": 2}
 
 
 def test_an_empty_detection_is_not_a_rejection(gate):

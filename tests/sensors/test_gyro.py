@@ -137,12 +137,16 @@ def test_a_bias_learned_at_rest_does_not_change_the_turn_since_the_last_fix():
     assert gyro.bias_variance < before  # the fix confirms it
 
 
-def test_an_uncertain_fix_teaches_nothing():
-    gyro = Gyro(GyroConfig())
-    for i in range(100):
-        gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.01), DRIVING).yaw, 0.1)
-        gyro.fix(0.0, 0.1**2)
-    assert gyro.bias == 0.0
+def test_an_uncertain_fix_teaches_less():
+    learned = {}
+    for sigma in (0.001, 0.1):
+        gyro = Gyro(GyroConfig())
+        for i in range(100):
+            gyro.turned(gyro.measure(step(0.1 * i, 0.1 * i + 0.1, lambda t: 0.01), DRIVING).yaw, 0.1)
+            gyro.fix(0.0, sigma**2)
+        learned[sigma] = gyro.bias
+    assert learned[0.001] == pytest.approx(0.01, rel=0.1)
+    assert 0.0 <= learned[0.1] < 0.3 * learned[0.001]
 
 
 def test_fixes_that_rest_on_the_gyro_teach_its_bias_from_far_apart_only():
