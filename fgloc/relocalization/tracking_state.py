@@ -186,7 +186,8 @@ class Tracking:
         if belief is None or not self._known:
             return False
         x, y, yaw = np.sqrt(np.diag(belief.cov))
-        return bool(max(x, y) > _NOWHERE_M or yaw > MAX_SIGMA[2])
+        # Twice the variance with which a place is taken, so that one just taken is not lost at once
+        return bool(max(x, y) > _NOWHERE_M or yaw**2 > 2.0 * MAX_SIGMA[2] ** 2)
 
     def start_known(self) -> None:
         """The pose is known; stop looking for it."""
