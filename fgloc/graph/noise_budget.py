@@ -111,8 +111,9 @@ class NoiseBudget:
         slips = self.rejected[wheels.source] == "slip" and wheels.motion.any()
         speed, turn = (_SLIP, _SLIP) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
-        speed_of_wheels, turned = np.hypot(*wheels.motion[:2]) / seconds, abs(float(wheels.motion[2])) / seconds
-        density = np.square([max(speed_of_wheels, speed), max(speed_of_wheels, speed), max(turned, turn)])
+        speed = max(speed, float(np.hypot(*wheels.motion[:2])) / seconds)
+        turn = max(turn, abs(float(wheels.motion[2])) / seconds)
+        density = np.square([speed, speed, turn])
         return replace(wheels, cov=wheels.cov + np.diag(density * _WRONG_LASTS_S * seconds))
 
 

@@ -31,10 +31,10 @@ class InnovationBias:
     """The newest innovations of each source and target."""
 
     def __init__(self, probability: float, window_s: float) -> None:
-        """Take the probability with which sound measurements pass, and the time after which they are of another place.
+        """Take the probability with which sound measurements pass, and the silence after which what was is forgotten.
 
-        `MOST_JOINT` innovations show a bias from one sigma on; one of half a sigma, as a survey leaves it, passes
-        however long it lasts.
+        What is older than such a silence may be of another place. `MOST_JOINT` innovations show a bias from one sigma
+        on; one of half a sigma, as a survey leaves it, passes however long it lasts.
         """
         self._probability, self._window_ns = probability, round(window_s * 1e9)
         self._windows: dict[tuple[str, int], _Window] = {}

@@ -276,7 +276,7 @@ class LandmarkModes:
         return None
 
     def _is_usual(self, moved: FloatArray) -> bool:
-        """Whether somebody moves a landmark so far: less may be the survey, more than the prior holds a misreading."""
+        """Whether a landmark may have been moved so far: less may be the survey's error, and a misreading more."""
         return _LEAST_M < math.hypot(*moved) < MOVED * math.sqrt(chi2_bound(self._gate, 2))
 
     def _plausible(self, row: int) -> bool:

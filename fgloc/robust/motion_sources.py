@@ -37,7 +37,7 @@ class MotionSources:
             factors: hold what is known of the installation; None: motions are taken as they are reported.
         """
         self._config = config
-        # Sigma of the speed of a robot whose motion is not measured, of the gate's bounds, which it keeps so probably
+        # Sigma of a speed that is not measured, as a share of the gate's bound: the bound is the quantile of GATE
         self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
         self.factors = LandmarkFactors(None) if factors is None else factors
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
