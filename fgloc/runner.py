@@ -27,11 +27,15 @@ from fgloc.replay.replay import Replay
 from fgloc.replay.smoothing import SmoothedRun, smooth_run
 from fgloc.types import (
     Estimate,
+    Finding,
     FloatArray,
     Ground,
     InstallationFound,
     RunResult,
+    Severity,
     Trajectory,
+    note,
+    ordered,
 )
 
 
@@ -75,31 +79,29 @@ def run(
     if check and not wrong.sentences and options.get("on_step") is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))
-    notes = _notes(wrong, outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))
+    findings = _findings(outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))
     result = _result(parts, replay, outcome, estimates, smoothed)
     wall_s = time.perf_counter() - began
-    return replace(result, notes=notes, source=recording_path, config=config, found=found, wall_s=wall_s)
+    return replace(result, findings=findings, source=recording_path, config=config, found=found, wall_s=wall_s)
 
 
-def _notes(
-    wrong: Mistakes,
+def _findings(
     outcome: Outcome,
     smoothed: SmoothedRun | None,
     left_out: int,
     tried: str | None,
     found: InstallationFound,
-) -> tuple[str, ...]:
-    """What the user should know, as sentences, the gravest first."""
-    notes = (
-        *outcome.mistakes[len(wrong.sentences) :],
-        *wrong.notes,
-        *(() if tried is None else (tried,)),
-        *outcome.notes,
-        *(() if smoothed is None else smoothed.notes),
-        *_left_out(left_out),
-        *contradictions(found),
+) -> tuple[Finding, ...]:
+    """What is wrong and what the user should know, the gravest first."""
+    return ordered(
+        [
+            *outcome.findings,
+            *note("clock.offset", () if tried is None else (tried,), Severity.WARNING),
+            *note("batch", () if smoothed is None else smoothed.notes),
+            *note("clock.back", _left_out(left_out)),
+            *note("installation", map(sentence, contradictions(found)), Severity.WARNING),
+        ]
     )
-    return tuple(dict.fromkeys(map(sentence, notes)))
 
 
 def _replayed(
@@ -146,7 +148,7 @@ def _result(
         decisions=tuple(replay.decisions),
         counts=dict(parts.localizer.counts),
         rejections=dict(sorted(outcome.rejections.items())),
-        notes=(),
+        findings=(),
         step_ms=np.array(replay.step_ms),
         wall_s=0.0,
         truth=replay.truth.trajectory(),
@@ -157,7 +159,6 @@ def _result(
         ),
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
-        mistakes=outcome.mistakes,
     )
 
 

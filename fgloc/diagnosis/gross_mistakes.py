@@ -20,7 +20,7 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.detection import RememberingDetector
-from fgloc.types import FloatArray, LandmarkMap
+from fgloc.types import Finding, FloatArray, LandmarkMap, Severity, note
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
 _FEWEST_IMAGES = 5
@@ -44,10 +44,10 @@ class Mistakes:
     undone: bool = False
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def findings(self) -> list[Finding]:
         """The sentences, and that the run did not follow the settings as given."""
-        sentence = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
-        return (*self.sentences, *sentence)
+        followed = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
+        return [*note("setup", self.sentences, Severity.ERROR), *note("setup.corrected", followed)]
 
 
 def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:

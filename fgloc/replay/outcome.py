@@ -13,6 +13,7 @@ from fgloc.diagnosis.unused_sightings import unused_sightings
 from fgloc.recording.reader import Recording
 from fgloc.replay.replay import Replay
 from fgloc.sensors import registry
+from fgloc.types import Finding, Severity, note
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,34 +23,40 @@ class Outcome:
     Attributes:
         roles: topics by role.
         rejections: everything rejected anywhere, by reason.
-        mistakes: of the set-up, gross and sure; before the run and after it.
-        hints: what surely does not fit together.
+        findings: what is wrong with the set-up, what does not fit together, and what the user should know.
         untried: what seems to be wrong with the clocks, and was not tried.
-        notes: what the user should know of the replay.
     """
 
     roles: Mapping[Role, str]
     rejections: Counter[str]
-    mistakes: tuple[str, ...]
-    hints: tuple[str, ...]
+    findings: tuple[Finding, ...]
     untried: tuple[str, ...]
-    notes: tuple[str, ...]
 
     @classmethod
     def of(cls, recording: Recording, parts: Assembly, replay: Replay, wrong: Mistakes) -> Outcome:
         """Collect it from the parts of a run."""
         hints, untried = _hints(recording, parts, replay)
-        notes = (*hints, *recording.notes, *replay.clocks.notes, *parts.sentences)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
         unused = unused_sightings(rejections, recording.roles, seen)
-        mistakes = (*wrong.sentences, *parts.diagnosis.mistakes, *unused, *parts.localizer.motion.mistakes)
-        return cls(recording.roles, rejections, mistakes, tuple(hints), tuple(untried), notes)
+        findings = [
+            *wrong.findings,
+            *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
+            *note("sightings.unused", map(sentence, unused), Severity.ERROR),
+            *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),
+            *note("setup.contradiction", map(sentence, hints), Severity.WARNING),
+            *note("recording", map(sentence, recording.notes)),
+            *note("clock", map(sentence, replay.clocks.notes)),
+            *note("run", map(sentence, parts.sentences)),
+        ]
+        return cls(recording.roles, rejections, tuple(findings), tuple(untried))
 
     def failed(self, why: str) -> str:
         """Message of a run that failed: what is wrong with the set-up, why it failed, what may be the cause."""
-        return " ".join([*self.mistakes, sentence(why) if self.mistakes else why, *self.hints, *self.untried])
+        mistakes = [f.text for f in self.findings if f.severity is Severity.ERROR]
+        hints = [f.text for f in self.findings if f.severity is Severity.WARNING]
+        return " ".join([*mistakes, sentence(why) if mistakes else why, *hints, *self.untried])
 
 
 def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[str], list[str]]:

@@ -22,6 +22,7 @@ from fgloc.types.events import (
     TransformEvent,
     TruthEvent,
 )
+from fgloc.types.findings import Finding, Severity, note, ordered
 from fgloc.types.maps import Camera, Landmark, LandmarkMap
 from fgloc.types.measurements import (
     FrameMeasurement,
@@ -59,6 +60,7 @@ __all__ = [
     "Decision",
     "Estimate",
     "Event",
+    "Finding",
     "FloatArray",
     "FrameMeasurement",
     "Ground",
@@ -82,6 +84,7 @@ __all__ = [
     "RunResult",
     "SensorEvent",
     "Setting",
+    "Severity",
     "Sighting",
     "SightingsEvent",
     "Step",
@@ -90,4 +93,6 @@ __all__ = [
     "TransformEvent",
     "TruthEvent",
     "by_class",
+    "note",
+    "ordered",
 ]

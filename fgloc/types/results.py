@@ -14,6 +14,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import TrajectoryError
 from fgloc.types.arrays import FloatArray, IntArray
+from fgloc.types.findings import Finding, Severity
 from fgloc.types.maps import Camera, LandmarkMap
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ class RunResult:
     decisions: tuple[Decision, ...]
     counts: Mapping[str, int]  # factors held, by kind
     rejections: Mapping[str, int]  # items rejected, by reason
-    notes: tuple[str, ...]  # what the user should know, one sentence each
+    findings: tuple[Finding, ...]  # what is wrong and worth knowing, the gravest first
     step_ms: FloatArray  # (n,) wall time of each update
     wall_s: float
     truth: Trajectory | None = None
@@ -205,8 +206,17 @@ class RunResult:
     installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
     cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
-    mistakes: tuple[str, ...] = ()  # of the set-up, gross and sure; the first notes too
     config: Config | None = None  # as the run used it: with the mistakes undone
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of all findings, the gravest first."""
+        return tuple(finding.text for finding in self.findings)
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Sentences of the findings because of which the poses are not to be trusted."""
+        return tuple(finding.text for finding in self.findings if finding.severity is Severity.ERROR)
 
     def write(self, folder: Path) -> None:
         """Write all files of the run, as ``fgloc smooth`` and ``fgloc online`` do; see ``docs/formats.md``.

@@ -10,7 +10,7 @@ from run_results import START_NS, figure_eight
 
 from fgloc.evaluation.judgements import episodes, gravest, judgements
 from fgloc.recording.outputs import write_steps_csv
-from fgloc.types import Decision
+from fgloc.types import Decision, Finding, Severity
 
 ALARM = 30.0
 
@@ -89,7 +89,7 @@ def test_the_gravest_come_first_and_stray_outliers_not_at_all():
 
 
 def test_the_setups_mistakes_are_of_the_whole_run():
-    (j,) = judgements(replace(run_of(), mistakes=("The markers are 0.16 m, not 0.2 m.",)))
+    (j,) = judgements(replace(run_of(), findings=(Finding("setup", "The markers are 0.16 m, not 0.2 m.", Severity.ERROR),)))
     assert (j.kind, j.when, j.evidence) == ("gross_mistake", "whole run", "The markers are 0.16 m, not 0.2 m.")
 
 

@@ -16,7 +16,7 @@ from fgloc.recording.reader import open_recording
 from fgloc.replay.outcome import Outcome
 from fgloc.runner import run
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.types import Mode
+from fgloc.types import Finding, Mode, Severity
 
 
 def write_late_circle(folder, late_s, seconds=6.0):
@@ -95,8 +95,16 @@ def test_fault_50_ids_outside_the_map_are_named_in_runs_with_images(tmp_path):
 
 
 def test_the_message_of_a_failed_run_is_in_sentences():
-    found = Outcome({}, Counter(), ("No marker is seen.",), ("Map and sightings contradict each other.",), (), ())
+    found = Outcome(
+        {},
+        Counter(),
+        (
+            Finding("setup", "No marker is seen.", Severity.ERROR),
+            Finding("setup.contradiction", "Map and sightings contradict each other.", Severity.WARNING),
+        ),
+        (),
+    )
     assert found.failed("the first pose was never found.") == (
         "No marker is seen. The first pose was never found. Map and sightings contradict each other."
     )
-    assert replace(found, mistakes=()).failed("the first pose was never found.").startswith("the first pose")
+    assert replace(found, findings=()).failed("the first pose was never found.").startswith("the first pose")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fgloc.se2 import rotate_cov, wrap_array
-from fgloc.types import Decision, Landmark, LandmarkMap, Mode, RunResult, TopicTimes, Trajectory
+from fgloc.types import Decision, Finding, Landmark, LandmarkMap, Mode, RunResult, TopicTimes, Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -35,7 +35,7 @@ def figure_eight(seed=0, n=300, truth=True, modes=None):
         decisions=tuple(decisions),
         counts={"wheels": n, "corners": 60},
         rejections={"sightings.gate": 30, "odometry.duplicate_stamp": 2},
-        notes=("The odometry's <twist> is zero while its pose moves.",),
+        findings=(Finding("wheels.source", "The odometry's <twist> is zero while its pose moves."),),
         step_ms=np.linspace(0.5, 1.5, n),
         wall_s=10.0,
         truth=Trajectory(stamps[known], true[known]) if truth else None,
