@@ -29,7 +29,6 @@ from fgloc.cli.options import (
     figure_formats,
 )
 from fgloc.cli.progress import run_bar
-from fgloc.cli.remarks import remarks
 from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import (
     exit_code,
@@ -196,15 +195,14 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
     rows += [(name, str(path)) for name, path in (("MCAP", mcap), ("rerun", rrd)) if path is not None]
-    found = remarks(result, metrics)
-    for remark in found:
-        if remark.kind != "note":
-            say_remark(*remark)
+    for finding in metrics.findings:
+        if finding.severity != "note":
+            say_remark(finding.severity, finding.text)
     for judgement in gravest(metrics.judgements, _TOLD):
         say(f"judged: {judgement.when}: {judgement.what} ({judgement.evidence}); {judgement.effect}")
-    for remark in found:
-        if remark.kind == "note":
-            say_remark(*remark)
+    for finding in metrics.findings:
+        if finding.severity == "note":
+            say_remark(finding.severity, finding.text)
     say_table(None, rows)
     exit_unless_trusted(result)
 

@@ -52,7 +52,7 @@ def exit_unless_trusted(result: RunResult) -> None:
     if lost:
         say(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
     if result.mistakes:
-        say("the set-up is wrong, as the first note says: correct it and run again", err=True)
+        say("not to be trusted, for the reason that is named first", err=True)
     if code := exit_code(result):
         raise typer.Exit(code)
 

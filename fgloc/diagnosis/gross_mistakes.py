@@ -20,7 +20,7 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.detection import RememberingDetector
-from fgloc.types import Finding, FloatArray, LandmarkMap, Severity, note
+from fgloc.types import Finding, FloatArray, LandmarkMap, Severity, note, ordered
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
 _FEWEST_IMAGES = 5
@@ -88,8 +88,7 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
             search.go_on(recording, setup, collector.found)
         except FglocError as error:
             return replace(info, problems=(str(error), *info.problems))
-    mistakes = tuple(search.sentences)
-    return replace(info, findings=(*mistakes, *info.findings), mistakes=mistakes)
+    return replace(info, found=ordered([*note("setup", search.sentences, Severity.ERROR), *info.found]))
 
 
 class _Search:

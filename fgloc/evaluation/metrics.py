@@ -20,7 +20,8 @@ from fgloc.config import Config
 from fgloc.evaluation.consistency import coverage, nees
 from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.evaluation.matching import FEWEST, Matched, match, matchable
-from fgloc.types import FloatArray, RunResult
+from fgloc.evaluation.warnings import all_findings
+from fgloc.types import Finding, FloatArray, RunResult
 
 _Figure = TypeVar("_Figure")
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled
@@ -46,6 +47,26 @@ class FoundSetting(BaseModel):
     prior_sigma: float
     found: float
     sigma: float
+
+
+class FoundFinding(BaseModel):
+    """A finding, as `fgloc.types.Finding` has it; ``severity`` is "error", "warning" or "note"."""
+
+    model_config = ConfigDict(frozen=True)
+
+    code: str
+    severity: str
+    text: str
+    lines: dict[str, str]
+    value: float | None
+    sigma: float | None
+
+    @classmethod
+    def of(cls, finding: Finding) -> FoundFinding:
+        """The finding as it is written; a figure that is not finite is left out."""
+        value, sigma = (v if v is not None and math.isfinite(v) else None for v in (finding.value, finding.sigma))
+        severity, lines = finding.severity.name.lower(), dict(finding.lines)
+        return cls(code=finding.code, severity=severity, text=finding.text, lines=lines, value=value, sigma=sigma)
 
 
 class GroundMetrics(BaseModel):
@@ -81,7 +102,7 @@ class Metrics(BaseModel):
     factors: dict[str, int]
     rejections: dict[str, int]
     installation: dict[str, FoundSetting]  # by setting
-    mistakes: tuple[str, ...]  # of the set-up, in sentences
+    findings: tuple[FoundFinding, ...]  # what is wrong and worth knowing, the gravest first
     judgements: tuple[Judgement, ...]  # what was judged to be wrong, when, and by which evidence
 
 
@@ -188,7 +209,9 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         factors=dict(sorted(result.counts.items())),
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
-        mistakes=result.mistakes,
+        findings=tuple(
+            map(FoundFinding.of, all_findings(result, honest[0], dict(sorted(result.rejections.items())), len(stamps)))
+        ),
         judgements=judgements(result),
     )
 

@@ -47,7 +47,7 @@ def content_of(result: RunResult, metrics: Metrics, matched: Matched | None) -> 
         "lost": lost,
         "judged": judged,
         "judged_line": _JUDGED + (f" {more} more are in metrics.json." if more else ""),
-        "notes": result.notes,
+        "findings": metrics.findings,
         "captions": _captions(result, compared),
         "figures": _figures(metrics),
         "installation": _installation(result),

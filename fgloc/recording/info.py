@@ -17,7 +17,7 @@ from fgloc.recording.checks import CameraInfoChecks, collector
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
 from fgloc.sensors.topic_checks import Collector, RawChecks, SightingsChecks
-from fgloc.types import Event, MotionEvent
+from fgloc.types import Event, Finding, MotionEvent, Severity, note
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
 
@@ -37,14 +37,18 @@ class RecordingInfo:
     roles: Mapping[Role, str]
     marker_ids: Mapping[int, int]  # id -> sightings
     problems: tuple[str, ...]  # what must be settled before a run
-    findings: tuple[str, ...]  # what looks wrong
+    found: tuple[Finding, ...]  # what looks wrong, the gravest first
     notes: tuple[str, ...]
-    mistakes: tuple[str, ...] = ()  # those of the findings that surely make the poses of a run wrong
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Sentences of what looks wrong, the gravest first."""
+        return tuple(finding.text for finding in self.found)
 
     @property
     def exit_code(self) -> int:
         """Of ``fgloc info``, as a run would end: 1 if none is possible, 3 if its poses would be wrong, else 0."""
-        return 1 if self.problems else 3 if self.mistakes else 0
+        return 1 if self.problems else 3 if any(f.severity is Severity.ERROR for f in self.found) else 0
 
 
 def inspect(path: Path, config: Config) -> RecordingInfo:
@@ -87,7 +91,7 @@ def inspect_recording(
         roles=recording.roles,
         marker_ids=dict(sorted(ids.items())),
         problems=recording.problems,
-        findings=tuple(findings),
+        found=tuple(note("recording", findings, Severity.WARNING)),
         notes=recording.notes,
     )
 

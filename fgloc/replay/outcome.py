@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from fgloc.assembly import Assembly
@@ -14,6 +15,8 @@ from fgloc.recording.reader import Recording
 from fgloc.replay.replay import Replay
 from fgloc.sensors import registry
 from fgloc.types import Finding, Severity, note
+
+_GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +49,9 @@ class Outcome:
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),
             *note("setup.contradiction", map(sentence, hints), Severity.WARNING),
-            *note("recording", map(sentence, recording.notes)),
-            *note("clock", map(sentence, replay.clocks.notes)),
-            *note("run", map(sentence, parts.sentences)),
+            *_graded("recording", recording.notes),
+            *_graded("clock", replay.clocks.notes),
+            *_graded("run", parts.sentences),
         ]
         return cls(recording.roles, rejections, tuple(findings), tuple(untried))
 
@@ -66,6 +69,12 @@ def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[
     if parts.detector is not None and not any(parts.localizer.counts[kind] for kind in registry.detected_kinds()):
         hints = [*parts.detector.hints(recording)[0], *hints]
     return hints, untried
+
+
+def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:
+    """Findings of a part of the run: warnings where data are damaged or in another frame, clock or unit."""
+    for text in texts:
+        yield Finding(code, sentence(text), Severity.WARNING if _GRAVE.search(text) else Severity.NOTE)
 
 
 def sentence(note: str) -> str:

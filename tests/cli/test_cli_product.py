@@ -14,14 +14,15 @@ from test_cli import write_circle
 
 from fgloc.cli import extras
 from fgloc.cli.progress import LINE_S, Lines
-from fgloc.cli.remarks import remarks
 from fgloc.config import Config, load_config
 from fgloc.datasets.bag import BagWriter
 from fgloc.evaluation.metrics import compute_metrics
+from fgloc.evaluation.warnings import all_findings
 from fgloc.instrumentation import progress
 from fgloc.runner import run
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.training.config import load_train_config
+from fgloc.types import Finding, Severity, ordered
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -147,28 +148,40 @@ def test_ctrl_c_says_what_is_kept(bag, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-# --- remarks ----------------------------------------------------------------------------------------------------------
+# --- findings ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_gravest_remark_comes_first(bag):
+def test_the_gravest_finding_comes_first(bag):
     result = run(bag, bag.parent / "map.yaml", Config(), "online")
     assert result.truth is not None
     metrics = compute_metrics(result, Config())
-    assert {r.kind for r in remarks(result, metrics)} <= {"note"}
-    worse = metrics.model_copy(update={"nees_over_3": 9.0, "rejections": {"image.dark": 40, "odometry.order": 2}})
+    assert {f.severity for f in metrics.findings} <= {"note"}
     noted = replace(
-        result, notes=("Nothing special.", "Set gate.max_speed.", "The truth is in another frame than the map."),
-        mistakes=("The camera is upside down.",),
-    )  # fmt: skip
-    said = remarks(noted, worse)
-    assert [r.kind for r in said] == ["mistake", "warning", "warning", "warning", "note", "note"]
-    assert "errors are 3.0 times" in said[1].text
-    assert "raise map.position_sigma_m or " in said[1].text
-    assert all(name in said[1].text for name in ("landmarks.range_scale_sigma", "wheels.scale_sigma"))
-    assert "camera." not in said[1].text  # there is none
-    assert "40 messages of image were dropped (image.dark 40)" in said[2].text
-    assert "another frame" in said[3].text
-    assert [r.text for r in said[4:]] == ["Set gate.max_speed.", "Nothing special."]
+        result,
+        findings=(
+            Finding("run", "Nothing special."),
+            Finding("setup", "The camera is upside down.", Severity.ERROR),
+            Finding("clock", "The truth is in another frame than the map.", Severity.WARNING),
+        ),
+    )
+    said = all_findings(noted, 9.0, {"image.dark": 40, "odometry.order": 2}, metrics.keyframes)
+    assert [f.code for f in said] == ["setup", "clock", "covariance.optimistic", "image.dropped", "run"]
+    assert said[2].value == 9.0
+    assert "raise map.position_sigma_m or " in said[2].text
+    assert all(name in said[2].text for name in ("landmarks.range_scale_sigma", "wheels.scale_sigma"))
+    assert "camera." not in said[2].text  # there is none
+    assert said[3].value == 40
+
+
+def test_one_line_is_given_for_each_key():
+    said = ordered(
+        [
+            Finding("a", "first", Severity.WARNING, {"landmarks.range_scale": "0.92"}),
+            Finding("b", "second", Severity.WARNING, {"landmarks.range_scale": "0.96"}),
+            Finding("c", "first", Severity.NOTE),
+        ]
+    )
+    assert [f.code for f in said] == ["a"]
 
 
 # --- a robot of your own ----------------------------------------------------------------------------------------------

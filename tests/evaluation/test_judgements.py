@@ -89,7 +89,9 @@ def test_the_gravest_come_first_and_stray_outliers_not_at_all():
 
 
 def test_the_setups_mistakes_are_of_the_whole_run():
-    (j,) = judgements(replace(run_of(), findings=(Finding("setup", "The markers are 0.16 m, not 0.2 m.", Severity.ERROR),)))
+    (j,) = judgements(
+        replace(run_of(), findings=(Finding("setup", "The markers are 0.16 m, not 0.2 m.", Severity.ERROR),))
+    )
     assert (j.kind, j.when, j.evidence) == ("gross_mistake", "whole run", "The markers are 0.16 m, not 0.2 m.")
 
 

@@ -47,7 +47,7 @@ KEYS = [
     "factors",
     "rejections",
     "installation",
-    "mistakes",
+    "findings",
     "judgements",
 ]
 CONFIG = Config()

@@ -40,7 +40,7 @@ def test_sightings_dropped_for_their_stamps_are_said_first_and_exit_with_3(tmp_p
     code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
     assert code == 3, stderr
     first = stdout.splitlines()[0]
-    assert first.startswith("mistake: None of the sightings on /landmarks was used, for their stamps do not fit")
+    assert first.startswith("error: None of the sightings on /landmarks was used, for their stamps do not fit")
     assert "recording.received_stamps: [sightings]" in first
     assert "dead reckoning" in (tmp_path / "out" / "report.html").read_text()
 
