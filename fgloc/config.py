@@ -89,6 +89,9 @@ class RecordingConfig(Section):
         description="axes that sightings_pose or marker poses refer to: x forward, or z forward; None: optical for "
         "cameras (images, corners), body for the rest",
     )
+    imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
+        None, description="IMU in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+    )
 
 
 class GateConfig(Section):
@@ -128,6 +131,7 @@ class KeyframesConfig(Section):
 class MapConfig(Section):
     """How well the landmarks of the map were surveyed, where the map does not give it of each."""
 
+    scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the map's positions")
     position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
     rotation_sigma_rad: float = Field(
         0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"
@@ -206,6 +210,8 @@ class TruthConfig(Section):
         0.0, ge=-100, le=100, description="yaw of the truth's body axes in the base frame; subtracted"
     )
     offset_m: tuple[_Place, _Place] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
+    axes: Literal["enu", "ned"] = Field("enu", description="ned: x north, y east, yaw clockwise")
+    scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of its positions")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
     max_gap_s: float = Field(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
 

@@ -76,7 +76,7 @@ def run(
     estimates = last_pass(all_estimates)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found, tried = installation_found(parts, outcome.roles, installed), None
-    if check and not wrong.sentences and options.get("on_step") is None:
+    if check and not wrong.grave and options.get("on_step") is None:
         trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))
     findings = _findings(outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))

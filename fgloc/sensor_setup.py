@@ -229,6 +229,11 @@ def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
 
 def mounted_imu(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
     """``T_base_imu (4, 4)``; without a transform the IMU is taken to be level and at the base."""
+    if config.recording.imu_pose is not None:
+        x, y, z, roll, pitch, yaw = config.recording.imu_pose
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = rpy_matrix(roll, pitch, yaw), (x, y, z)
+        return T
     base = base_frame(stream, config, first)
     event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
     if event is not None and event.frame_id in stream.frames and base in stream.frames:
@@ -241,11 +246,7 @@ def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
 
     Its length is ``gyro.scale``, so that rates along it are true ones.
     """
-    base = base_frame(stream, config, first)
-    event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
-    if event is not None and event.frame_id in stream.frames and base in stream.frames:
-        return np.asarray(registry.rate_sensor().scale(config) * stream.frames.lookup(base, event.frame_id)[2, :3])
-    return np.array([0.0, 0.0, registry.rate_sensor().scale(config)])
+    return np.asarray(registry.rate_sensor().scale(config) * mounted_imu(stream, config, first)[2, :3])
 
 
 def base_up(recording: Recording, config: Config) -> FloatArray | None:

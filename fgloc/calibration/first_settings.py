@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, config_of
+from fgloc.diagnosis.conventions import conventions
+from fgloc.diagnosis.signals import read_signals
+from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.files import find_beside
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
+from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.first_settings import FirstLook, FirstSection
-from fgloc.types import Event
+from fgloc.types import Event, Finding, ordered
 
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
@@ -43,6 +49,7 @@ class RobotFile:
     text: str
     roles: dict[Role, str]
     missing: tuple[str, ...]
+    found: tuple[Finding, ...] = ()  # conventions, which the text has
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +82,59 @@ def first_settings(bag: Path) -> RobotFile:
         "# motion:",
         "#   model: models/model.safetensors",
     ]
+    text = "\n".join(lines) + "\n"
+    found = () if seen.info.problems else _compared(bag, text)
+    text = with_findings(text, found)
+    missing += [f.text for f in found if not f.lines]
     lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
-    return RobotFile("\n".join(lines) + "\n", dict(seen.info.roles), tuple(dict.fromkeys(missing)))
+    return RobotFile(text, dict(seen.info.roles), tuple(dict.fromkeys(missing)), found)
+
+
+def _compared(bag: Path, text: str) -> tuple[Finding, ...]:
+    """Conventions of the recording, read as the settings so far have it."""
+    config = config_of(yaml.safe_load(text) or {})
+    map_path = find_beside(bag, "map.yaml")
+    landmark_map = T_base_sensor = imu_up = None
+    with Recording(bag, config.recording) as recording:
+        try:
+            _, setup = recorded_setup(recording, map_path, config)
+            landmark_map, T_base_sensor, imu_up = setup.landmark_map, setup.T_base_sensor, setup.imu_up
+        except FglocError:  # what is missing is said elsewhere; without it less can be compared
+            pass
+        found = conventions(read_signals(recording, config), config, T_base_sensor, imu_up, landmark_map)
+    return ordered(found.findings)
+
+
+def with_findings(text: str, findings: Sequence[Finding]) -> str:
+    """A robot.yaml with the lines of findings, each below a comment with its evidence."""
+    lines = text.splitlines()
+    values: dict[str, tuple[str, str]] = {}
+    for finding in findings:
+        for key, value in finding.lines.items():
+            before = values.get(key)
+            if before is not None and value.startswith("{"):
+                value = "{" + before[1].strip("{}") + ", " + value.strip("{}") + "}"
+            values[key] = (finding.text.partition(": set ")[0] + ".", value)
+    written: dict[str, list[str]] = {}
+    for key, (why, value) in values.items():
+        section, name = key.split(".")
+        lines = [line for line in lines if not line.startswith(f"  {name}:") or _section_at(lines, line) != section]
+        comment = textwrap.wrap(why, 110, initial_indent="  # ", subsequent_indent="  # ")
+        block = written.setdefault(section, [])
+        block += [*(() if comment[0] in block else comment), f"  {name}: {value}"]
+    for section, block in written.items():
+        if f"{section}:" not in lines:
+            lines += ["", f"{section}:"]
+        at = lines.index(f"{section}:") + 1
+        lines[at:at] = block
+    return "\n".join(lines) + "\n"
+
+
+def _section_at(lines: Sequence[str], line: str) -> str:
+    """Name of the section that a line stands in."""
+    heads = [one for one in lines[: lines.index(line)] if one and not one.startswith((" ", "#"))]
+    return heads[-1].partition(":")[0] if heads else ""
 
 
 def _look(bag: Path) -> _Seen:
@@ -118,7 +175,8 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
     if "truth" in seen.info.roles:
         yield ""
         yield "# The truth's frame: the map's (none), or another one (se2: fitted, for evaluation only)."
-        yield f"truth: {{align: {'none' if seen.has_map else 'se2'}}}"
+        yield "truth:"
+        yield f"  align: {'none' if seen.has_map else 'se2'}"
     else:
         missing.append(
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "

@@ -33,6 +33,9 @@ def init(
     write_text(out, found.text)
     load_config(out)
     say_table(("role", "topic"), list(found.roles.items()))
+    for finding in found.found:
+        if finding.lines:
+            say(f"found: {finding.text.replace(': set ', '; written: ', 1)}")
     for sentence in found.missing:
         warn(sentence)
     say(f"configuration: {out}")

@@ -10,10 +10,12 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
+from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.excerpt import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
 from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
 from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks
 from fgloc.diagnosis.setup_check import Checked, check_fit
+from fgloc.diagnosis.signals import read_signals
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
@@ -24,6 +26,7 @@ from fgloc.types import Finding, FloatArray, LandmarkMap, Severity, note, ordere
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
 _FEWEST_IMAGES = 5
+_MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
 _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
 
 
@@ -32,22 +35,21 @@ class Mistakes:
     """What is wrong with a set-up.
 
     Attributes:
-        sentences: one for each mistake, with the line to be set; none on a sound set-up.
+        findings: one for each mistake, with the line to be set; none on a sound set-up.
         config: with the mistakes undone.
         landmark_map: likewise; None: the file is taken as it is.
         undone: whether ``config`` and ``landmark_map`` are not as they were given.
     """
 
-    sentences: tuple[str, ...]
+    findings: tuple[Finding, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
     undone: bool = False
 
     @property
-    def findings(self) -> list[Finding]:
-        """The sentences, and that the run did not follow the settings as given."""
-        followed = ("This run was made with that corrected; correct it, too.",) if self.undone else ()
-        return [*note("setup", self.sentences, Severity.ERROR), *note("setup.corrected", followed)]
+    def grave(self) -> bool:
+        """Whether a mistake would make the poses wrong."""
+        return any(finding.severity is Severity.ERROR for finding in self.findings)
 
 
 def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:
@@ -64,7 +66,10 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     found = _Search(path, map_path, config)
     found.run()
     undone = found.config != config or found.landmark_map is not None
-    return Mistakes(tuple(found.sentences), found.config, found.landmark_map, undone)
+    findings = found.findings
+    if undone and any(finding.severity is Severity.ERROR for finding in findings):
+        findings += note("setup.corrected", ["This run was made with that corrected; correct it, too."])
+    return Mistakes(tuple(findings), found.config, found.landmark_map, undone)
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
@@ -88,7 +93,7 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
             search.go_on(recording, setup, collector.found)
         except FglocError as error:
             return replace(info, problems=(str(error), *info.problems))
-    return replace(info, found=ordered([*note("setup", search.sentences, Severity.ERROR), *info.found]))
+    return replace(info, found=ordered([*search.findings, *info.found]))
 
 
 class _Search:
@@ -99,7 +104,14 @@ class _Search:
         self.config = config
         self.landmark_map: LandmarkMap | None = None
         self.sentences: list[str] = []
+        self._conventions: list[Finding] = []
+        self._compared = False
         self.detections: dict[bytes, Any] = {}
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Everything that was found: conventions, then what the fits of the set-up name."""
+        return [*self._conventions, *note("setup", self.sentences, Severity.ERROR)]
 
     def run(self) -> None:
         """Read the excerpt, and check it."""
@@ -117,9 +129,12 @@ class _Search:
 
     def go_on(self, recording: Recording, setup: SensorSetup, excerpt: Excerpt) -> None:
         """As `run`, of an excerpt that was read."""
-        if self._check(recording, setup, excerpt):
+        if not self._check(recording, setup, excerpt):
+            return
+        for _ in range(_MOST_READINGS):
             with open_recording(self._path, self.config.recording) as corrected:
-                self._check(corrected, *self._read(corrected))
+                if not self._check(corrected, *self._read(corrected)):
+                    return
 
     def _read(self, recording: Recording) -> tuple[SensorSetup, Excerpt]:
         setup, detector = self.begin(recording)
@@ -133,6 +148,14 @@ class _Search:
             self.sentences.append(clock_sentence(roles, excerpt.delays, given))
             self._change("recording", received_stamps=(*given, *roles))
             return True
+        if not self._compared:
+            self._compared = True
+            signals = read_signals(recording, self.config)
+            found = conventions(signals, self.config, parts.T_base_sensor, parts.imu_up, parts.landmark_map)
+            self._conventions += found.findings
+            changed, self.config = found.config.recording != self.config.recording, found.config
+            if changed:
+                return True
         for mistake in registry.raw_mistakes(excerpt.motion, self.config):
             self.sentences.append(mistake.sentence)
             self._change(mistake.section, **mistake.values)

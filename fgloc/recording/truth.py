@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 
 import numpy as np
@@ -19,7 +20,11 @@ SLIPPING_TOPIC = "/truth/slipping"
 def base_pose(event: TruthEvent, config: TruthConfig) -> FloatArray:
     """Planar pose ``(3,)`` of the base, from that of the body which the system tracks."""
     T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
-    return se2.compose((event.position[0], event.position[1], quaternion_yaw(event.orientation)), T_body_base)
+    x, y = config.scale * event.position[0], config.scale * event.position[1]
+    yaw = quaternion_yaw(event.orientation)
+    if config.axes == "ned":
+        x, y, yaw = y, x, se2.wrap(0.5 * math.pi - yaw)
+    return se2.compose((x, y, yaw), T_body_base)
 
 
 def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:

@@ -124,7 +124,6 @@ class SightingsChecks:
         self.frame_id = ""
         self.in_pixels = False
         self._filled = array("b")  # whether each message holds a sighting
-        self._positions = Table(3)
         self._ranges = Table(1)
 
     def add(self, event: Event) -> None:
@@ -135,8 +134,6 @@ class SightingsChecks:
         self.in_pixels = event.in_pixels
         self.ids.update(s.landmark_id for s in event.sightings)
         for sighting in event.sightings:
-            if (place := sighting.place()) is not None:
-                self._positions.add(*place)
             if (distance := sighting.distance()) is not None:
                 self._ranges.add(distance)
 
@@ -164,19 +161,4 @@ class SightingsChecks:
                 f"{topic}: {count(bad)} sightings are not between {config.gate.min_range:g} and "
                 f"{config.gate.max_range:g} m off and will be rejected."
             )
-        return found + self._axes(topic, config)
-
-    def _axes(self, topic: str, config: Config) -> list[str]:
-        """A standing marker keeps its height while its distance changes: this tells which axis points forward."""
-        positions = self._positions.array()
-        if len(positions) < 20 or config.recording.sightings_axes is not None:
-            return []
-        spread = np.percentile(positions, 95, axis=0) - np.percentile(positions, 5, axis=0)
-        optical = (positions[:, 2] > 0).mean() > 0.99 and spread[1] < 0.4 * min(spread[0], spread[2])
-        if optical and "optical" not in self.frame_id:
-            return [
-                f"{topic}: the positions look as if z pointed forward (z {positions[:, 2].min():.1f} to "
-                f"{positions[:, 2].max():.1f} m, y nearly constant) although frame_id is {self.frame_id!r}; "
-                "if so, set recording.sightings_axes: optical."
-            ]
-        return []
+        return found

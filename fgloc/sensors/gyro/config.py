@@ -11,7 +11,7 @@ class GyroConfig(Section):
     """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
 
     use: bool = True
-    scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported rate")
+    scale: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: it turns the other way")
     yaw_per_sqrt_s: float = Field(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
     scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
     bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")

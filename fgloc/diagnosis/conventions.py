@@ -1,0 +1,680 @@
+"""Conventions of a recording: axes, signs, units, mirrors, scales, lags and frames, by pairs of signals.
+
+Nothing here needs a pose, and only the last comparison needs a map. What is found is discrete or far beyond what an
+installer may be off by; smaller deviations are constants, which the graph estimates. `init` writes the lines that undo
+what is found, every other command names them first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fgloc import se2
+from fgloc.config import Config, config_of
+from fgloc.diagnosis.pairs import (
+    AXES,
+    BodyFit,
+    Figure,
+    Mounting,
+    RateFit,
+    fit_body,
+    fit_map,
+    fit_rate,
+    fit_sightings,
+    planar,
+)
+from fgloc.diagnosis.pose_text import sensor_pose
+from fgloc.diagnosis.signals import Path, Sightings, Signals
+from fgloc.frames import rotation_of
+from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
+
+_LATE_S = 0.03  # less is within what drivers mean by a stamp
+_SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
+_RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
+_TURNED_RAD = 0.05  # of a sensor: likewise
+_PLACED_M = 0.08
+_TELLS = 0.7  # share of a turn that another explains: two that tell the same
+_WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
+_ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
+_FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
+_GRAVITY = 5.0  # m/s²: less is no accelerometer
+_TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
+_UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
+_UNIT = 0.04  # share by which a scale may miss a unit's
+
+
+@dataclass
+class Conventions:
+    """What was found, and what it was found by.
+
+    Attributes:
+        findings: with the lines that undo them.
+        config: with those lines.
+        compared: sentences on the pairs that were compared and agree, for `init`'s comments.
+    """
+
+    config: Config
+    findings: list[Finding] = field(default_factory=list)
+    compared: list[str] = field(default_factory=list)
+
+    def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
+        """Note a finding, and set its lines."""
+        shown = {key: _yaml(value) for key, value in lines.items()}
+        value, sigma = (None, None) if figure is None else (figure.value, figure.sigma)
+        remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
+        self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
+        for key, given in lines.items():
+            self.config = with_line(self.config, key, given)
+
+
+def conventions(
+    signals: Signals,
+    config: Config,
+    T_base_sensor: FloatArray | None = None,
+    imu_up: FloatArray | None = None,
+    landmark_map: LandmarkMap | None = None,
+) -> Conventions:
+    """Compare all pairs of signals of a recording.
+
+    Args:
+        signals: of the recording, read as configured.
+        config: as configured.
+        T_base_sensor: ``(4, 4)`` place of the sensor that reports ranges or marker poses; None: the base.
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame, as configured; None: z.
+        landmark_map: None: nothing is compared with a map.
+    """
+    found = Conventions(config)
+    _odometry(found, signals)
+    path = signals.path(found.config)
+    if path is None or path.length_m < 0.05:
+        if (rates := signals.rates()) is not None:
+            _gravity(found, rates[2], _unit(imu_up))
+        return found
+    gyro = _gyro(found, signals, path, imu_up)
+    seen = signals.sightings()
+    sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
+    _clocks(found, signals, gyro, sensor)
+    _truth(found, signals, path)
+    return found
+
+
+def with_line(config: Config, key: str, value: Any) -> Config:
+    """The configuration with one key of robot.yaml set; a mapping is merged."""
+    section, name = key.split(".")
+    content = config.model_dump(mode="json", exclude_unset=True)
+    part = dict(content.get(section, {}))
+    part[name] = {**part.get(name, {}), **value} if isinstance(value, dict) else value
+    return config_of(content | {section: part})
+
+
+def _yaml(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+
+
+def unit_of(scale: float) -> tuple[float, str] | None:
+    """Factor and name of the unit of length that a scale (true over reported) is near; None: no usual one."""
+    for factor, name in _UNITS.items():
+        for known, text in ((factor, name), (1.0 / factor, f"metres for {name}")):
+            if abs(math.log(abs(scale) / known)) < _UNIT:
+                return known, text
+    return None
+
+
+# --- the odometry's pose and its twist --------------------------------------------------------------------------------
+
+
+def _odometry(found: Conventions, signals: Signals) -> None:
+    rows = np.array(signals.odometry)
+    if len(rows) < 50:
+        return
+    _, first = np.unique(rows[:, 0], return_index=True)
+    rows = rows[first]
+    times, yaw = rows[:, 0], np.unwrap(rows[:, 3])
+    place = rows[:, 1] + 1j * rows[:, 2]
+    span = max(1, round(0.4 / max(float(np.median(np.diff(times))), 1e-3)))
+    dt = times[span:] - times[:-span]
+    moved, turned = place[span:] - place[:-span], yaw[span:] - yaw[:-span]
+    whole = (dt < 1.5) & (dt > 0.05) & (np.abs(moved) < 5.0 * dt + 0.5)
+    if whole.sum() < 30:
+        return
+    middle = 0.5 * (yaw[span:] + yaw[:-span])
+    twists = np.array([np.convolve(rows[:, k], np.ones(span), "valid")[:-1] / span for k in (4, 5, 6)])
+    used = found.config.wheels.source in ("auto", "twist") and found.config.wheels.track is None
+    grave = Severity.ERROR if used else Severity.NOTE
+    _twist_speed(found, (moved / dt)[whole], middle[whole], (twists[0] + 1j * twists[1])[whole], grave)
+    _twist_rate(found, (turned / dt)[whole], twists[2][whole], moved[whole], middle[whole], grave)
+
+
+def _twist_speed(
+    found: Conventions, moved: np.ndarray[Any, Any], yaw: FloatArray, twist: np.ndarray[Any, Any], grave: Severity
+) -> None:
+    """Unit, sign and frame of the reported speed, by the change of the pose."""
+    if float(np.quantile(np.abs(moved), 0.9)) < 0.03 or not np.abs(twist).max() > 0.0:
+        return
+    body = moved * np.exp(-1j * yaw)
+    fits = {}
+    for frame, reference in (("body", body), ("world", moved)):
+        slope = _complex_slope(reference, twist)
+        fits[frame] = (
+            slope,
+            float(np.mean(np.minimum(np.abs(twist - slope * reference) / abs(slope or 1.0), 1.0) ** 2)),
+        )
+    spread = float(np.abs(np.mean(np.exp(1j * yaw))))  # 1: it drove in one direction
+    (c, misfit), (_, in_world) = fits["body"], fits["world"]
+    if in_world < 0.3 * misfit and spread < 0.97 and misfit > 0.05 * float(np.mean(np.abs(moved) ** 2)):
+        found.add(
+            "odometry.twist_frame",
+            "The odometry's twist is in the world's axes: it follows the pose's change there and not in the robot's axes",
+            {"wheels.source": "pose"},
+            None,
+            grave,
+        )
+        return
+    if misfit > 0.5 * float(np.mean(np.abs(moved) ** 2)) or abs(c) < 1e-9:
+        return
+    ratio = 1.0 / abs(c)  # true over reported
+    turned = abs(math.remainder(float(np.angle(c)), math.tau))
+    if abs(math.log(ratio)) < 0.25 and turned < 0.5:
+        return
+    unit = unit_of(ratio)
+    if turned > 2.6 and abs(math.log(ratio)) < 0.25:
+        text, lines = "The odometry's twist has the opposite direction of its pose's motion", {"wheels.source": "pose"}
+    elif turned > 0.5:
+        text, lines = "The odometry's twist is turned against its pose's motion", {"wheels.source": "pose"}
+    elif unit is not None:
+        text = f"The odometry's speeds are in {unit[1]}: they are {abs(c):.4g} times the change of its pose"
+        lines = {"wheels.scale_v": round(unit[0] * found.config.wheels.scale_v, 7)}
+    else:
+        text = f"The odometry's speeds are {abs(c):.3g} times the change of its pose"
+        lines = {"wheels.source": "pose"}
+    found.add("odometry.twist_unit", text, lines, Figure(ratio, 0.0), grave)
+
+
+def _twist_rate(
+    found: Conventions,
+    rate: FloatArray,
+    twist: FloatArray,
+    moved: np.ndarray[Any, Any],
+    yaw: FloatArray,
+    grave: Severity,
+) -> None:
+    """Unit and sign of the reported yaw rate, by the change of the pose's yaw."""
+    if float(np.quantile(np.abs(rate), 0.9)) < 0.03 or not np.abs(twist).max() > 0.0:
+        return
+    clipped = np.clip(twist, *np.quantile(twist, [0.01, 0.99]))
+    c = float(rate @ clipped / (rate @ rate))
+    if float(np.mean((clipped - c * rate) ** 2)) > 0.5 * float(np.mean(clipped**2)) or abs(c) < 1e-9:
+        return
+    if c < 0.0 and abs(math.log(-c)) < 0.3:
+        ahead = [abs(np.mean(np.exp(1j * (np.angle(moved) - s * yaw))[np.abs(moved) > 0.01])) for s in (1.0, -1.0)]
+        text = "The odometry's yaw rate has the opposite sign of its pose's yaw"
+        if ahead[0] >= ahead[1]:
+            found.add("odometry.yaw_sign", text, {"wheels.source": "pose"}, Figure(c, 0.0), grave)
+        else:
+            found.add("odometry.yaw_sign", f"{text}, whose own path contradicts that yaw", {}, Figure(c, 0.0), grave)
+    elif abs(math.log(abs(c) * math.pi / 180.0)) < 0.2:
+        lines = {"wheels.scale_omega": round(math.pi / 180.0 * found.config.wheels.scale_omega, 7)}
+        text = f"The odometry's yaw rate is in degrees: it is {c:.3g} times the change of its pose's yaw"
+        found.add("odometry.yaw_unit", text, lines, Figure(1.0 / c, 0.0), grave)
+
+
+def _complex_slope(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> complex:
+    weights = np.ones(len(x))
+    slope = 0j
+    for _ in range(5):
+        slope = complex(np.sum(weights * x.conj() * y) / max(float(np.sum(weights * np.abs(x) ** 2)), 1e-12))
+        residual = np.abs(y - slope * x)
+        spread = 1.5 * float(np.median(residual)) + 0.05 * float(np.quantile(np.abs(y), 0.9)) + 1e-12
+        weights = 1.0 / (1.0 + (residual / (2.4 * spread)) ** 2)
+    return slope
+
+
+# --- the gyro and the wheels ------------------------------------------------------------------------------------------
+
+
+def _unit(up: FloatArray | None) -> FloatArray:
+    axis = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=float)
+    return np.asarray(axis / max(float(np.linalg.norm(axis)), 1e-12))
+
+
+def _gyro(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> RateFit | None:
+    """Axis, sign, unit and lag of the gyro; the fit by the axis that tells the turn, None: none does."""
+    rates = signals.rates()
+    if rates is None:
+        return None
+    times, omega, force = rates
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (omega[1:] + omega[:-1]) * np.diff(times)[:, None], 0)])
+    up, given = _unit(imu_up), found.config.gyro.scale
+    sign = math.copysign(1.0, given)
+    configured = fit_rate(path, times, turned @ up * given)
+    if configured is not None and configured.share > _TELLS and configured.scale.value > 0.0:
+        _gravity(found, force, up * sign)
+        return _gyro_scale(found, configured, given)
+    fits = {k: fit for k in range(3) if (fit := fit_rate(path, times, turned[:, k])) is not None and fit.share > _TELLS}
+    gravity = _gravity_axis(force)
+    if not fits:
+        _gravity(found, force, up * sign)
+        return None
+    k = max(fits, key=lambda i: fits[i].share + (0.1 if gravity is not None and abs(gravity[i]) > 0.85 else 0.0))
+    fit = fits[k]
+    axis = np.zeros(3)
+    axis[k] = math.copysign(1.0, fit.scale.value)
+    _turned_imu(found, axis, gravity, fit)
+    again = fit_rate(path, times, turned @ axis * abs(found.config.gyro.scale))
+    return None if again is None else _gyro_scale(found, again, abs(given))
+
+
+def _turned_imu(found: Conventions, axis: FloatArray, gravity: FloatArray | None, fit: RateFit) -> None:
+    """Name the axis of the IMU that points up, and set it."""
+    named = f"{'-' if axis.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(axis)))]}"
+    scale = found.config.gyro.scale
+    by_gravity = "" if gravity is None else f", and gravity lies along {_axis_text(gravity)}"
+    text = (
+        f"The turn of the wheels is the gyro's {named} axis, not the one that its mounting says (it explains "
+        f"{100.0 * fit.share:.0f} % of the wheels' turn{by_gravity})"
+    )
+    lines: dict[str, Any] = {"recording.imu_pose": [0.0, 0.0, 0.0, *_rpy_for(axis)]}
+    if gravity is not None and gravity @ axis < -0.5:  # a mirror: no turn of the IMU does both
+        lines = {"recording.imu_pose": [0.0, 0.0, 0.0, *_rpy_for(-axis)], "gyro.scale": -abs(scale)}
+        text += "; gravity has the opposite sign, as of left-handed axes"
+    elif scale < 0.0:
+        lines["gyro.scale"] = -scale
+    found.add("imu.axes", text, lines, None, Severity.ERROR)
+
+
+def _rpy_for(up: FloatArray) -> list[float]:
+    """Roll, pitch and yaw [rad] of an IMU whose axis ``up (3,)`` points upwards, by the least turn."""
+    z = np.array([0.0, 0.0, 1.0])
+    across = np.cross(up, z)
+    size = float(np.linalg.norm(across))
+    angle = math.atan2(size, float(up @ z))
+    R = rotation_of(angle * (across / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])))
+    T = np.eye(4)
+    T[:3, :3] = R
+    return [round(v, 4) + 0.0 for v in sensor_pose(T, optical=False)[3:]]
+
+
+def _gravity_axis(force: FloatArray) -> FloatArray | None:
+    mean = np.median(force, axis=0)
+    size = float(np.linalg.norm(mean))
+    return None if not size > _GRAVITY else np.asarray(mean / size)
+
+
+def _gravity(found: Conventions, force: FloatArray, up: FloatArray) -> None:
+    """Name an IMU that does not stand upright by its accelerometer, although its gyro agrees or tells nothing."""
+    axis = _gravity_axis(force)
+    if axis is None or math.acos(float(np.clip(axis @ up, -1.0, 1.0))) < _TILTED_RAD:
+        return
+    snapped = np.zeros(3)
+    snapped[int(np.argmax(np.abs(axis)))] = math.copysign(1.0, axis[int(np.argmax(np.abs(axis)))])
+    if float(axis @ snapped) < math.cos(_TILTED_RAD):
+        snapped = axis
+    found.add(
+        "imu.gravity",
+        f"The IMU's accelerometer has gravity along {_axis_text(axis)}, not along the axis that its mounting says",
+        {"recording.imu_pose": [0.0, 0.0, 0.0, *_rpy_for(snapped)]},
+        None,
+        Severity.ERROR,
+    )
+
+
+def _axis_text(axis: FloatArray) -> str:
+    k = int(np.argmax(np.abs(axis)))
+    return (
+        f"{'-' if axis[k] < 0 else ''}{'xyz'[k]}" if abs(axis[k]) > 0.9 else f"({', '.join(f'{v:.2f}' for v in axis)})"
+    )
+
+
+def _gyro_scale(found: Conventions, fit: RateFit, given: float) -> RateFit:
+    """Unit of the gyro, or a track that the turn refutes."""
+    factor = fit.scale.value  # wheels' turn over the gyro's as configured
+    if abs(math.log(max(factor, 1e-9) * 180.0 / math.pi)) < 0.35:
+        sign = math.copysign(1.0, found.config.gyro.scale)
+        found.add(
+            "imu.unit",
+            f"The gyro's rates are in degrees: they are {1.0 / factor:.1f} times those of the wheels",
+            {"gyro.scale": round(sign * abs(given) * math.pi / 180.0, 7)},
+            fit.scale,
+            Severity.ERROR,
+        )
+    elif abs(math.log(max(factor, 1e-9) * math.pi / 180.0)) < 0.35:
+        found.add(
+            "odometry.yaw_unit",
+            f"The wheels' yaw rate is {factor:.1f} times the gyro's: it is in degrees",
+            {"wheels.scale_omega": round(found.config.wheels.scale_omega * math.pi / 180.0, 7)},
+            fit.scale,
+            Severity.ERROR,
+        )
+    elif fit.scale.off(1.0, _RATE_SCALE):
+        found.add(
+            "wheels.turn",
+            f"The wheels turn {factor:.3f} ± {fit.scale.sigma:.3f} times as much as the gyro (a track as the turn sees "
+            "it, or skidding wheels; a gyro is seldom off by so much)",
+            {"wheels.scale_omega": round(found.config.wheels.scale_omega / factor, 4)},
+            Figure(1.0 / factor, fit.scale.sigma / factor**2),
+            Severity.ERROR,
+        )
+    else:
+        found.compared.append(f"gyro and wheels turn alike ({factor:.3f} ± {fit.scale.sigma:.3f})")
+    return fit
+
+
+# --- landmarks and the wheels -----------------------------------------------------------------------------------------
+
+
+def _sensor(
+    found: Conventions, path: Path, seen: Sightings, T_base_sensor: FloatArray | None, landmark_map: LandmarkMap | None
+) -> Mounting | None:
+    """Axes, mirror, scale and place of the sensor of landmarks; None: the wheels do not tell."""
+    T = np.eye(4) if T_base_sensor is None else T_base_sensor
+    section = found.config.landmarks
+    turned = (seen.points * section.range_scale) @ T[:3, :3].T
+    c, s = math.cos(section.bearing_bias_rad), math.sin(section.bearing_bias_rad)
+    turned[:, :2] = turned[:, :2] @ np.array([[c, -s], [s, c]])
+    as_given = Sightings(seen.times, seen.ids, turned, seen.spatial)
+    fits = fit_sightings(path, as_given)
+    if not fits:
+        return None
+    best = _best(fits)
+    reach = float(np.median(np.abs(planar(as_given.points, best.axes))))
+    if best.misfit > _FITS * reach * max(best.scale.value, 1e-9) or best.scale.sigma > 0.3 * best.scale.value:
+        return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
+    sound = fits.get("body")
+    if best.axes == "body" or (sound is not None and sound.misfit < _WORSE * best.misfit):
+        assert sound is not None
+        return _constants(found, path, as_given, sound, T, landmark_map)
+    raw = Sightings(seen.times, seen.ids, seen.points * section.range_scale, seen.spatial)
+    chosen = best if T_base_sensor is None else _best(fit_sightings(path, raw) or {best.axes: best})
+    pose = _pose_of(chosen, T)
+    lines: dict[str, Any] = {}
+    if chosen.axes == "optical":
+        text = (
+            "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place while the "
+            f"wheels move, to {1e3 * chosen.misfit:.0f} mm; in the axes as configured they wander"
+        )
+        code, lines["recording.sightings_axes"] = "sightings.axes", "optical"
+    elif not seen.spatial:
+        text = (
+            "Bearings count to the right (or the sensor is upside down): mirrored, landmarks stay in place to "
+            f"{1e3 * chosen.misfit:.0f} mm while the wheels move, as reported they wander"
+        )
+        code = "sightings.mirrored"
+    else:
+        text = (
+            f"Landmarks stay in place, to {1e3 * chosen.misfit:.0f} mm, if the sensor's axes are taken as "
+            f"{chosen.axes}; in the axes as configured they wander"
+        )
+        code, lines["recording.sightings_axes"] = "sightings.axes", "body"
+    lines["recording.sightings_pose"] = pose
+    found.add(code, text, lines, None, Severity.ERROR)
+    if chosen.scale.off(1.0, _SCALE):
+        _scale(found, path, raw, chosen, landmark_map)
+    return chosen
+
+
+def _best(fits: Mapping[str, Mounting]) -> Mounting:
+    """The fit of the least misfit; of those about alike the most usual axes."""
+    least = min(m.misfit for m in fits.values())
+    return next(fits[name] for name in AXES if name in fits and fits[name].misfit <= _ALIKE * least)
+
+
+def _pose_of(m: Mounting, T_given: FloatArray) -> list[float]:
+    """x, y, z, roll, pitch, yaw of a mounting as ``recording.sightings_pose`` has it; the place if it is known."""
+    (i, a), (j, b) = AXES[m.axes]
+    forward, left = np.zeros(3), np.zeros(3)
+    forward[i], left[j] = a, b
+    R = np.array([forward, left, np.cross(forward, left)])
+    c, s = math.cos(m.yaw.value), math.sin(m.yaw.value)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
+    T[2, 3] = T_given[2, 3]
+    for k, figure in ((0, m.x), (1, m.y)):
+        T[k, 3] = figure.value if figure.sigma < 0.5 * _PLACED_M else T_given[k, 3]
+    return [round(v, 4) + 0.0 for v in sensor_pose(T, optical=m.axes == "optical")]
+
+
+def _constants(
+    found: Conventions,
+    path: Path,
+    seen: Sightings,
+    m: Mounting,
+    T: FloatArray,
+    landmark_map: LandmarkMap | None,
+) -> Mounting:
+    """Scale and mounting of a sensor whose axes are right."""
+    scaled = m.scale.off(1.0, _SCALE)
+    if scaled or landmark_map is not None:
+        _scale(found, path, seen, m, landmark_map)
+    place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], _PLACED_M) and f.sigma < 0.5 * _PLACED_M]
+    turned = m.yaw.off(0.0, _TURNED_RAD)
+    if place or turned:
+        moved = T.copy()
+        c, s = math.cos(m.yaw.value), math.sin(m.yaw.value)
+        if turned:
+            moved[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ T[:3, :3]
+        for k, figure in place:
+            moved[k, 3] = figure.value
+        optical = found.config.recording.sightings_axes == "optical"
+        what = []
+        if turned:
+            what.append(f"looks {math.degrees(m.yaw.value):+.1f} ± {math.degrees(m.yaw.sigma):.1f}° further left")
+        what += [
+            f"sits {figure.value - T[k, 3]:+.2f} ± {figure.sigma:.2f} m further {'ahead' if k == 0 else 'left'}"
+            for k, figure in place
+        ]
+        found.add(
+            "sightings.mounting",
+            f"The sensor of the landmarks {' and '.join(what)} than configured, by the wheels' motion",
+            {"recording.sightings_pose": [round(v, 4) + 0.0 for v in sensor_pose(moved, optical)]},
+            m.yaw if turned else place[0][1],
+            Severity.ERROR,
+        )
+    if not (scaled or place or turned):
+        found.compared.append(
+            f"landmarks and wheels agree: scale {m.scale.value:.3f} ± {m.scale.sigma:.3f}, the sensor looks "
+            f"{math.degrees(m.yaw.value):+.1f} ± {math.degrees(m.yaw.sigma):.1f}° to the left"
+        )
+    return m
+
+
+def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmark_map: LandmarkMap | None) -> None:
+    """Which of wheels, ranges and map has the wrong scale; two against one decide, of two either may be wrong."""
+    by_wheels, section = m.scale, found.config.landmarks  # true over reported range, in the wheels' metres
+    if landmark_map is not None and len(landmark_map) > 2:
+        places = {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
+        fit = fit_map(path, seen, m, places)
+        if fit is not None and fit.misfit < 0.5:
+            if fit.shift:
+                found.add("map.ids", f"The map's ids are {fit.shift:+d} against those seen", {}, None, Severity.ERROR)
+            if fit.mirrored:
+                text = "The map is a mirror image of what is seen: change the sign of all its y"
+                found.add("map.mirrored", text, {}, None, Severity.ERROR)
+            on_map = fit.scale  # distances on the map over those in the wheels' metres
+            ranges = Figure(by_wheels.value * on_map.value, by_wheels.value * on_map.sigma)  # map over reported range
+            if on_map.off(1.0, _SCALE):
+                _three(found, by_wheels, on_map, ranges)
+                return
+            if not by_wheels.off(1.0, _SCALE):
+                return
+    if not by_wheels.off(1.0, _SCALE):
+        return
+    value = by_wheels.value * section.range_scale
+    unit = unit_of(by_wheels.value)
+    named = f" (they are in {unit[1]})" if unit is not None else ""
+    rival = (
+        "" if abs(math.log(by_wheels.value)) > 0.15 else f"; or the wheels' are {by_wheels.value:.3f} times too long"
+    )
+    found.add(
+        "sightings.scale",
+        f"Distances of landmarks are {1.0 / by_wheels.value:.4g} ± {by_wheels.sigma / by_wheels.value**2:.2g} times "
+        f"those of the wheels' motion{named}{rival}",
+        {"landmarks.range_scale": round(value if unit is None else unit[0] * section.range_scale, 5)},
+        by_wheels,
+        Severity.ERROR,
+    )
+
+
+def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:
+    """Name the one of map, ranges and wheels that the other two contradict."""
+    unit = unit_of(1.0 / on_map.value)
+    if not by_wheels.off(1.0, _SCALE):
+        factor = 1.0 / on_map.value if unit is None else unit[0]
+        named = f" (it is in {unit[1]})" if unit is not None else ""
+        found.add(
+            "map.unit",
+            f"Distances on the map are {on_map.value:.4g} ± {on_map.sigma:.2g} times those that wheels and sightings "
+            f"agree on{named}",
+            {"map.scale": round(found.config.map.scale * factor, 6)},
+            Figure(1.0 / on_map.value, on_map.sigma / on_map.value**2),
+            Severity.ERROR,
+        )
+    elif not ranges.off(1.0, _SCALE):
+        found.add(
+            "wheels.scale",
+            f"Distances by the wheels are {1.0 / on_map.value:.4g} times those that map and sightings agree on",
+            {"wheels.scale_v": round(found.config.wheels.scale_v * on_map.value, 5)},
+            on_map,
+            Severity.ERROR,
+        )
+    else:
+        found.add(
+            "scales",
+            f"Map, sightings and wheels have three scales: sightings {1.0 / by_wheels.value:.3f} and map "
+            f"{on_map.value:.3f} times the wheels'",
+            {},
+            on_map,
+            Severity.ERROR,
+        )
+
+
+# --- clocks -----------------------------------------------------------------------------------------------------------
+
+
+def _clocks(found: Conventions, signals: Signals, gyro: RateFit | None, sensor: Mounting | None) -> None:
+    """Whose stamps are late, by the lags of gyro and landmarks against the wheels."""
+    late: dict[str, Figure] = {}
+    if gyro is not None and gyro.share > _TELLS:
+        late["imu"] = gyro.late_s
+    if sensor is not None and sensor.late_s.sigma < _LATE_S:
+        late["sightings"] = sensor.late_s
+    off = {role: lag for role, lag in late.items() if lag.off(0.0, _LATE_S)}
+    if not off:
+        found.compared += [f"{role}: {lag.value:+.3f} ± {lag.sigma:.3f} s late" for role, lag in late.items()]
+        return
+    wheels = "joints" if found.config.wheels.track is not None and "joints" in signals.delays else "odometry"
+    if wheels not in signals.delays:
+        return  # commands: a robot follows them late, which is no clock's fault
+    same = len(off) == 2 and abs(np.diff([lag.value for lag in off.values()])[0]) < 0.5 * _LATE_S + 3.0 * max(
+        lag.sigma for lag in off.values()
+    )
+    if same or (len(late) == 1 and "imu" in off and _unpunctual(signals, wheels, "imu")):
+        lag = next(iter(off.values()))
+        _late(found, wheels, Figure(-lag.value, lag.sigma), " and ".join(off), len(late) == 1)
+        return
+    for role, lag in off.items():
+        others = [wheels, *(other for other in late if other not in off)]
+        _late(found, role, lag, " and ".join(others), len(others) == 1)
+
+
+def _unpunctual(signals: Signals, role: str, other: str) -> bool:
+    """Whether the first of two roles has the odder delay between stamp and receipt."""
+    delays = [abs(float(np.median(signals.delays[r]))) if signals.delays.get(r) else 0.0 for r in (role, other)]
+    return delays[0] > delays[1] + _LATE_S
+
+
+def _late(found: Conventions, role: str, lag: Figure, against: str, either: bool) -> None:
+    given = {str(r): offset for r, offset in found.config.recording.stamp_offset_s.items()}.get(role, 0.0)
+    doubt = " (either clock may be wrong: only the difference matters)" if either else ""
+    found.add(
+        f"clock.{role}",
+        f"The stamps of {role} are {abs(lag.value):.3f} ± {lag.sigma:.3f} s {'late' if lag.value > 0 else 'early'} "
+        f"against {against}{doubt}",
+        {"recording.stamp_offset_s": {role: round(given - lag.value, 3)}},
+        lag,
+        Severity.ERROR,
+    )
+
+
+# --- the truth --------------------------------------------------------------------------------------------------------
+
+
+def _truth(found: Conventions, signals: Signals, path: Path) -> None:
+    """Axes, unit, lag and mounting of a truth; only evaluation reads it, so that poses stay right."""
+    poses = signals.true_poses()
+    if poses is None or path.length_m < 0.3:
+        return
+    section = found.config.truth
+    own = poses.copy()
+    own[:, 1:3] *= section.scale
+    if section.axes == "ned":
+        own[:, 1:] = np.column_stack([own[:, 2], own[:, 1], 0.5 * math.pi - own[:, 3]])
+    x, y, turned = se2.inverse((*section.offset_m, section.yaw_offset_rad)).tolist()
+    c, s = np.cos(own[:, 3]), np.sin(own[:, 3])
+    own[:, 1:] += np.column_stack([c * x - s * y, s * x + c * y, np.full(len(own), turned)])
+    if float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
+        found.add("truth.no_yaw", "The truth has no yaw: only positions are compared", {}, None, Severity.NOTE)
+        return
+    fit = fit_body(path, own)
+    if fit is None or fit.misfit > 0.25:
+        return
+    for code, text, lines, figure in _truth_lines(found, fit):
+        found.add(code, text, lines, figure, Severity.WARNING)
+
+
+def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, dict[str, Any], Figure | None]]:
+    section = found.config.truth
+    if fit.mirrored:
+        other = "enu" if section.axes == "ned" else "ned"
+        text = "The truth is a mirror image of the wheels' path: its axes are north, east, down"
+        yield "truth.axes", text, {"truth.axes": other}, None
+    elif fit.share > 0.5 and fit.turns.value < -0.5:
+        yield "truth.yaw_sign", "The truth's yaw counts clockwise although its positions do not", {}, fit.turns
+        return
+    if fit.scale.off(1.0, 0.08):
+        unit = unit_of(1.0 / fit.scale.value)
+        factor = 1.0 / fit.scale.value if unit is None else unit[0]
+        named = f" (it is in {unit[1]})" if unit is not None else ""
+        yield (
+            "truth.scale",
+            f"Distances of the truth are {fit.scale.value:.4g} ± {fit.scale.sigma:.2g} times the wheels'{named}",
+            {"truth.scale": round(section.scale * factor, 6)},
+            fit.scale,
+        )
+    if fit.late_s.off(0.0, _LATE_S) and fit.share > _TELLS:
+        given = {str(r): o for r, o in found.config.recording.stamp_offset_s.items()}.get("truth", 0.0)
+        side = "late" if fit.late_s.value > 0 else "early"
+        yield (
+            "clock.truth",
+            f"The truth's stamps are {abs(fit.late_s.value):.3f} ± {fit.late_s.sigma:.3f} s {side} against the wheels'",
+            {"recording.stamp_offset_s": {"truth": round(given - fit.late_s.value, 3)}},
+            fit.late_s,
+        )
+    if fit.share < 0.3:
+        return
+    place = [fit.x.value, fit.y.value]
+    off_place = [f.off(0.0, 0.03) and f.sigma < 0.05 for f in (fit.x, fit.y)]
+    turned = fit.yaw.off(0.0, 0.04)
+    if not turned and not any(off_place):
+        return
+    kept = [v if off else 0.0 for v, off in zip(place, off_place, strict=True)]
+    T_base_body = se2.compose((*kept, fit.yaw.value if turned else 0.0), (*section.offset_m, section.yaw_offset_rad))
+    lines: dict[str, Any] = {}
+    what = []
+    if turned:
+        lines["truth.yaw_offset_rad"] = round(float(T_base_body[2]), 4)
+        what.append(f"is turned by {math.degrees(fit.yaw.value):+.1f} ± {math.degrees(fit.yaw.sigma):.1f}°")
+    if any(off_place):
+        what.append(f"sits at {place[0]:+.2f}, {place[1]:+.2f} m")
+    if any(off_place) or section.offset_m != (0.0, 0.0):
+        lines["truth.offset_m"] = [round(v, 3) + 0.0 for v in T_base_body[:2].tolist()]
+    text = f"The body that the truth tracks {' and '.join(what)} in the robot's axes"
+    yield "truth.mounting", text, lines, fit.yaw
+
+
+__all__ = ["Conventions", "conventions", "unit_of", "with_line"]

@@ -1,0 +1,586 @@
+"""Pairs of signals that tell the same thing, compared without a map and without a pose.
+
+Each comparison is a robust regression that gives sign, axis, scale and lag of one signal against the other, with their
+uncertainty from a jackknife over blocks of time: neighbouring errors are alike, so that the residuals of single messages
+would promise too much.
+
+Sources: Huber and Ronchetti, Robust Statistics, 2nd edition, 7.8 (iteratively reweighted least squares); Efron and
+Tibshirani, An Introduction to the Bootstrap, chapter 11 (jackknife); Umeyama 1991 (similarity of point sets).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from fgloc.diagnosis.signals import Path, Sightings
+from fgloc.types import FloatArray, IntArray
+
+ComplexArray = NDArray[np.complex128]
+
+MOST_LAG_S = 1.5  # a clock that is further off shows in the receive times
+_LAG_STEP_S = 0.05
+_PAIR_S = (0.4, 6.0)  # between two sightings of one landmark: the wheels err little over seconds
+_MOST_PAIRS = 4000
+_BLOCKS = 8  # of time, of the jackknife
+_TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
+_RATE_HALF_S = 0.15  # yaw rates are means over twice this
+_TURN_HALF_S = 1.0
+_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_CLIPPED = 4.0  # standard deviations beyond which a rate counts as this much: spikes of a driver
+_CAUCHY = 2.385  # tuning constant of 95 % efficiency
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A value with its standard deviation."""
+
+    value: float
+    sigma: float
+
+    def off(self, expected: float, least: float, sigmas: float = 5.0) -> bool:
+        """Whether the value is surely, and by more than ``least``, away from the expected one."""
+        return abs(self.value - expected) > max(least, sigmas * self.sigma)
+
+
+# --- landmarks against the wheels -------------------------------------------------------------------------------------
+
+AXES: dict[str, tuple[tuple[int, int], tuple[int, int]]] = {
+    # forward and left in the sensor's axes, each as (axis, sign); up completes them to a right-handed frame
+    "body": ((0, 1), (1, 1)),
+    "optical": ((2, 1), (0, -1)),
+    "body, upside down": ((0, 1), (1, -1)),
+    "optical, upside down": ((2, 1), (0, 1)),
+    "x up": ((2, 1), (1, -1)),  # an optical frame turned by a quarter about its axis
+    "x down": ((2, 1), (1, 1)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """How a sensor of landmarks is mounted and reports, by the wheels' motion alone.
+
+    Attributes:
+        axes: name in `AXES`.
+        scale: true over reported distance, in the wheels' unit of length.
+        yaw: of the sensor's forward axis in the base frame [rad].
+        x: place of the sensor in the base frame [m].
+        y: likewise.
+        late_s: how much later the sensor's stamps are than the wheels'.
+        misfit: robust standard deviation of a landmark's place between two sightings [m].
+        pairs: number of pairs of sightings.
+    """
+
+    axes: str
+    scale: Figure
+    yaw: Figure
+    x: Figure
+    y: Figure
+    late_s: Figure
+    misfit: float
+    pairs: int
+
+
+def planar(points: FloatArray, axes: str) -> ComplexArray:
+    """Points ``(n, 3)`` in the plane of the base: forward + i left, ``(n,)``, for a sensor that looks ahead."""
+    (i, a), (j, b) = AXES[axes]
+    return np.asarray(a * points[:, i] + 1j * b * points[:, j])
+
+
+def up_of(points: FloatArray, axes: str) -> FloatArray:
+    """Coordinate ``(n,)`` of points ``(n, 3)`` along the sensor's upward axis."""
+    (i, a), (j, b) = AXES[axes]
+    forward, left = np.zeros(3), np.zeros(3)
+    forward[i], left[j] = a, b
+    return np.asarray(points @ np.cross(forward, left))
+
+
+def _wander(heights: FloatArray, tracks: IntArray) -> float:
+    """Robust standard deviation of heights within a track [m]: on a flat floor a landmark keeps its height."""
+    _, number = np.unique(tracks, return_inverse=True)
+    mean = np.bincount(number, heights) / np.bincount(number)
+    return _MAD * float(np.median(np.abs(heights - mean[number])))
+
+
+def fit_sightings(path: Path, seen: Sightings) -> dict[str, Mounting]:
+    """Mounting for each hypothesis of the sensor's axes that the sightings determine, by name.
+
+    Args:
+        path: motion of the wheels.
+        seen: landmarks in the sensor's axes.
+    """
+    first, last = _pairs(seen, path)
+    if len(first) < 60:
+        return {}
+    names = list(AXES) if seen.spatial else ["body", "body, upside down"]
+    lags = np.arange(-MOST_LAG_S, MOST_LAG_S + 1e-9, _LAG_STEP_S)
+    found = {}
+    for name in names:
+        z = planar(seen.points, name)
+        fits = [_similarity(path, seen.times, z, first, last, float(lag)) for lag in lags]
+        best = min(range(len(fits)), key=lambda k: fits[k][2])
+        alpha, beta, misfit = fits[best]
+        if np.isfinite(misfit):
+            found[name] = (misfit, float(lags[best]), alpha, beta, z)
+    least = min((f[0] for f in found.values()), default=math.inf)
+    return {
+        name: _refined(path, seen, name, z, late, alpha, beta, len(first))
+        for name, (misfit, late, alpha, beta, z) in found.items()
+        if misfit < 5.0 * least or name == "body"
+    }
+
+
+def _pairs(seen: Sightings, path: Path) -> tuple[IntArray, IntArray]:
+    """Indices of pairs of sightings of one landmark between which the wheels' motion is known, evenly thinned out."""
+    found: list[NDArray[np.int64]] = []
+    for landmark in np.unique(seen.ids):
+        own = np.flatnonzero(seen.ids == landmark)
+        at = seen.times[own]
+        low, high = np.searchsorted(at, at + _PAIR_S[0]), np.searchsorted(at, at + _PAIR_S[1], side="right")
+        counts = np.maximum(high - low, 0)
+        left = np.repeat(np.arange(len(own)), counts)
+        right = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(low, counts)
+        found.append(np.column_stack([own[left], own[right]]))
+    pairs = np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
+    pairs = pairs[path.known(seen.times[pairs[:, 0]] - MOST_LAG_S, seen.times[pairs[:, 1]] + MOST_LAG_S)]
+    pairs = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _complex_poses(path: Path, times: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    poses = path.at(times)
+    return poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])
+
+
+def _similarity(
+    path: Path, times: FloatArray, z: ComplexArray, first: IntArray, last: IntArray, late: float
+) -> tuple[complex, complex, float]:
+    """Scale and yaw (as one complex number) and place of the sensor for a lag, and the misfit in the sensor's unit.
+
+    A landmark that stands still is at one place: ``p_i + R_i (α z_i + β) = p_j + R_j (α z_j + β)``, which is linear in α
+    and β.
+    """
+    p1, r1 = _complex_poses(path, times[first] - late)
+    p2, r2 = _complex_poses(path, times[last] - late)
+    A = np.column_stack([r1 * z[first] - r2 * z[last], r1 - r2])
+    y = p2 - p1
+    # β is small: a prior of a metre keeps it so where the robot does not turn
+    weights = np.ones(len(y))
+    x = np.zeros(2, dtype=complex)
+    for _ in range(5):
+        H = (A.conj().T * weights) @ A
+        H[1, 1] += 1e-2 * weights.sum() / len(y)
+        x = np.linalg.solve(H + 1e-12 * np.eye(2), (A.conj().T * weights) @ y)
+        residual = np.abs(A @ x - y)
+        scale = _MAD * float(np.median(residual)) + 1e-9
+        weights = 1.0 / (1.0 + (residual / (_CAUCHY * scale)) ** 2)
+    size = abs(x[0])
+    return complex(x[0]), complex(x[1]), math.inf if size < 1e-9 else float(np.median(residual)) / size
+
+
+def _refined(
+    path: Path, seen: Sightings, name: str, z: ComplexArray, late: float, alpha: complex, beta: complex, pairs: int
+) -> Mounting:
+    """Least squares in what the sensor reports, so that its noise does not shorten the scale; sigmas by a jackknife."""
+    keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
+    times, ids, z = seen.times[keep], seen.ids[keep], z[keep]
+    every = max(1, len(z) // 3000)
+    times, ids, z = times[::every], ids[::every], z[::every]
+    tracks = _tracks(times, ids)
+    start = np.array([math.log(abs(alpha)), math.atan2(alpha.imag, alpha.real), beta.real, beta.imag, late])
+    start[2:4] = np.clip(start[2:4], -2.0, 2.0)
+
+    def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float]:
+        part = _Places(path, times[use], z[use], tracks[use])
+        fit = least_squares(part.residuals, x0, loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
+        left = part.residuals(fit.x)
+        return fit.x, part.misfit(fit.x)
+
+    everything = np.ones(len(z), dtype=bool)
+    x, typical = solve(everything, start)
+    blocks = np.minimum(((times - times[0]) / max(times[-1] - times[0], 1e-9) * _BLOCKS).astype(int), _BLOCKS - 1)
+    left_out = [solve(blocks != b, x)[0] for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(blocks)]
+    sigmas = jackknife(np.array(left_out)) if len(left_out) > 2 else np.full(5, np.inf)
+    scale, yaw, bx, by, late = x.tolist()
+    height = _wander(up_of(seen.points[keep][::every], name), tracks) if seen.spatial else 0.0
+    return Mounting(
+        name,
+        Figure(math.exp(scale), math.exp(scale) * float(sigmas[0])),
+        Figure(math.remainder(yaw, math.tau), float(sigmas[1])),
+        Figure(bx, float(sigmas[2])),
+        Figure(by, float(sigmas[3])),
+        Figure(late, float(sigmas[4])),
+        math.hypot(typical, height),
+        pairs,
+    )
+
+
+def jackknife(left_out: FloatArray) -> FloatArray:
+    """Standard deviations ``(p,)`` of estimates, from those ``(b, p)`` with one block of data left out."""
+    b = len(left_out)
+    return np.asarray(np.sqrt((b - 1) / b * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)))
+
+
+def _tracks(times: FloatArray, ids: IntArray) -> IntArray:
+    """Number of the track of each sighting: one landmark over some seconds."""
+    out = np.zeros(len(times), dtype=np.int64)
+    begun: dict[int, tuple[float, int]] = {}
+    count = 0
+    for k, (at, landmark) in enumerate(zip(times.tolist(), ids.tolist(), strict=True)):
+        start, number = begun.get(landmark, (-math.inf, -1))
+        if at - start > _TRACK_S:
+            start, number, count = at, count, count + 1
+            begun[landmark] = (start, number)
+        out[k] = number
+    return out
+
+
+class _Places:
+    """Residuals of sightings against the mean place of their track."""
+
+    SIGMA = 0.03  # of a range over its length, and of a bearing [rad]
+    PLACE_M = 0.3  # prior of the sensor's place: it sits on the robot
+
+    def __init__(self, path: Path, times: FloatArray, z: ComplexArray, tracks: IntArray) -> None:
+        _, self._tracks = np.unique(tracks, return_inverse=True)
+        self._path, self._times, self._z = path, times, z
+        self._counts = np.bincount(self._tracks)
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """``(2 n + 2,)``: along and across the line of sight, over the range, in units of `SIGMA`; and the prior."""
+        scale, yaw, bx, by, late = x.tolist()
+        alpha, beta = math.exp(min(scale, 50.0)) * np.exp(1j * yaw), complex(bx, by)
+        p, r = _complex_poses(self._path, self._times - late)
+        q = p + r * (alpha * self._z + beta)
+        real, imaginary = (np.bincount(self._tracks, part) / self._counts for part in (q.real, q.imag))
+        place = (real + 1j * imaginary)[self._tracks]
+        # in the sensor: what would be seen of that place, over what was seen; 1 if they agree
+        ratio = ((place - p) / r - beta) / (alpha * self._z)
+        off = (ratio - 1.0) / self.SIGMA
+        off = np.where(np.isfinite(off), off, 1e3)
+        return np.concatenate([off.real, off.imag, [bx / self.PLACE_M, by / self.PLACE_M]])
+
+    def misfit(self, x: FloatArray) -> float:
+        """Robust standard deviation of a landmark's place in the sensor's plane [m]."""
+        n = len(self._z)
+        off = self.residuals(x)[: 2 * n] * self.SIGMA
+        return _MAD * float(np.median(np.hypot(off[:n], off[n:]) * np.abs(self._z)))
+
+
+# --- rates ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RateFit:
+    """A rate that follows another: ``reference(t) = scale · rate(t + late) + offset``.
+
+    ``share``: of the reference's robust variance that is explained; near 1 for two that tell the same.
+    """
+
+    scale: Figure
+    late_s: Figure
+    share: float
+
+
+def fit_rate(path: Path, times: FloatArray, integral: FloatArray, longest_s: float = MOST_LAG_S) -> RateFit | None:
+    """Scale and lag of a turn against the wheels' turn.
+
+    Args:
+        path: motion of the wheels.
+        times: ``(n,)`` [s].
+        integral: ``(n,)`` of the rate over time [rad], in whatever unit and sign it is reported.
+        longest_s: lags up to this are tried.
+
+    Returns:
+        None where the wheels do not turn, or the two share too little time.
+    """
+    at = np.arange(
+        max(path.times[0], times[0]) + longest_s + 0.3, min(path.times[-1], times[-1]) - longest_s - 0.3, 0.1
+    )
+    at = at[path.known(at - 0.3, at + 0.3)]
+    if len(at) < 50:
+        return None
+    reference = path.yaw_rate(at, _RATE_HALF_S)
+    if float(np.sqrt(np.mean(reference**2))) < 0.03:
+        return None
+
+    def rate(late: float, half_s: float = _RATE_HALF_S) -> FloatArray:
+        later = np.interp(at + late + half_s, times, integral)
+        return np.asarray((later - np.interp(at + late - half_s, times, integral)) / (2.0 * half_s))
+
+    late, share = best_lag(lambda tau: _explained(reference, rate(tau))[1], longest_s)
+    turned = path.yaw_rate(at, _TURN_HALF_S)  # over longer: a driver's filter takes from short turns
+    scale = _explained(turned, rate(late, _TURN_HALF_S))[0]
+    parts = np.array_split(np.arange(len(at)), _BLOCKS)
+    left_out = []
+    for part in parts:
+        use = np.ones(len(at), dtype=bool)
+        use[part] = False
+        near = np.arange(late - 0.1, late + 0.1001, 0.02)
+        shares = [_explained(reference[use], rate(float(tau))[use])[1] for tau in near]
+        at_best = _vertex(near, np.array(shares))
+        left_out.append((_explained(turned[use], rate(at_best, _TURN_HALF_S)[use])[0], at_best))
+    sigmas = jackknife(np.array(left_out))
+    return RateFit(Figure(scale, float(sigmas[0])), Figure(late, float(sigmas[1]) + 0.002), share)
+
+
+def best_lag(share: Callable[[float], float], longest_s: float) -> tuple[float, float]:
+    """Lag [s] at which two signals share most, and that share."""
+    coarse = np.arange(-longest_s, longest_s + 1e-9, 0.05)
+    shares = np.array([share(float(tau)) for tau in coarse])
+    near = coarse[int(np.argmax(shares))] + np.arange(-0.06, 0.0601, 0.01)
+    fine = np.array([share(float(tau)) for tau in near])
+    return _vertex(near, fine), float(fine.max())
+
+
+def _vertex(x: FloatArray, y: FloatArray) -> float:
+    """Place of the maximum of equally spaced values, by the parabola through the three highest neighbours."""
+    k = int(np.argmax(y))
+    if k in (0, len(x) - 1):
+        return float(x[k])
+    a, b, c = y[k - 1 : k + 2].tolist()
+    bend = a - 2.0 * b + c
+    return float(x[k] + (0.5 * (a - c) / bend if bend < 0.0 else 0.0) * (x[1] - x[0]))
+
+
+def _explained(y: FloatArray, x: FloatArray) -> tuple[float, float]:
+    """Slope of y by x with an offset, robust, and the share of y's variance that it explains, of the inliers."""
+    weights = np.ones(len(y))
+    slope = offset = 0.0
+    typical = float(np.sqrt(np.mean(np.minimum(np.abs(y - np.median(y)), _CLIPPED * np.std(y)) ** 2)))
+    if not np.any(np.abs(x) > 1e-12):
+        return 0.0, 0.0
+    for _ in range(6):
+        total = weights.sum()
+        mx, my = float(weights @ x) / total, float(weights @ y) / total
+        varied = float(weights @ (x - mx) ** 2)
+        if varied <= 0.0:
+            return 0.0, 0.0
+        slope = float(weights @ ((x - mx) * (y - my))) / varied
+        offset = my - slope * mx
+        residual = y - slope * x - offset
+        # a robot that mostly stands makes the median a lie: what it does while it turns must count
+        spread = max(_MAD * float(np.median(np.abs(residual))), 0.2 * typical) + 1e-9
+        weights = 1.0 / (1.0 + (residual / (_CAUCHY * spread)) ** 2)
+    capped = np.minimum(np.abs(residual), _CLIPPED * typical)
+    return slope, 1.0 - float(np.mean(capped**2)) / max(typical**2, 1e-12)
+
+
+# --- poses against the wheels -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class BodyFit:
+    """A body whose poses are known from elsewhere, on a robot whose wheels are known.
+
+    Attributes:
+        mirrored: whether its positions are a mirror image (x and y exchanged, or one of them negated).
+        turns: its turn over the robot's: 1, or -1 if its yaw counts the other way.
+        scale: its distances over the robot's.
+        yaw: of its axes in the base frame [rad].
+        x: of its origin in the base frame [m].
+        y: likewise.
+        late_s: how much later its stamps are than the wheels'.
+        misfit: robust standard deviation of a displacement [m].
+        share: of the turn's variance that is explained.
+    """
+
+    mirrored: bool
+    turns: Figure
+    scale: Figure
+    yaw: Figure
+    x: Figure
+    y: Figure
+    late_s: Figure
+    misfit: float
+    share: float
+
+
+def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | None:
+    """Where a body sits whose poses are given, and by what they are off, from its displacements and the wheels'.
+
+    Args:
+        path: motion of the wheels.
+        poses: rows of time, x, y and continuous yaw.
+        window_s: over which displacements are compared.
+
+    Returns:
+        None where the two share too little time, or the robot does not move.
+    """
+    times, yaw = poses[:, 0], poses[:, 3]
+    rate = fit_rate(path, times, yaw)
+    late = 0.0 if rate is None or rate.share < 0.5 else rate.late_s.value
+    start = np.arange(path.times[0], path.times[-1] - window_s, 0.2)
+    start = start[path.known(start, start + window_s)]
+    start = start[_covered(times, start + late) & _covered(times, start + window_s + late)]
+    if len(start) < 40:
+        return None
+    speeds = _speed_lag(path, poses, start, window_s)
+    if rate is None or rate.share < 0.5:
+        late = speeds
+    fits = {m: _body(path, poses, start, window_s, late, m) for m in (False, True)}
+    mirrored = fits[True][1] < 0.5 * fits[False][1]
+    (alpha, lever, turns), misfit, travelled = fits[mirrored]
+    if travelled < 0.1:
+        return None
+    blocks = np.array_split(np.arange(len(start)), _BLOCKS)
+    left_out = []
+    for block in blocks:
+        x = _body(path, poses, np.delete(start, block), window_s, late, mirrored)[0]
+        turned = math.remainder(np.angle(x[0]) - np.angle(alpha), math.tau)
+        left_out.append((x[2], abs(x[0]), turned, x[1].real, x[1].imag))
+    s = jackknife(np.array(left_out)).tolist()
+    lag = Figure(late, rate.late_s.sigma if rate is not None and rate.share >= 0.5 else 0.05)
+    return BodyFit(
+        mirrored,
+        Figure(turns, s[0]),
+        Figure(abs(alpha), s[1]),
+        Figure(float(np.angle(alpha)), s[2]),
+        Figure(lever.real, s[3]),
+        Figure(lever.imag, s[4]),
+        lag,
+        misfit,
+        0.0 if rate is None else rate.share,
+    )
+
+
+def _covered(times: FloatArray, at: FloatArray, longest_s: float = 0.25) -> NDArray[np.bool_]:
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    return np.asarray((times[after] - times[after - 1] < longest_s) & (at >= times[0]) & (at <= times[-1]))
+
+
+def _at(poses: FloatArray, at: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    x, y, yaw = (np.interp(at, poses[:, 0], poses[:, k]) for k in (1, 2, 3))
+    return x + 1j * y, np.asarray(yaw)
+
+
+def _speed_lag(path: Path, poses: FloatArray, start: FloatArray, window_s: float) -> float:
+    """Lag by the distances, for a body whose yaw tells nothing."""
+    way = np.abs(np.diff([np.interp(start + d, path.times, _length(path.poses[:, :2])) for d in (0.0, 0.4)], axis=0)[0])
+
+    def share(tau: float) -> float:
+        moved = np.abs(_at(poses, start + tau + 0.4)[0] - _at(poses, start + tau)[0])
+        return _explained(way, np.asarray(moved))[1]
+
+    return best_lag(share, MOST_LAG_S)[0]
+
+
+def _length(places: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+
+
+def _body(
+    path: Path, poses: FloatArray, start: FloatArray, window_s: float, late: float, mirrored: bool
+) -> tuple[tuple[complex, complex, float], float, float]:
+    """Least squares of displacements: of the body in its axes, by those of the base and by the lever arm.
+
+    With the body at l in the base, turned by δ: ``e^{iδ} s d_body = d_base + (e^{iφ} - 1) l``.
+    """
+    p1, r1 = _complex_poses(path, start)
+    p2, r2 = _complex_poses(path, start + window_s)
+    base, turn = (p2 - p1) / r1, r2 / r1
+    q1, psi1 = _at(poses, start + late)
+    q2, psi2 = _at(poses, start + window_s + late)
+    own = (q2 - q1) * np.exp(-1j * psi1)
+    turned = np.asarray(psi2 - psi1)
+    if mirrored:
+        own, turned = own.conj(), -turned
+    phi = np.asarray(np.unwrap(np.angle(turn))) if len(turn) else np.zeros(0)
+    phi = np.interp(start + window_s, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
+    turns = _explained(turned, phi)[0] if float(np.std(phi)) > 0.05 else 1.0
+    A = np.column_stack([own, -(turn - 1.0)])
+    weights = np.ones(len(start))
+    x = np.zeros(2, dtype=complex)
+    for _ in range(6):
+        H = (A.conj().T * weights) @ A
+        H[1, 1] += 1e-2
+        x = np.linalg.solve(H + 1e-9 * np.eye(2), (A.conj().T * weights) @ base)
+        residual = np.abs(A @ x - base)
+        spread = _MAD * float(np.median(residual)) + 1e-6
+        weights = 1.0 / (1.0 + (residual / (_CAUCHY * spread)) ** 2)
+    size = abs(x[0])
+    relative = complex(x[0]) / size**2 if size > 1e-9 else 1e9 + 0j  # e^{iδ} over s: its distances over the robot's
+    return (complex(relative), complex(x[1]), turns), float(np.median(residual)), float(np.median(np.abs(base)))
+
+
+# --- landmarks against the map ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MapFit:
+    """Map against the places of landmarks by wheels and sightings.
+
+    Attributes:
+        scale: distances on the map over those seen, in the wheels' unit.
+        mirrored: whether the map is a mirror image.
+        shift: by how much the ids of the map are higher than those seen; 0 if they agree.
+        misfit: robust residual over the spread of the landmarks: small if the map fits.
+        windows: number of stretches with three or more landmarks.
+    """
+
+    scale: Figure
+    mirrored: bool
+    shift: int
+    misfit: float
+    windows: int
+
+
+def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]) -> MapFit | None:
+    """Similarity between the map and the places of landmarks within short stretches; None: they do not tell.
+
+    Args:
+        path: motion of the wheels.
+        seen: sightings.
+        mounting: how they are reported.
+        places: ``(2,)`` on the map [m], by id.
+    """
+    z = planar(seen.points, mounting.axes)
+    alpha = mounting.scale.value * np.exp(1j * mounting.yaw.value)
+    p, r = _complex_poses(path, seen.times - mounting.late_s.value)
+    q = p + r * (alpha * z + complex(mounting.x.value, mounting.y.value))
+    windows: list[dict[int, complex]] = []
+    for start in np.arange(seen.times[0], seen.times[-1], 5.0):
+        use = (seen.times >= start) & (seen.times < start + 8.0) & np.isfinite(q)
+        if use.any() and path.known(np.array([start + 0.0]), np.array([min(start + 8.0, path.times[-1])]))[0]:
+            ids, places_seen = seen.ids[use], q[use]
+            of_each = {int(i): places_seen[ids == i] for i in np.unique(ids)}
+            windows.append({i: complex(np.median(own.real), np.median(own.imag)) for i, own in of_each.items()})
+    shifts = (0, 1, -1)
+    best: tuple[float, bool, int, list[float]] | None = None
+    for shift in shifts:
+        for mirrored in (False, True):
+            misfits, scales = [], []
+            for window in windows:
+                common = [i for i in window if i + shift in places]
+                if len(common) < 3:
+                    continue
+                a = np.array([window[i] for i in common])
+                b = np.array([complex(*places[i + shift]) for i in common])
+                fitted = _point_similarity(a, b.conj() if mirrored else b)
+                if fitted is not None:
+                    scales.append(fitted[0])
+                    misfits.append(fitted[1])
+            if len(misfits) >= 3:
+                typical = float(np.median(misfits))
+                if best is None or typical < 0.5 * best[0]:
+                    best = (typical, mirrored, shift, scales)
+    if best is None:
+        return None
+    misfit, mirrored, shift, scales = best
+    spread = _MAD * float(np.median(np.abs(np.array(scales) - np.median(scales)))) / math.sqrt(len(scales))
+    return MapFit(Figure(float(np.median(scales)), 1.5 * spread + 1e-3), mirrored, shift, misfit, len(scales))
+
+
+def _point_similarity(a: ComplexArray, b: ComplexArray) -> tuple[float, float] | None:
+    """Scale that takes points a to b, and the residual over the spread; None where they are nearly one point."""
+    a, b = a - a.mean(), b - b.mean()
+    size_a, size_b = float(np.sum(np.abs(a) ** 2)), float(np.sum(np.abs(b) ** 2))
+    if size_a < 1e-9 or size_b < 1e-12:
+        return None
+    s = np.vdot(a, b) / size_a
+    return math.sqrt(size_b / size_a), math.sqrt(float(np.sum(np.abs(b - s * a) ** 2)) / size_b)

@@ -1,0 +1,229 @@
+"""Signals of a recording that tell the same thing in different ways: collected once, for `fgloc.diagnosis.conventions`.
+
+A prefix of the recording is read: all but the images, in bounded memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config, Role
+from fgloc.frames import quaternion_yaw
+from fgloc.intake.validation import EventValidator
+from fgloc.recording.reader import Recording
+from fgloc.sensors import registry
+from fgloc.types import (
+    Event,
+    FloatArray,
+    InertialEvent,
+    IntArray,
+    MotionEvent,
+    SightingsEvent,
+    Step,
+    TruthEvent,
+    by_class,
+)
+
+LONGEST_S = 600.0  # of a recording is looked at: enough for any convention, and bounded
+GRID_S = 0.05  # of the wheels' path
+_SILENT_S = 0.6  # without a message of the wheels their motion is not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Landmarks in the sensor's axes: ``times (n,)`` [s], ``ids (n,)``, ``points (n, 3)`` [m].
+
+    ``spatial``: whether a point has three measured coordinates; otherwise it lies in the sensor's plane.
+    """
+
+    times: FloatArray
+    ids: IntArray
+    points: FloatArray
+    spatial: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """Motion of the base by its odometry: ``times (n,)`` [s], ``poses (n, 3)`` with a continuous yaw.
+
+    ``gaps`` ``(n,)`` counts the silences before each time: motion between times with different counts is not known.
+    """
+
+    times: FloatArray
+    poses: FloatArray
+    gaps: IntArray
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Poses ``(m, 3)`` at some times; NaN outside the path."""
+        out = np.column_stack([np.interp(times, self.times, column) for column in self.poses.T])
+        out[(times < self.times[0]) | (times > self.times[-1])] = np.nan
+        return out
+
+    def known(self, first: FloatArray, last: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Whether the motion between two times is known."""
+        inside = (first >= self.times[0]) & (last <= self.times[-1])
+        a = self.gaps[np.clip(np.searchsorted(self.times, first), 0, len(self.times) - 1)]
+        b = self.gaps[np.clip(np.searchsorted(self.times, last), 0, len(self.times) - 1)]
+        return np.asarray(inside & (a == b))
+
+    def yaw_rate(self, times: FloatArray, half_s: float) -> FloatArray:
+        """Mean yaw rate [rad/s] over ``half_s`` before and after each time."""
+        yaw = np.interp(times + half_s, self.times, self.poses[:, 2])
+        return np.asarray((yaw - np.interp(times - half_s, self.times, self.poses[:, 2])) / (2.0 * half_s))
+
+    @property
+    def length_m(self) -> float:
+        """Distance travelled."""
+        return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
+
+
+@dataclass(eq=False)
+class Signals:
+    """What was collected. Times are seconds from ``origin_ns``.
+
+    Attributes:
+        motion: events of the wheels and commands that passed the gate, in order of receipt.
+        imu: rows of time, rates ``(3,)`` and specific forces ``(3,)``.
+        truth: rows of time, position ``(3,)`` and quaternion ``(4,)``.
+        seen: rows of time, landmark and point ``(3,)``.
+        spatial: whether the points of ``seen`` have three measured coordinates.
+        widest: largest absolute bearing that was reported [rad]; 0 without bearings.
+        odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
+        delays: received minus stamped [s], by role.
+    """
+
+    origin_ns: int = 0
+    motion: list[MotionEvent] = field(default_factory=list)
+    imu: list[tuple[float, ...]] = field(default_factory=list)
+    truth: list[tuple[float, ...]] = field(default_factory=list)
+    seen: list[tuple[float, ...]] = field(default_factory=list)
+    odometry: list[tuple[float, ...]] = field(default_factory=list)
+    spatial: bool = False
+    widest: float = 0.0
+    delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+    def sightings(self) -> Sightings | None:
+        """Sightings in order of time; None: there are none."""
+        if not self.seen:
+            return None
+        rows = np.array(sorted(self.seen), dtype=float)
+        return Sightings(rows[:, 0], rows[:, 1].astype(np.int64), rows[:, 2:5], self.spatial)
+
+    def path(self, config: Config) -> Path | None:
+        """Motion by the wheels as configured; None: they have too few messages."""
+        wheels = registry.odometer().build(config)
+        events = sorted(self.motion, key=lambda e: e.stamp_ns)
+        moving = [e for e in events if not isinstance(e, InertialEvent)]
+        if len(moving) < 10:
+            return None
+        stamps = np.array([e.stamp_ns for e in moving], dtype=np.int64)
+        grid = np.arange(stamps[0], stamps[-1] + 1, round(GRID_S * 1e9))
+        ends = np.searchsorted(stamps, grid, side="right")
+        silence = np.diff(stamps, append=stamps[-1]) * 1e-9
+        poses, gaps, gap = [np.zeros(3)], [0], 0
+        yaw = 0.0
+        for k in range(1, len(grid)):
+            step = Step(k, 0, int(grid[k - 1]), int(grid[k]), by_class(moving[max(ends[k - 1] - 1, 0) : ends[k] + 1]))
+            measured = wheels.measure(step)
+            motion = np.zeros(3) if measured is None else measured.motion
+            last = max(int(ends[k]) - 1, 0)
+            if measured is None or silence[last] > _SILENT_S:
+                gap += 1
+            pose = se2.compose(poses[-1], motion)
+            yaw += float(motion[2])
+            poses.append(np.array([pose[0], pose[1], yaw]))
+            gaps.append(gap)
+        if not wheels.source:
+            return None
+        return Path((grid - self.origin_ns) * 1e-9, np.array(poses), np.array(gaps, dtype=np.int64))
+
+    def rates(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Times ``(n,)``, rates and forces ``(n, 3)`` of the IMU in order of time; None: too few."""
+        if len(self.imu) < 50:
+            return None
+        rows = np.array(self.imu)
+        _, first = np.unique(rows[:, 0], return_index=True)
+        rows = rows[first]
+        return rows[:, 0], rows[:, 1:4], rows[:, 4:7]
+
+    def true_poses(self) -> FloatArray | None:
+        """Rows of time, x, y, continuous yaw of the truth, frozen repetitions left out; None: too few."""
+        if len(self.truth) < 30:
+            return None
+        rows = np.array(self.truth)
+        _, first = np.unique(rows[:, 0], return_index=True)
+        rows = rows[first]
+        rows = rows[np.append(True, np.abs(np.diff(rows[:, 1:], axis=0)).max(axis=1) > 0.0)]
+        if len(rows) < 30:
+            return None
+        yaw = np.unwrap([quaternion_yaw(q) for q in rows[:, 4:8]])
+        return np.column_stack([rows[:, 0], rows[:, 1:3], yaw])
+
+
+class SignalCollector:
+    """Takes signals from the events of a recording, one by one."""
+
+    def __init__(self, config: Config) -> None:
+        """``config`` has the bounds of what is plausible."""
+        self.found = Signals()
+        self._gate = EventValidator(config.gate)
+        self._first_ns: int | None = None
+
+    def add(self, event: Event) -> bool:
+        """Take what is wanted of an event; False: it came after the last that is looked at."""
+        if self._first_ns is None:
+            self._first_ns = self.found.origin_ns = event.received_ns
+        if event.received_ns - self._first_ns > LONGEST_S * 1e9:
+            return False
+        if isinstance(event, MotionEvent) and event.odometer is not None:
+            row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.odometer.pose, *event.odometer.twist)
+            if all(map(math.isfinite, row)):
+                self.found.odometry.append(row)
+        passed = self._gate.check(event)
+        if passed is None:
+            return True
+        at_s = (passed.stamp_ns - self.found.origin_ns) * 1e-9
+        if isinstance(passed, InertialEvent):
+            self.found.imu.append((at_s, *passed.angular_velocity.tolist(), *passed.linear_acceleration.tolist()))
+        elif isinstance(passed, MotionEvent):
+            self.found.motion.append(passed)
+        elif isinstance(passed, TruthEvent):
+            self.found.truth.append((at_s, *passed.position.tolist(), *passed.orientation.tolist()))
+        elif isinstance(passed, SightingsEvent) and not passed.in_pixels:
+            self.found.seen.extend(self._points(passed, at_s))
+        return True
+
+    def _points(self, event: SightingsEvent, at_s: float) -> Iterator[tuple[float, ...]]:
+        for sighting in event.sightings:
+            place = sighting.place()
+            if place is not None:
+                self.found.spatial = True
+                yield (at_s, float(sighting.landmark_id), *place.tolist())
+                continue
+            distance, bearing = sighting.distance(), getattr(sighting, "bearing_rad", None)
+            if distance is not None and bearing is not None:
+                self.found.widest = max(self.found.widest, abs(bearing))
+                x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+                yield (at_s, float(sighting.landmark_id), x, y, 0.0)
+
+
+def read_signals(recording: Recording, config: Config) -> Signals:
+    """Signals of a recording's beginning, without its images."""
+    collector = SignalCollector(config)
+    role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
+    counted = dict(recording.undecodable)
+    for message in recording.messages(role_of.keys()):
+        role = role_of[message[0]]
+        for event in recording.decode(message, role):
+            collector.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
+            if not collector.add(event):
+                recording.undecodable = counted
+                return collector.found
+    recording.undecodable = counted
+    return collector.found
