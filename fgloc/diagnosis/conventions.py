@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -57,11 +57,13 @@ class Conventions:
         findings: with the lines that undo them.
         config: with those lines.
         compared: sentences on the pairs that were compared and agree, for `init`'s comments.
+        opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
     """
 
     config: Config
     findings: list[Finding] = field(default_factory=list)
     compared: list[str] = field(default_factory=list)
+    opposite: bool = False
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
         """Note a finding, and set its lines."""
@@ -98,6 +100,8 @@ def conventions(
         return found
     gyro = _gyro(found, signals, path, imu_up)
     seen = signals.sightings()
+    if found.opposite and _opposite(found, signals, path, seen, T_base_sensor):
+        path = signals.path(found.config) or path
     sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
     _clocks(found, signals, gyro, sensor)
     _truth(found, signals, path)
@@ -170,7 +174,7 @@ def _twist_speed(
     if in_world < 0.3 * misfit and spread < 0.97 and misfit > 0.05 * float(np.mean(np.abs(moved) ** 2)):
         found.add(
             "odometry.twist_frame",
-            "The odometry's twist is in the world's axes: it follows the pose's change there and not in the robot's axes",
+            "The odometry's twist is in the world's axes: there it follows the change of the pose, not in the robot's",
             {"wheels.source": "pose"},
             None,
             grave,
@@ -183,6 +187,7 @@ def _twist_speed(
     if abs(math.log(ratio)) < 0.25 and turned < 0.5:
         return
     unit = unit_of(ratio)
+    lines: dict[str, Any]
     if turned > 2.6 and abs(math.log(ratio)) < 0.25:
         text, lines = "The odometry's twist has the opposite direction of its pose's motion", {"wheels.source": "pose"}
     elif turned > 0.5:
@@ -250,14 +255,18 @@ def _gyro(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray |
         return None
     times, omega, force = rates
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (omega[1:] + omega[:-1]) * np.diff(times)[:, None], 0)])
-    up, given = _unit(imu_up), found.config.gyro.scale
+    given = found.config.gyro.scale
     sign = math.copysign(1.0, given)
-    configured = fit_rate(path, times, turned @ up * given)
+    up = _unit(imu_up) * (sign if imu_up is None else 1.0)  # a mounting has the sign of the scale in it
+    configured = fit_rate(path, times, turned @ up * abs(given))
+    gravity = _gravity_axis(force)
     if configured is not None and configured.share > _TELLS and configured.scale.value > 0.0:
         _gravity(found, force, up * sign)
         return _gyro_scale(found, configured, given)
+    if configured is not None and configured.share > _TELLS and gravity is not None and gravity @ up * sign > 0.5:
+        found.opposite = True  # the IMU stands upright: wheels or gyro count the other way
+        return replace(configured, scale=replace(configured.scale, value=-configured.scale.value))
     fits = {k: fit for k in range(3) if (fit := fit_rate(path, times, turned[:, k])) is not None and fit.share > _TELLS}
-    gravity = _gravity_axis(force)
     if not fits:
         _gravity(found, force, up * sign)
         return None
@@ -304,6 +313,34 @@ def _gravity_axis(force: FloatArray) -> FloatArray | None:
     mean = np.median(force, axis=0)
     size = float(np.linalg.norm(mean))
     return None if not size > _GRAVITY else np.asarray(mean / size)
+
+
+def _opposite(
+    found: Conventions, signals: Signals, path: Path, seen: Sightings | None, T_base_sensor: FloatArray | None
+) -> bool:
+    """Name which of wheels and gyro turns the wrong way, by the landmarks; whether it is the wheels."""
+    if seen is None:
+        if not signals.images:  # what images show is compared elsewhere
+            text = "Wheels and gyro turn in opposite directions: left and right are exchanged, or the gyro's sign"
+            found.add("yaw.sign", text, {}, None, Severity.ERROR)
+        return False
+    mirrored = Path(path.times, path.poses * [1.0, -1.0, -1.0], path.gaps)
+    R = np.eye(3) if T_base_sensor is None else T_base_sensor[:3, :3]
+    turned = Sightings(seen.times, seen.ids, seen.points @ R.T, seen.spatial)
+    fits = [fit_sightings(one, turned).get("body") for one in (path, mirrored)]
+    misfits = [math.inf if fit is None else fit.misfit for fit in fits]
+    wheels = found.config.wheels
+    if misfits[1] * _WORSE < misfits[0]:
+        lines: dict[str, Any] = {"wheels.scale_omega": -wheels.scale_omega}
+        if wheels.track is not None and wheels.left_joint is not None:
+            lines = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
+        text = "The wheels turn in the opposite direction of gyro and landmarks, which agree"
+        found.add("wheels.sign", text, lines, None, Severity.ERROR)
+        return True
+    if misfits[0] * _WORSE < misfits[1]:
+        text = "The gyro turns in the opposite direction of wheels and landmarks, which agree"
+        found.add("imu.sign", text, {"gyro.scale": -found.config.gyro.scale}, None, Severity.ERROR)
+    return False
 
 
 def _gravity(found: Conventions, force: FloatArray, up: FloatArray) -> None:

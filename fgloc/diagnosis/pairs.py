@@ -1,8 +1,8 @@
 """Pairs of signals that tell the same thing, compared without a map and without a pose.
 
 Each comparison is a robust regression that gives sign, axis, scale and lag of one signal against the other, with their
-uncertainty from a jackknife over blocks of time: neighbouring errors are alike, so that the residuals of single messages
-would promise too much.
+uncertainty from a jackknife over blocks of time: neighbouring errors are alike, so that the residuals of single
+messages would promise too much.
 
 Sources: Huber and Ronchetti, Robust Statistics, 2nd edition, 7.8 (iteratively reweighted least squares); Efron and
 Tibshirani, An Introduction to the Bootstrap, chapter 11 (jackknife); Umeyama 1991 (similarity of point sets).
@@ -162,8 +162,8 @@ def _similarity(
 ) -> tuple[complex, complex, float]:
     """Scale and yaw (as one complex number) and place of the sensor for a lag, and the misfit in the sensor's unit.
 
-    A landmark that stands still is at one place: ``p_i + R_i (α z_i + β) = p_j + R_j (α z_j + β)``, which is linear in α
-    and β.
+    A landmark that stands still is at one place: ``p_i + R_i (α z_i + β) = p_j + R_j (α z_j + β)``, which is linear in
+    α and β.
     """
     p1, r1 = _complex_poses(path, times[first] - late)
     p2, r2 = _complex_poses(path, times[last] - late)
@@ -198,7 +198,6 @@ def _refined(
     def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float]:
         part = _Places(path, times[use], z[use], tracks[use])
         fit = least_squares(part.residuals, x0, loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
-        left = part.residuals(fit.x)
         return fit.x, part.misfit(fit.x)
 
     everything = np.ones(len(z), dtype=bool)

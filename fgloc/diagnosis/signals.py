@@ -94,6 +94,7 @@ class Signals:
         seen: rows of time, landmark and point ``(3,)``.
         spatial: whether the points of ``seen`` have three measured coordinates.
         widest: largest absolute bearing that was reported [rad]; 0 without bearings.
+        images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
         delays: received minus stamped [s], by role.
     """
@@ -106,6 +107,7 @@ class Signals:
     odometry: list[tuple[float, ...]] = field(default_factory=list)
     spatial: bool = False
     widest: float = 0.0
+    images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
 
     def sightings(self) -> Sightings | None:
@@ -216,6 +218,7 @@ class SignalCollector:
 def read_signals(recording: Recording, config: Config) -> Signals:
     """Signals of a recording's beginning, without its images."""
     collector = SignalCollector(config)
+    collector.found.images = "image" in recording.roles
     role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
     counted = dict(recording.undecodable)
     for message in recording.messages(role_of.keys()):

@@ -28,7 +28,9 @@ class WheelsConfig(Section):
         None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
     )
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
-    scale_omega: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported yaw rate")
+    scale_omega: float = Field(
+        1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: it counts clockwise"
+    )
     yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
     slowdown: float = Field(
         0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
