@@ -1,79 +1,87 @@
-"""Beside others, on the same steps as installed: ``python -m benchmarks.peers --robot-localization FOLDER [--tune]``.
+"""Beside others, on the same steps as installed: ``python -m benchmarks.peers [--export DIR] [--poses NAME=DIR]``.
 
-- ``robot_localization``: its own EKF, built from its sources (branch noetic-devel), fed with wheel twist, gyro and
-  poses from images: of each marker alone (``rl_marker_poses``) or of all of an image by RANSAC (``rl_pnp``). The
-  settings were chosen on validation recordings by ``--tune`` (`benchmarks.peers_localizer`).
 - ``marker_poses``, ``corners``, ``corners_rules``: `benchmarks.textbook`.
 - ``wheels``: dead reckoning by the wheels from the first true pose.
 - ``fgloc``: online, with the learned motion that its ``robot.yaml`` names.
+- Any other program takes part by its poses: ``--export`` writes each recording (``bag/``, ``robot.yaml``, ``map.yaml``
+  in a folder of its name) and ends; ``--poses NAME=DIR`` reads ``DIR/RECORDING.tum`` into the same table.
 
 The case ``mrclam`` has five real robots: see `benchmarks.peers_mrclam`.
 
 ``peers.CASE.NAME.*``: mean over the seeds, spread their standard deviation. ``peers.CASE.best_over_fgloc``: the least
-mean ATE of the peers over fgloc's. ``update_ms``: mean processor time of a step without the detection of markers.
+mean ATE of the peers over fgloc's. ``update_ms``: mean processor time of a step without the detection of markers, of
+those who run here.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
-import os
+import shutil
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks import peers_filter, peers_mrclam
+from benchmarks import peers_mrclam
 from benchmarks.adaptive_recordings import Recorded, Split
 from benchmarks.adaptive_runs import CASES as FAILURES
 from benchmarks.adaptive_runs import Replayed, changed, failure, replayed
 from benchmarks.common import Row, main, not_run
 from benchmarks.installed_recordings import SEEDS, Take, load, prepare
 from benchmarks.installed_runs import floor, kept, processor_times
-from benchmarks.peers_localizer import GRID, KINDS, Kind, Localizer, Settings
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
+from fgloc.ablation.failures import Scene, corrupt, generators
+from fgloc.config import load_config
 from fgloc.datasets import mrclam
+from fgloc.datasets.bag import BagWriter
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.matching import match
+from fgloc.frames import quaternion_yaw
+from fgloc.recording.outputs import read_tum
+from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.maps import write_map
+from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Estimate, Step, Trajectory
+from fgloc.types import Estimate, Event, Step, Trajectory, TruthEvent
 
 CASES = ("none", "slip", "dark30", "ids30", "moved", "frozen")
-TUNED: dict[Kind, Settings] = {
-    "marker_poses": Settings(
-        noise_xy=0.003, noise_v=0.1, pose_rad=0.005, reject_twist=3.0, wheel_v=0.1, wheel_omega=0.2, gyro=0.03
-    ),
-    "pnp": Settings(noise_xy=0.03, noise_yaw=0.003, noise_v=0.1, pose_m=0.05, pose_rad=0.005, wheel_v=0.1, gyro=0.003),
-}
-"""What ``--tune`` gave on 2026-11-22: 33.5 and 37.4 mm, geometric means over the cases."""
-_TUNED_ON = (41, 42)  # of the validation split
-_ROUNDS = 2
-_LOST_M = 10.0  # an error that counts for one without an end, in the mean of logarithms
+_REWRITTEN = (
+    "sensor_msgs/msg/JointState",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+)
+_HERE = Path(__file__).parent
+Poses = Mapping[str, Path]  # folder of another program's TUM files, by its name
 Runs = dict[str, Callable[[Sequence[Step]], list[Estimate]]]  # by method
 Scores = Mapping[str, Mapping[str, float]]  # by method: ate_mm, yaw_deg, nees_over_3, worst_mm, update_ms
 
 
-def measure(quick: bool, split: Split, library: Path | str, seeds: int | None) -> Iterator[Row]:
+def measure(quick: bool, split: Split, poses: Poses, seeds: int | None) -> Iterator[Row]:
     """All rows; a quick run has one seed and two cases."""
     cases, chosen = (CASES[:2], SEEDS[split][:1]) if quick else (CASES, SEEDS[split][:seeds])
-    if isinstance(library, str):
-        yield from not_run([f"peers.{case}.best_over_fgloc" for case in cases], library)
-        return
     prepare(Take("installed", floor(case), split, seed) for case in cases for seed in chosen)
     for case in cases:
         runs = []
         for seed in chosen:
-            runs.append(_scored(case, split, seed, library))
+            truth = cache(lambda case=case, seed=seed: _truth(load(Take("installed", floor(case), split, seed)).events))
+            runs.append({**_scored(case, split, seed), **_of_files(poses, f"{case}_{split}_{seed}", truth)})
             print(f"{case} {seed}", file=sys.stderr, flush=True)
         yield from _rows(case, runs)
     if peers_mrclam.SOURCE.is_dir():
-        yield from _rows("mrclam", [_robot(robot, library) for robot in mrclam.ROBOTS[: 1 if quick else None]])
+        robots = mrclam.ROBOTS[: 1 if quick else None]
+        runs = [{**_robot(k), **_of_files(poses, f"mrclam_{k}", lambda k=k: _robots_truth(k))} for k in robots]
+        yield from _rows("mrclam", runs)
     else:
         yield from not_run(["peers.mrclam.best_over_fgloc"], f"no {peers_mrclam.SOURCE}; set FGLOC_REAL_DATA")
 
@@ -88,7 +96,9 @@ def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
             else:
                 yield Row(f"peers.{case}.{name}.{figure}", None, n=len(values), reason="not in every run")
         means[name] = float(np.mean([run[name]["ate_mm"] for run in runs]))
-        times = [run[name]["update_ms"] for run in runs]
+        times = [run[name].get("update_ms", math.nan) for run in runs]
+        if np.isnan(times).any():  # ran elsewhere
+            continue
         yield Row(f"peers.{case}.{name}.update_ms", float(np.mean(times)), float(np.std(times)), len(times), "ms")
     best = min((name for name in means if name != "fgloc"), key=lambda name: means[name])
     ratios = np.array([run[best]["ate_mm"] / run["fgloc"]["ate_mm"] for run in runs])
@@ -98,14 +108,19 @@ def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
 # --- Runs -------------------------------------------------------------------------------------------------------------
 
 
-def _scored(case: str, split: Split, seed: int, library: Path) -> Scores:
+def _scored(case: str, split: Split, seed: int) -> Scores:
     """Scores of everybody in one case, kept under the hash of fgloc's sources and of the peers'."""
-    made = peers_filter.sources_key(library, *map(repr, TUNED.values()))
-    name = f"peers_{case}_{split}_{seed}_{made}"
-    return kept(name, lambda: run_all(case, split, seed, library))
+    return kept(f"peers_{case}_{split}_{seed}_{_sources()}", lambda: run_all(case, split, seed))
 
 
-def run_all(case: str, split: Split, seed: int, library: Path) -> dict[str, dict[str, float]]:
+@cache
+def _sources() -> str:
+    """Hash of the sources of this benchmark's peers."""
+    parts = [(_HERE / f"{name}.py").read_bytes() for name in ("peers", "peers_mrclam", "textbook")]
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:12]
+
+
+def run_all(case: str, split: Split, seed: int) -> dict[str, dict[str, float]]:
     """Everybody on the steps of one replay."""
     recorded, made, ms = replay(case, split, seed)
     truth = made.online.truth
@@ -114,11 +129,11 @@ def run_all(case: str, split: Split, seed: int, library: Path) -> dict[str, dict
     assert online.covs is not None
     stamps = online.stamps_ns.tolist()
     estimates = [Estimate(s, p, c) for s, p, c in zip(stamps, online.poses, online.covs, strict=True)]
-    runs = others(recorded, made, library)
+    runs = others(recorded, made)
     return {"fgloc": score(estimates, truth) | {"update_ms": ms}} | _scores_of(runs, made.steps, truth)
 
 
-def _robot(robot: int, library: Path) -> Scores:
+def _robot(robot: int) -> Scores:
     """Scores of everybody on one robot of MRCLAM, kept likewise."""
 
     def run_all() -> dict[str, dict[str, float]]:
@@ -131,7 +146,7 @@ def _robot(robot: int, library: Path) -> Scores:
         }
         return {"fgloc": ours} | _scores_of(runs, made.steps, made.truth)
 
-    return kept(f"peers_mrclam_{robot}_{peers_filter.sources_key(library)}", run_all)
+    return kept(f"peers_mrclam_{robot}_{_sources()}", run_all)
 
 
 def _scores_of(runs: Runs, steps: Sequence[Step], truth: Trajectory) -> dict[str, dict[str, float]]:
@@ -154,17 +169,13 @@ def replay(case: str, split: Split, seed: int) -> tuple[Recorded, Replayed, floa
     return recorded, made, float(np.mean(times))
 
 
-def others(recorded: Recorded, made: Replayed, library: Path) -> Runs:
+def others(recorded: Recorded, made: Replayed) -> Runs:
     """Everybody else, by name."""
     camera, landmarks, wheels = recorded.camera, made.landmarks, recorded.config.wheels
     assert camera is not None
     assert made.online.truth is not None
     truth = made.online.truth
-    found: Runs = {
-        f"rl_{kind}": lambda steps, k=kind: Localizer(library, k, landmarks, camera, steps).run(TUNED[k])  # type: ignore[misc]
-        for kind in KINDS
-    }
-    found |= {pipeline: Textbook(pipeline, landmarks, camera, wheels).run for pipeline in PIPELINES}
+    found: Runs = {pipeline: Textbook(pipeline, landmarks, camera, wheels).run for pipeline in PIPELINES}
     return found | {"wheels": lambda steps: dead_reckoning(steps, wheels, truth)}
 
 
@@ -200,54 +211,93 @@ def score(estimates: Sequence[Estimate], truth: Trajectory) -> dict[str, float]:
     }
 
 
-# --- Tuning -----------------------------------------------------------------------------------------------------------
+# --- Programs that run elsewhere --------------------------------------------------------------------------------------
 
 
-def tune(library: Path) -> dict[Kind, Settings]:
-    """The settings of the least geometric mean ATE over the cases of the validation recordings, axis by axis."""
-    prepare(Take("installed", floor(case), "validation", seed) for case in CASES for seed in _TUNED_ON)
-    replays = [replay(case, "validation", seed)[:2] for case in CASES for seed in _TUNED_ON]
-    return {kind: _tuned(library, kind, replays) for kind in KINDS}
+def _of_files(poses: Poses, name: str, truth: Callable[[], Trajectory]) -> Scores:
+    """Scores of the TUM files of other programs; infinite where a file is missing."""
+    out = {}
+    for program, folder in poses.items():
+        path = folder / f"{name}.tum"
+        read = read_tum(path) if path.is_file() else None
+        stamps = [] if read is None else read.stamps_ns.tolist()
+        unknown = np.full((3, 3), np.nan)
+        estimates = [] if read is None else [Estimate(s, p, unknown) for s, p in zip(stamps, read.poses, strict=True)]
+        out[program] = score(estimates, truth())
+    return out
 
 
-def _tuned(library: Path, kind: Kind, replays: Sequence[tuple[Recorded, Replayed]]) -> Settings:
-    fed = []
-    for recorded, made in replays:
-        assert recorded.camera is not None
-        assert made.online.truth is not None
-        localizer = Localizer(library, kind, made.landmarks, recorded.camera, made.steps)
-        fed.append((localizer, made.online.truth))
+def _truth(events: Iterable[Event]) -> Trajectory:
+    true = [e for e in events if isinstance(e, TruthEvent)]
+    poses = [(e.position[0], e.position[1], quaternion_yaw(e.orientation)) for e in true]
+    return Trajectory(np.array([e.stamp_ns for e in true], dtype=np.int64), np.array(poses))
 
-    def cost(settings: Settings) -> float:
-        ates_m = [1e-3 * score(localizer.run(settings), truth)["ate_mm"] for localizer, truth in fed]
-        return float(np.mean([math.log(min(ate, _LOST_M)) for ate in ates_m]))
 
-    best = TUNED[kind]
-    least = cost(best)
-    for _ in range(_ROUNDS):
-        for name, values in GRID.items():
-            changes: list[dict[str, Any]] = [{name: value} for value in values if value != getattr(best, name)]
-            tried = [replace(best, **change) for change in changes]
-            for settings, found in zip(tried, map(cost, tried), strict=True):
-                if found < least:
-                    best, least = settings, found
-        print(f"{kind}: {1e3 * math.exp(least):.1f} mm, {best}", file=sys.stderr, flush=True)
-    return best
+def _robots_truth(robot: int) -> Trajectory:
+    with tempfile.TemporaryDirectory() as scratch:
+        bag = mrclam.convert(peers_mrclam.SOURCE, robot, Path(scratch) / "robot")
+        with open_recording(bag, load_config(bag.parent / "robot.yaml").recording) as recording:
+            return _truth(recording.events())
+
+
+def export(out: Path, quick: bool, split: Split, seeds: int | None) -> None:
+    """Write what everybody is given, a folder for each recording: ``bag/``, ``robot.yaml``, ``map.yaml``.
+
+    Images are replaced by the corners that fgloc detects in them; failures are made.
+    """
+    cases, chosen = (CASES[:2], SEEDS[split][:1]) if quick else (CASES, SEEDS[split][:seeds])
+    prepare(Take("installed", floor(case), split, seed) for case in cases for seed in chosen)
+    for case in cases:
+        for seed in chosen:
+            _export(load(Take("installed", floor(case), split, seed)), case, seed, out / f"{case}_{split}_{seed}")
+    if peers_mrclam.SOURCE.is_dir():
+        for robot in mrclam.ROBOTS[: 1 if quick else None]:
+            mrclam.convert(peers_mrclam.SOURCE, robot, out / f"mrclam_{robot}")
+
+
+def _export(recorded: Recorded, case: str, seed: int, out: Path) -> None:
+    chain = [failure(described) for described in FAILURES[case].chain(recorded)]
+    ids = tuple(sorted(recorded.landmarks.landmarks))
+    scenes = [
+        Scene(recorded.start_ns, recorded.duration_s, recorded.config, ids, rng) for rng in generators(len(chain), seed)
+    ]
+    landmarks = recorded.landmarks
+    for made, scene in zip(chain, scenes, strict=True):
+        landmarks = made.corrupt_map(landmarks, scene)
+    events = corrupt(chain, "sightings", corrupt(chain, "recorded", iter(recorded.events), scenes), scenes)
+    with BagWriter(out / "bag", overwrite=True) as bag, Recording(recorded.bag, recorded.config.recording) as source:
+        for topic, kind, received_ns, raw in source.messages():
+            if kind not in _REWRITTEN:
+                bag.copy(topic, kind, raw, received_ns)
+        for event in events:
+            _write(bag, event)
+    shutil.copy(recorded.bag.parent / "robot.yaml", out / "robot.yaml")
+    write_map(landmarks, out / "map.yaml")
+
+
+def _write(bag: BagWriter, event: Event) -> None:
+    match event:
+        case JointsEvent(stamp_ns=stamp, received_ns=received, topic=topic):
+            arrays = (event.position.tolist(), event.velocity.tolist(), event.effort.tolist())
+            bag.joints(topic, stamp, event.names, *arrays, received_ns=received)
+        case ImuEvent(stamp_ns=stamp, received_ns=received, topic=topic):
+            rates = (event.angular_velocity.tolist(), event.linear_acceleration.tolist())
+            variances = (float(event.angular_velocity_cov[0, 0]), 0.0)
+            bag.imu(topic, stamp, *rates, received, event.frame_id, variances)
+        case CornersEvent(stamp_ns=stamp, received_ns=received):
+            seen = {s.landmark_id: s.corners_px for s in event.sightings}
+            bag.corners("/tag_detections", stamp, seen, received, event.frame_id)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--robot-localization", type=Path, default=os.environ.get("ROBOT_LOCALIZATION"), metavar="DIR")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--seeds", type=int, help="so many of the split's seeds")
-    parser.add_argument("--tune", action="store_true", help="choose robot_localization's settings and end")
+    parser.add_argument("--export", type=Path, metavar="DIR", help="write the recordings there and end")
+    parser.add_argument("--poses", action="append", default=[], metavar="NAME=DIR", help="another program's TUM files")
     known, rest = parser.parse_known_args()
-    built = (
-        peers_filter.build(known.robot_localization)
-        if known.robot_localization is not None
-        else "robot_localization's sources are not given: --robot-localization DIR"
-    )
-    if known.tune and isinstance(built, Path):
-        print("\n".join(f"{kind}: {settings}" for kind, settings in tune(built).items()))
+    if known.export is not None:
+        export(known.export, "--quick" in rest, known.split, known.seeds)
     else:
-        main(lambda quick: measure(quick, known.split, built, known.seeds), __doc__ or "", rest)
+        named = {name: Path(folder) for name, _, folder in (given.partition("=") for given in known.poses)}
+        main(lambda quick: measure(quick, known.split, named, known.seeds), __doc__ or "", rest)

@@ -8,8 +8,6 @@ scale of the camera's ranges, offset of its bearings).
   bearings with a Cauchy kernel, landmarks held by tight priors. Its constants are the best of 13 sets on robots
   1 and 2 (least geometric mean of the ATE), which are among the five.
 - ``wheels``: the commands alone.
-
-robot_localization is not among them: it takes poses, and range and bearing of one beacon are none.
 """
 
 from __future__ import annotations
