@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from fgloc.config import BatchConfig
-from fgloc.errors import EstimatorError
+from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings
 from fgloc.graph.batch_ground import GroundMotions, ground_covs, ground_of
 from fgloc.graph.batch_solve import (
@@ -42,6 +42,8 @@ from fgloc.types import (
     PixelMeasurement,
 )
 
+_SAME = 1e-3  # share by which the error may rise where a step is linearized anew: noise of sightings is made there too
+_HALVINGS = 7  # tries of a step that fits worse, each of half the length: a sixty-fourth of it leads nowhere
 _LARGEST_LOG = math.log(sys.float_info.max) - 1.0
 
 
@@ -204,18 +206,52 @@ class BatchSmoother:
         return np.asarray(self._values.atVector(INSTALLATION)) if n else np.zeros(0)
 
     def _optimize(self) -> None:
-        """Linearize the sightings anew and solve, until the error stays what it is."""
+        """Linearize anew and solve, until the error stays what it is; a step that fits worse is damped or refused.
+
+        What a step is worth shows where it is linearized next. Without one that fits better the initial values stand.
+        """
         self._solved = None
         self._error = math.inf
+        self._relinearize()
+        before, cost = self._values, float(self._graph.error(self._values))  # where the next step begins
         for _ in range(MOST_STEPS):
-            self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
-            self._graph = self._linearized()
-            start = self._values if self._factors.known else without_orphans(self._values, self._graph)
-            previous, self._error = self._error, self._solve(start)
-            if not np.isfinite(self._error):
-                raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
+            previous, self._error = self._error, self._solve(before)
             if abs(previous - self._error) <= ROUNDING * self._error:
                 break
+            before, cost, refused = self._damped(before, cost)
+            if refused:
+                break
+        if not np.isfinite(self._error):
+            raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
+
+    def _relinearize(self) -> float:
+        """Linearize at the values; their error there."""
+        self._graph = gtsam.NonlinearFactorGraph()  # of a long run the factors take a gigabyte
+        self._graph = self._linearized()
+        if not self._factors.known:
+            self._values = without_orphans(self._values, self._graph)
+        return float(self._graph.error(self._values))
+
+    def _damped(self, before: gtsam.Values, cost: float) -> tuple[gtsam.Values, float, bool]:
+        """Shorten the last step until it fits no worse than what it began at; else go back there.
+
+        Returns:
+            The values now, their error, and whether the step was refused.
+        """
+        step = before.localCoordinates(self._values)
+        for i in range(_HALVINGS if np.isfinite(step.vector()).all() else 0):
+            if i:
+                step = step.scale(0.5)
+                self._values, self._error = before.retract(step), math.inf
+            try:
+                at = self._relinearize()
+            except (EstimatorError, CovarianceError, RuntimeError):  # too far off for anything to be seen from there
+                continue
+            if at <= (1.0 if i else 1.0 + _SAME) * cost:
+                return self._values, at, False
+        self._values, self._error = before, cost
+        self._relinearize()
+        return before, cost, True
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
