@@ -1,8 +1,8 @@
 """Quantiles that decide: one place for what "unlikely" means.
 
-There are three levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm a day of a
-monitor (`alarm_bound`), and the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is
-named to the user.
+There are four levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm a day of a
+monitor (`alarm_bound`), the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is named
+to the user, and `PRIOR_GATE` of a constant: what is further off contradicts what was given, and is not used.
 """
 
 from __future__ import annotations
@@ -11,6 +11,10 @@ import math
 import sys
 from functools import lru_cache
 
+# Prior sigmas that a constant of the installation may be off by. A careful installation is off by one of them, a careless
+# one by twice as much, and three sigmas of that are as far as it goes: beyond, something else is wrong.
+PRIOR_GATE = 6.0
+SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given, from which a constant is surely another one
 GATE = 0.9999  # a measurement that is less likely than one minus this is not fused
 ROUNDING = math.sqrt(sys.float_info.epsilon)  # relative error that rounding may leave in what is solved for
 _ALARM_EVERY_S = 86400.0  # where nothing is wrong: a robot drives all day, some 20 km

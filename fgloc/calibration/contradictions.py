@@ -12,9 +12,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fgloc.stats import SURE_SIGMAS
 from fgloc.types import InstallationFound, Setting
 
-SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given
 _SURE_2 = 11.8  # χ² of two degrees of freedom, as rare as three sigmas of one
 _MOST_NAMED = 5  # landmarks
 

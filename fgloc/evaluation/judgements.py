@@ -10,9 +10,10 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from fgloc.calibration.contradictions import SURE_SIGMAS, contradicted
+from fgloc.calibration.contradictions import contradicted
 from fgloc.evaluation.judgement_effects import effect, plural
 from fgloc.sensors import registry
+from fgloc.stats import SURE_SIGMAS
 from fgloc.types import Decision, IntArray, RunResult, Trajectory
 
 Kind = Literal[

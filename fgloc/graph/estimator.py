@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+
+import numpy as np
 
 from fgloc.config import EstimatorConfig
 from fgloc.errors import EstimatorError
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.graph.joint import considered, joint_cov, split
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.graph.uneven import levelled, predict, starting
 from fgloc.types import FloatArray, MotionMeasurement
@@ -22,6 +26,8 @@ class Estimator(ABC):
         log: every measurement of the window (or of the run, if ``keep_all``).
         belief: the newest pose.
         rebuilt: how often what the estimator held had to be built again from the log.
+        contradicted: constants that left the gate of their prior, with value and sigma that they had then. They are
+            held at what was given from then on, and their prior's uncertainty stays in the covariance of the pose.
     """
 
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
@@ -33,6 +39,7 @@ class Estimator(ABC):
         self._k = -1
         self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
         self._elapsed_s = 0.0
+        self.contradicted: dict[str, tuple[float, float]] = {}
 
     @property
     def elapsed_s(self) -> float:
@@ -159,6 +166,33 @@ class Estimator(ABC):
         if not self.installation.ground:
             return None
         return (belief.installation or self.installed).mean[self.installation.constants :]
+
+    def _held(self) -> list[int]:
+        """Rows of pose and installation together that are held."""
+        return [3 + self.installation.index[name] for name in self.contradicted]
+
+    def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
+        """From now on hold what this belief has beyond the gate of its prior; whether there was something new."""
+        known = belief.installation
+        names = () if known is None else self.installation.beyond_gate(known)
+        new = [name for name in names if name not in self.contradicted]
+        for name in new:
+            i = self.installation.index[name]
+            assert known is not None
+            self.contradicted[name] = float(known.mean[i]), math.sqrt(max(0.0, float(known.cov[i, i])))
+        return bool(new)
+
+    def _considered(self, belief: PoseWithCovariance) -> PoseWithCovariance:
+        """The belief with what is held as uncertain as its prior."""
+        if not self.contradicted or belief.installation is None:
+            return belief
+        rows, prior = self._held(), self.installation.prior()
+        held = [i - 3 for i in rows]
+        P = considered(joint_cov(belief, belief.installation), rows, prior.cov[np.ix_(held, held)])
+        found = split(belief, P)
+        assert found.installation is not None
+        found.installation.mean[held] = prior.mean[held]
+        return found
 
     def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief

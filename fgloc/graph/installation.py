@@ -7,7 +7,8 @@ through the joint covariance of pose and θ.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,6 +17,7 @@ import numpy as np
 from fgloc.config import Config
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole
+from fgloc.stats import PRIOR_GATE, SURE_SIGMAS
 from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
@@ -102,6 +104,35 @@ class Installation:
         """Before anything was measured."""
         return InstallationEstimate(self._prior_mean.copy(), self._prior_cov.copy())
 
+    def beyond_gate(self, belief: InstallationEstimate) -> tuple[str, ...]:
+        """Constants that measurements put further off than the gate of their prior; no landmark, none taken as exact.
+
+        What measurements say lies beyond what was found, which the prior pulls: as `Setting.off` has it.
+        """
+        rows = self._gated
+        off = np.abs(belief.mean[rows] - self._prior_mean[rows])
+        prior, found = np.diag(self._prior_cov)[rows], np.diag(belief.cov)[rows]
+        spread = np.sqrt(np.maximum(prior - found, _UNSEEN * prior))
+        beyond = (off > PRIOR_GATE * spread) & (off > SURE_SIGMAS * np.sqrt(np.maximum(found, 0.0)))
+        return tuple(self.names[i] for i in rows[beyond])
+
+    @cached_property
+    def _gated(self) -> IntArray:
+        """Rows of the constants that have a prior to leave."""
+        own = [i for i, name in enumerate(self.names[: self.constants]) if not name.startswith("map.")]
+        return np.array([i for i in own if self.sigmas[i] > _HELD], dtype=np.int64)
+
+    def with_sigmas(self, held: Iterable[str], freed: Mapping[str, float]) -> Installation:
+        """The same parameters, some taken as exact at what was given, some with another prior sigma."""
+        other = copy.copy(self)
+        other.__dict__.pop("_gated", None)
+        other.sigmas, other._prior_cov = self.sigmas.copy(), self._prior_cov.copy()
+        for name, sigma in {**dict.fromkeys(held, _HELD), **freed}.items():
+            i = self.index[name]
+            other._prior_cov[i], other._prior_cov[:, i] = 0.0, 0.0
+            other._prior_cov[i, i], other.sigmas[i] = sigma**2, sigma
+        return other
+
     def measured(self, row: FloatArray, value: float, sigma: float) -> None:
         """Take a measurement of the parameters into the prior.
 
@@ -129,6 +160,7 @@ def _block(name: str) -> str:
     return name.rpartition(".")[0] if section == "map" else section if section in TIME_OFFSET else ""
 
 
+_UNSEEN = 1e-6  # share of its variance by which measurements make a constant surer that they say nothing of
 _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state
 MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but for noise, to bound the work of a step
 

@@ -30,7 +30,8 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_key
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.isam2_backends import Backend, FixedLag, WholeRun
-from fgloc.graph.joint import correct, is_linear
+from fgloc.graph.joint import EXACT, correct, is_linear
+from fgloc.graph.linear_factors import linear_factor
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.uneven import ground_factors, ground_prior, is_level_known, step_of
 from fgloc.types import (
@@ -95,11 +96,30 @@ class IncrementalEstimator(Estimator):
         return frame.belief if corrected is None else corrected[0]
 
     def _newest(self, k: int) -> PoseWithCovariance:
+        belief = self._found(k)
+        while self._hold_beyond_gate(belief):
+            assert self._backend is not None
+            self._backend.hold(self._holding())
+            belief = self._found(k)
+        return self._considered(belief)
+
+    def _found(self, k: int) -> PoseWithCovariance:
+        """As the backend has it: what is held is as good as exact."""
         assert self._backend is not None
         belief = self._backend.belief(k, len(self.factors.installation), self.installation.ground)
         if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
             raise ValueError("estimate is not finite")
         return belief
+
+    def _holding(self) -> gtsam.NonlinearFactorGraph:
+        """What keeps the constants that left the gate of their prior at what was given."""
+        graph, constants = gtsam.NonlinearFactorGraph(), self.installation.constants
+        rows = [self.installation.index[name] for name in self.contradicted]
+        H = np.eye(constants)[rows] / EXACT
+        values = gtsam.Values()
+        values.insert(INSTALLATION, self.installation.prior().mean[:constants])
+        graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values))
+        return graph
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""
@@ -202,6 +222,8 @@ class IncrementalEstimator(Estimator):
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
             if self.installation.ground:
                 made.append(ground_prior(frame.k, known.mean[constants:], known.cov[constants:, constants:]))
+        if self._fresh and self.contradicted:
+            graph.push_back(self._holding())
         self._fresh = False
         if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]

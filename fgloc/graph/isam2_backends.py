@@ -33,6 +33,9 @@ class Backend(Protocol):
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         """Put factors in the place of those in these slots; their own slots."""
 
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+
     def holds(self, k: int) -> bool:
         """Whether a keyframe is in the window."""
 
@@ -68,6 +71,10 @@ class FixedLag:
         self._smoother.update(graph, gtsam.Values(), {}, slots)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+        self._smoother.update(graph, gtsam.Values(), {})
+
     def holds(self, k: int) -> bool:
         """Whether a keyframe is in the window."""
         return bool(self._smoother.getISAM2().valueExists(pose_key(k)))
@@ -99,6 +106,10 @@ class WholeRun:
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
         """Put factors in the place of others."""
         return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
+
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+        self._isam2.update(graph, gtsam.Values())
 
     def holds(self, k: int) -> bool:
         """Whether a keyframe is in the window."""

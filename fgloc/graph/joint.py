@@ -28,6 +28,7 @@ FAR_M2 = 1e2  # m²: variance of a position that nothing tells
 MOST_JOINT = 16
 MOST_STEPS = 6  # of Gauss-Newton: it has arrived after two or three, or does not
 LINEAR_M, LINEAR_RAD = 0.05, 0.02  # sigmas of a pose up to which a sighting is linear in it, to a fifth of a pixel
+EXACT = 1e-5  # sigma of a state that is taken as exact, in its own unit
 _STILL = math.sqrt(ROUNDING)  # sigmas: a step of Gauss-Newton this small is the last one
 
 
@@ -178,6 +179,36 @@ def correct(
         pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationEstimate(theta, after_cov[3:, 3:])
     )
     return corrected, cost
+
+
+def conditioned(P: FloatArray, rows: Sequence[int]) -> FloatArray:
+    """Joint covariance ``(m, m)`` where the states in these rows are known to be what they are expected to be."""
+    gain = np.linalg.solve(P[np.ix_(rows, rows)] + EXACT**2 * np.eye(len(rows)), P[rows]).T
+    rest = P - gain @ P[rows]
+    return np.asarray(0.5 * (rest + rest.T))
+
+
+def considered(P: FloatArray, rows: Sequence[int], prior: FloatArray) -> FloatArray:
+    """Joint covariance ``(m, m)`` of an estimate that takes the states in these rows as exact, when they are not.
+
+    Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter VIII, "consider" covariance.
+
+    Args:
+        P: with these states held by next to nothing: how the others follow them.
+        rows: the states.
+        prior: their covariance, which nothing that is measured makes smaller.
+    """
+    held = P[np.ix_(rows, rows)]
+    gain = np.linalg.solve(held, P[rows]).T
+    spread = P + gain @ (prior - held) @ gain.T
+    return np.asarray(0.5 * (spread + spread.T))
+
+
+def split(belief: PoseWithCovariance, P: FloatArray) -> PoseWithCovariance:
+    """The belief with another joint covariance ``(3 + n, 3 + n)`` of pose and installation."""
+    assert belief.installation is not None
+    known = InstallationEstimate(belief.installation.mean, P[3:, 3:])
+    return PoseWithCovariance(belief.pose, P[:3, :3], P[:3, 3:], known)
 
 
 def is_linear(belief: PoseWithCovariance) -> bool:
