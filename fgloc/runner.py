@@ -12,13 +12,14 @@ from typing import Unpack
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
-from fgloc.calibration.clock_trials import clock_note, clock_trials
-from fgloc.calibration.contradictions import contradictions
+from fgloc.calibration.clock_trials import clock_findings, clock_trials
+from fgloc.calibration.contradictions import contradiction_findings, contradictions
 from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
 from fgloc.config import Config
 from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
 from fgloc.errors import EstimatorError
+from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation.timing import one_blas_thread
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay.options import Progress, RunMode, RunOptions
@@ -30,9 +31,7 @@ from fgloc.types import (
     Finding,
     FloatArray,
     Ground,
-    InstallationFound,
     RunResult,
-    Severity,
     Trajectory,
     note,
     ordered,
@@ -75,11 +74,15 @@ def run(
     all_estimates = replay.estimates if smoothed is None else smoothed.estimates
     estimates = last_pass(all_estimates)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
-    found, tried = installation_found(parts, outcome.roles, installed), None
+    found = installation_found(parts, outcome.roles, installed)
+    contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction
+    of_constants = contradiction_findings(found, contradiction, config) or contradictions(found)
     if check and not wrong.grave and options.get("on_step") is None:
-        trials = clock_trials(found, parts.diagnosis.clock_offsets(parts.wheels.source), config)
-        tried = clock_note(trials, config, partial(_tried, recording_path, map_path, options.get("detections")))
-    findings = _findings(outcome, smoothed, len(all_estimates) - len(estimates), *(tried or (None, found)))
+        asked = found if contradiction is None else installation_found(parts, outcome.roles, contradiction.asked)
+        trials = clock_trials(asked, parts.diagnosis.clock_offsets(parts.wheels.source), config)
+        again = partial(_tried, recording_path, map_path, options.get("detections"))
+        of_constants = clock_findings(trials, config, again, contradiction is not None) or of_constants
+    findings = _findings(outcome, smoothed, len(all_estimates) - len(estimates), of_constants)
     result = _result(parts, replay, outcome, estimates, smoothed)
     wall_s = time.perf_counter() - began
     return replace(result, findings=findings, source=recording_path, config=config, found=found, wall_s=wall_s)
@@ -89,19 +92,23 @@ def _findings(
     outcome: Outcome,
     smoothed: SmoothedRun | None,
     left_out: int,
-    tried: str | None,
-    found: InstallationFound,
+    of_constants: Sequence[Finding],
 ) -> tuple[Finding, ...]:
     """What is wrong and what the user should know, the gravest first."""
     return ordered(
         [
             *outcome.findings,
-            *note("clock.offset", () if tried is None else (tried,), Severity.WARNING),
             *note("batch", () if smoothed is None else smoothed.notes),
             *note("clock.back", _left_out(left_out)),
-            *note("installation", map(sentence, contradictions(found)), Severity.WARNING),
+            *of_constants,
         ]
     )
+
+
+def _contradiction(parts: Assembly) -> Contradiction | None:
+    """Constants that were held online."""
+    estimator = parts.localizer.estimator
+    return Contradiction(tuple(estimator.contradicted), estimator.asked()) if estimator.contradicted else None
 
 
 def _replayed(

@@ -11,8 +11,8 @@ import math
 import sys
 from functools import lru_cache
 
-# Prior sigmas that a constant of the installation may be off by. A careful installation is off by one of them, a careless
-# one by twice as much, and three sigmas of that are as far as it goes: beyond, something else is wrong.
+# Prior sigmas that a constant of the installation may be off by. A careful installation is off by one of them, a
+# careless one by twice as much, and three sigmas of that are as far as it goes: beyond, something else is wrong.
 PRIOR_GATE = 6.0
 SURE_SIGMAS = 3.0  # sigmas, of what was found and of what was given, from which a constant is surely another one
 GATE = 0.9999  # a measurement that is less likely than one minus this is not fused

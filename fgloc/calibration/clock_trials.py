@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fgloc.calibration.contradictions import contradicted
+from fgloc.calibration.contradictions import CODES, contradicted
 from fgloc.config import Config
 from fgloc.sensors import registry
-from fgloc.types import InstallationFound, RunResult, Setting
+from fgloc.types import Finding, InstallationFound, RunResult, Setting, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SAME_S = 0.01
@@ -53,10 +53,10 @@ def clock_trials(found: InstallationFound, seen: Mapping[str, float], config: Co
     return tuple(kept)
 
 
-def clock_note(
-    trials: tuple[Trial, ...], config: Config, again: Callable[[Config], RunResult]
-) -> tuple[str, InstallationFound] | None:
-    """A sentence on the correction that makes the run fit best, and what is found with it.
+def clock_findings(
+    trials: tuple[Trial, ...], config: Config, again: Callable[[Config], RunResult], beyond: bool
+) -> list[Finding]:
+    """The correction that makes the run fit best, and what of the installation is off with it.
 
     None if no correction makes it fit clearly better.
 
@@ -64,14 +64,16 @@ def clock_note(
         trials: what to try.
         config: as the run used it.
         again: the same run in batch, with another configuration.
+        beyond: whether a constant was beyond the gate of its prior without a correction: then the run's poses have the
+            wrong clock in them.
     """
     if not trials:
-        return None
+        return []
     plain = again(config).cost
     done = [(trial, again(_with(config, trial))) for trial in trials]
     costs = [math.inf if result.cost is None else result.cost for _, result in done]
     if plain is None or min(costs) > plain - _BETTER:
-        return None
+        return []
     best = next(i for i, cost in enumerate(costs) if cost <= min(costs) + _AS_GOOD * (plain - min(costs)))
     trial, result = done[best]
     assert result.found is not None
@@ -82,7 +84,7 @@ def clock_note(
     sigma = math.hypot(_MODEL_S, max((s.sigma for s in clocks), default=0.0) if left is None else left.sigma)
     late = given - setting
     if abs(late) < _LATE_S:
-        return None
+        return []
     has_gyro = any(s.name.startswith(f"{registry.motion_names().rate}.") for s in result.found.settings)
     name, against = _names(trial.role, has_gyro)
     sentence = (
@@ -90,7 +92,10 @@ def clock_note(
         f"{against}: set recording.stamp_offset_s: {{{trial.role}: {setting:.3f}}}; tried, and the recording fits "
         "better."
     )
-    return sentence, result.found
+    severity = Severity.ERROR if beyond else Severity.WARNING
+    lines = {"recording.stamp_offset_s": f"{{{trial.role}: {setting:.3f}}}"}
+    left_over = [f for f in result.findings if f.code in CODES]
+    return [Finding("clock.offset", sentence, severity, lines, abs(late), sigma), *left_over]
 
 
 def _late(s: Setting) -> bool:

@@ -8,22 +8,118 @@ what was found further off than three of its own: of 20 parameters of a careful 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from fgloc.stats import SURE_SIGMAS
-from fgloc.types import InstallationFound, Setting
+from fgloc.calibration.settings import settings_found
+from fgloc.config import Config
+from fgloc.graph.contradictions import Contradiction, Rival
+from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS
+from fgloc.types import Finding, FloatArray, InstallationFound, Setting, Severity, note
 
 _SURE_2 = 11.8  # χ² of two degrees of freedom, as rare as three sigmas of one
+CODES = ("installation.contradiction", "installation.off", "map.moved")
 _MOST_NAMED = 5  # landmarks
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_NOT_COMPARED = "; `fgloc smooth` compares what explains it."
+_UNEXPLAINED = ". No constant alone explains it: look for a wrong axis, sign, unit or clock."
 
 
-def contradictions(found: InstallationFound) -> tuple[str, ...]:
-    """A sentence for every given value that is contradicted, one for all landmarks; clocks: `clock_trials`."""
+def contradictions(found: InstallationFound) -> list[Finding]:
+    """One finding for every given value that is contradicted, one for all landmarks; clocks: `clock_trials`.
+
+    What was found is used, as it is within the gate of its prior; what is not: `contradiction_findings`.
+    """
     off = [s for s in found.settings if not s.name.startswith("stamp_offset_s.") and contradicted(s)]
-    sentences = [f"{s.name} is {_number(s)}, {s.given:.6g} was given: set {_line(s)}." for s in off]
-    return (*sentences, *_landmarks(found))
+    findings = [
+        Finding(
+            CODES[1],
+            f"{s.name} is {_number(s)}, {s.given:.6g} was given: set {_line(s)}.",
+            Severity.WARNING,
+            _lines([s]),
+            s.found,
+            s.sigma,
+        )
+        for s in off
+    ]
+    return [*findings, *note(CODES[2], _landmarks(found), Severity.WARNING)]
+
+
+def contradiction_findings(
+    found: InstallationFound, contradiction: Contradiction | None, config: Config
+) -> list[Finding]:
+    """The finding about constants that are beyond the gate of their prior, with what explains it; at most one.
+
+    Args:
+        found: the installation as it was used.
+        contradiction: of the run.
+        config: as the run used it.
+    """
+    if contradiction is None:
+        return []
+    names, rivals = _listed(s.name for s in _settings(found, contradiction.names, config)), contradiction.rivals
+    text = (
+        f"The recording contradicts what was given of {names} by more than {PRIOR_GATE:g} sigmas, and it was not used"
+    )
+    if rivals is None:
+        return [Finding(CODES[0], f"{text}{_NOT_COMPARED}", Severity.ERROR)]
+    if not rivals:
+        return [Finding(CODES[0], f"{text}{_UNEXPLAINED}", Severity.ERROR)]
+    options = [_told(found, rival, config) for rival in rivals]
+    lines = _lines(options[0]) if len(rivals) == 1 and rivals[0].sensible else {}
+    shown = " or ".join(" with ".join(f"{s.name} {_number(s)}" for s in option) for option in options)
+    if lines:
+        told = f"{text}: {shown} explains it best. Set {', '.join(f'{key}: {value}' for key, value in lines.items())}."
+    elif len(rivals) > 1:
+        told = f"{text}: {shown} explain it alike, and the data cannot tell which."
+    else:
+        told = (
+            f"{text}: {shown} would explain it, which is no installation. Look for a wrong axis, sign, unit or clock."
+        )
+    value = (options[0][0].found, options[0][0].sigma) if len(rivals) == 1 else (None, None)
+    return [Finding(CODES[0], told, Severity.ERROR, lines, *value)]
+
+
+def _told(found: InstallationFound, rival: Rival, config: Config) -> list[Setting]:
+    return _settings(found, rival.names, config, rival.mean, rival.sigmas)
+
+
+def _settings(
+    found: InstallationFound,
+    names: Sequence[str],
+    config: Config,
+    mean: FloatArray | None = None,
+    sigmas: FloatArray | None = None,
+) -> list[Setting]:
+    """Settings that these constants alone change; without values, by one prior sigma each."""
+    every = (*found.names, *(name for name in names if name not in found.names))
+    rows, n = [every.index(name) for name in names], len(every)
+    prior = np.eye(n)
+    prior[: len(found.names), : len(found.names)] = found.prior_cov
+    theta, cov = np.zeros(n), np.zeros((n, n))
+    theta[rows] = np.sqrt(np.diag(prior)[rows]) if mean is None else mean
+    cov[rows, rows] = 0.0 if sigmas is None else sigmas**2
+    state = replace(found, names=every, mean=theta, cov=cov, prior_cov=prior)
+    return [s for s in settings_found(state, config) if abs(s.found - s.given) > ROUNDING]
+
+
+def _lines(settings: Sequence[Setting]) -> dict[str, str]:
+    """Keys of ``robot.yaml`` with the values of these settings; the camera's pose is in the run's installation.yaml."""
+    lines: dict[str, str] = {}
+    for s in settings:
+        section, key = s.name.split(".")
+        if section == "stamp_offset_s":
+            lines["recording.stamp_offset_s"] = f"{{{key}: {s.found:.3f}}}"
+        elif key not in _AXES:
+            lines[s.name] = f"{s.found:.5g}"
+    return lines
+
+
+def _listed(names: Iterable[str]) -> str:
+    every = list(names)
+    return " and ".join([", ".join(every[:-1]), every[-1]] if len(every) > 1 else every)
 
 
 def contradicted(s: Setting) -> bool:
@@ -50,7 +146,7 @@ def _landmarks(found: InstallationFound) -> Iterator[str]:
 
 
 def _line(s: Setting) -> str:
-    if s.name.split(".")[1] in ("x", "y", "z", "roll", "pitch", "yaw"):
+    if s.name.split(".")[1] in _AXES:
         return "recording.sightings_pose, as the run's installation.yaml has it"
     return f"{s.name}: {s.found:.5g}"
 

@@ -151,8 +151,12 @@ class BatchSmoother:
         """
         total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
         if self._sightings is None:
-            factors = [f for some in self.accepted.values() for s in some for f in s.factors]
-            return total + sum(f.error(self._values) for f in factors)
+            for frame in self.frames:
+                kept = self.accepted[frame.k]
+                total += sum(f.error(self._values) for s in kept for f in s.factors)
+                left_out = [s for s in frame.sightings if s not in kept]
+                total += sum(0.5 * chi2_bound(self._probability, _dof(s)) for s in left_out)
+            return total
         rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
         for squares, rows in (s.squares(self._whole_poses(), self._theta()) for s in (self._sightings, rejected)):
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
@@ -162,6 +166,11 @@ class BatchSmoother:
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total
+
+    def rows(self) -> int:
+        """Length of the residuals of all sightings that `cost` counts."""
+        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
+        return sum(s.measurement.dof for s in seen)
 
     def _cost_of_installation(self) -> float:
         """Of its prior, where that is not among the priors of the poses."""

@@ -167,6 +167,15 @@ class Estimator(ABC):
             return None
         return (belief.installation or self.installed).mean[self.installation.constants :]
 
+    def asked(self) -> InstallationEstimate:
+        """The installation with what is held as it was when it left the gate of its prior."""
+        mean, cov = self.installed.mean.copy(), self.installed.cov.copy()
+        for name, (value, sigma) in self.contradicted.items():
+            i = self.installation.index[name]
+            cov[i], cov[:, i] = 0.0, 0.0
+            mean[i], cov[i, i] = value, sigma**2
+        return InstallationEstimate(mean, cov)
+
     def _held(self) -> list[int]:
         """Rows of pose and installation together that are held."""
         return [3 + self.installation.index[name] for name in self.contradicted]

@@ -6,6 +6,7 @@ robust (Cauchy).
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from operator import is_not
@@ -166,6 +167,17 @@ class LandmarkFactors:
         self._estimated = self.installation.prior()
         self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
+
+    def with_installation(self, installation: Installation) -> LandmarkFactors:
+        """The same with other priors, where what is taken as exact is as it was given."""
+        other = copy.copy(self)
+        other.installation = installation
+        held = np.flatnonzero(installation.sigmas < self.installation.sigmas)
+        mean = self._estimated.mean.copy()
+        mean[held] = installation.prior().mean[held]
+        other.estimated = InstallationEstimate(mean, self._estimated.cov)
+        other._prepared = (), None
+        return other
 
     @property
     def estimated(self) -> InstallationEstimate:

@@ -8,7 +8,7 @@ through the joint covariance of pose and θ.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +25,16 @@ SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
 MARKER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 POINT = ("x_m", "y_m")
 GROUND = ("ground.z_m", "ground.roll_rad", "ground.pitch_rad")
+LENGTH, HEADING, TURN = "length", "heading", "turn"
+# What constants of sightings change alike: distances, the direction of landmarks while the robot turns, the turn
+_EFFECTS = {
+    "sightings.range_scale": (LENGTH,),
+    "camera.focal": (LENGTH,),
+    "sightings.bearing_offset_rad": (HEADING,),
+    "sightings.time_offset_s": (HEADING,),
+    "camera.ry_rad": (HEADING,),
+    "camera.time_offset_s": (HEADING,),
+}
 _GROUND_SIGMAS = (0.3, 0.15, 0.15)  # m, rad, rad: of a robot somewhere on an uneven floor; ramps of 15° are 0.26 rad
 TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its block
 
@@ -50,10 +60,16 @@ class Installation:
         landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
         ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
             newest pose; in the graph each keyframe has its own.
+        effects: what a constant changes; constants of one effect may be taken for one another.
         constants: how many rows are the same for all poses: all, or all but those.
     """
 
-    def __init__(self, parameters: Mapping[str, float], landmark_cov: Mapping[int, FloatArray] | None = None) -> None:
+    def __init__(
+        self,
+        parameters: Mapping[str, float],
+        landmark_cov: Mapping[int, FloatArray] | None = None,
+        effects: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
         """Take prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
         Args:
@@ -61,11 +77,13 @@ class Installation:
                 is held).
             landmark_cov: covariance of landmarks for which the map gives it, as `Landmark` has it; what it leaves out
                 (z, the rotation) keeps its sigma, what is no state is passed over.
+            effects: as the attribute; default: none is known.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
         kept = {name: s for name, s in parameters.items() if s > 0.0 or _block(name) in blocks}
         self.names = tuple(kept)
+        self.effects = {name: tuple(effects[name]) for name in kept if effects and name in effects}
         sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
@@ -115,6 +133,11 @@ class Installation:
         spread = np.sqrt(np.maximum(prior - found, _UNSEEN * prior))
         beyond = (off > PRIOR_GATE * spread) & (off > SURE_SIGMAS * np.sqrt(np.maximum(found, 0.0)))
         return tuple(self.names[i] for i in rows[beyond])
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Constants that are estimated, but for landmarks."""
+        return tuple(self.names[i] for i in self._gated)
 
     @cached_property
     def _gated(self) -> IntArray:
@@ -189,10 +212,12 @@ def installation_of(
     camera, rb = config.camera, config.landmarks
     there = {MotionRole.ODOMETER: True, MotionRole.RATE: has_gyro, MotionRole.MODEL: has_model}
     roles = [role for role, is_there in there.items() if is_there]
-    sigmas = {parameter.name: parameter.sigma for parameter in registry.motion_parameters(config, roles)}
+    parameters = registry.motion_parameters(config, roles)
+    sigmas = {parameter.name: parameter.sigma for parameter in parameters}
+    effects = _EFFECTS | {parameter.name: parameter.effects for parameter in parameters}
     ground = dict(zip(GROUND, _GROUND_SIGMAS, strict=True)) if config.estimator.ground == "uneven" else {}
     if landmark_map is None:
-        return Installation(sigmas | ground)
+        return Installation(sigmas | ground, effects=effects)
     if corners:
         m, r = camera.position_sigma_m, camera.rotation_sigma_rad
         focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
@@ -205,7 +230,7 @@ def installation_of(
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)
     sigmas |= ground
-    return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None})
+    return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None}, effects)
 
 
 def _landmark_sigmas(i: int, landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.graph.batch import BatchSmoother, Smoothed
+from fgloc.graph.contradictions import Contradiction, as_given, smoothed_within_priors, spread
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.uneven import ground_at
 from fgloc.types import (
@@ -26,6 +27,7 @@ class SmoothedRun:
     notes: tuple[str, ...]
     installation: InstallationEstimate
     cost: float
+    contradiction: Contradiction | None = None  # constants that are not used as they were found
 
 
 def smooth_run(parts: Assembly) -> SmoothedRun:
@@ -39,9 +41,15 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     """
     localizer, config = parts.localizer, parts.config
     log = localizer.estimator.log
-    solver = BatchSmoother(log, localizer.factors, config.batch, config.estimator.gate_probability)
+    probability = config.estimator.gate_probability
+    solver, contradiction = smoothed_within_priors(log, localizer.factors, config.batch, probability)
     notes = []
-    result = solver.result()
+    result, installed = solver.result(), solver.installed()
+    if contradiction is not None:
+        result.covs[:] += spread(
+            result.poses, contradiction.rivals or ()
+        )  # a view of `ground_covs`, where there is one
+        installed = as_given(installed, localizer.factors.installation, contradiction.names)
     estimates = [
         Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode, (), ground)
         for frame, pose, cov, ground in zip(
@@ -52,7 +60,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, cost {result.error:.1f}.")
-    return SmoothedRun(estimates, landmarks, tuple(notes), solver.installed(), solver.cost())
+    return SmoothedRun(estimates, landmarks, tuple(notes), installed, solver.cost(), contradiction)
 
 
 def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:

@@ -138,11 +138,14 @@ class Parameter(NamedTuple):
         name: ``sensor.parameter``.
         sigma: of the prior; 0: it is exact.
         rank: its place among the parameters of all sensors.
+        effects: what it changes: "length" (distances), "turn", "heading" (where landmarks are seen while the robot
+            turns). Parameters of one effect may be taken for one another.
     """
 
     name: str
     sigma: float
     rank: Rank = Rank.GAIN
+    effects: tuple[str, ...] = ()
 
 
 class FoundRow(NamedTuple):

@@ -22,7 +22,7 @@ LEVELS = ("gyro.level_x_rad", "gyro.level_y_rad")  # tilt about x and y that the
 
 def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
     """With their priors; on uneven ground also of what tells roll and pitch."""
-    scale = Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0)
+    scale = Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0, effects=("turn",))
     if config.estimator.ground == "flat" or MotionRole.RATE not in roles:
         return (scale,)
     biases = (Parameter(name, config.gyro.bias_sigma) for name in BIASES)

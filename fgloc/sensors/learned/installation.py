@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
     """With their priors."""
-    return (Parameter("learned.scale", config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0, Rank.MODEL),)
+    return (
+        Parameter(
+            "learned.scale", config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0, Rank.MODEL, ("length",)
+        ),
+    )
 
 
 def found(config: Config) -> tuple[FoundRow, ...]:

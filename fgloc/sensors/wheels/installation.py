@@ -27,12 +27,17 @@ def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter
     """With their priors. Without a gyro theirs is the clock that others are compared to."""
     wheels = config.wheels
     return (
-        Parameter("wheels.radius", wheels.scale_sigma),
-        Parameter("wheels.track", wheels.turn_scale_sigma),
-        Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma),
+        Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn")),
+        Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",)),
+        Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma, effects=("turn",)),
         Parameter("wheels.slowdown", wheels.slowdown_sigma),
         Parameter("wheels.delay_s", wheels.delay_sigma_s),
-        Parameter("wheels.time_offset_s", wheels.time_offset_sigma_s if MotionRole.RATE in roles else 0.0, Rank.CLOCK),
+        Parameter(
+            "wheels.time_offset_s",
+            wheels.time_offset_sigma_s if MotionRole.RATE in roles else 0.0,
+            Rank.CLOCK,
+            ("heading",),
+        ),
     )
 
 
