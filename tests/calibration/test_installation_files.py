@@ -10,14 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli
-from fgloc.calibration.clock_trials import clock_note, clock_trials
+from fgloc.calibration.clock_trials import clock_findings, clock_trials
 from fgloc.calibration.contradictions import contradicted, contradictions
 from fgloc.calibration.multi_run import pooled
 from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
-from fgloc.types import Camera, InstallationFound, RunResult, Setting
+from fgloc.types import Camera, InstallationFound, RunResult, Setting, Severity
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "installed_run"
 
@@ -93,8 +93,8 @@ def test_only_what_is_surely_beyond_the_prior_is_said():
     assert pulled.off == pytest.approx(3.9, abs=0.1)
     assert pulled.unpulled == pytest.approx(0.083, abs=0.001)
     state = found({"gyro.scale": (0.03, 0.0005, 0.005)})
-    (note,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)))
-    assert "set gyro.scale: 1.03" in note
+    (finding,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)))
+    assert finding.lines == {"gyro.scale": "1.03"}
 
 
 def test_pooling_counts_the_prior_once():
@@ -123,12 +123,14 @@ def test_a_clock_is_named_only_if_its_correction_fits_better():
 
         return run
 
-    told = clock_note(trials, config, again(-0.085))
-    assert told is not None
-    assert "0.085 ±" in told[0]
-    assert "{sightings: -0.085}" in told[0]
-    assert clock_note(trials, config, again(0.0)) is None
-    assert clock_note((), config, again(0.0)) is None
+    (told,) = clock_findings(trials, config, again(-0.085), beyond=False)
+    assert told.value == pytest.approx(0.085)
+    assert told.lines == {"recording.stamp_offset_s": "{sightings: -0.085}"}
+    assert told.severity is Severity.WARNING
+    (told,) = clock_findings(trials, config, again(-0.085), beyond=True)
+    assert told.severity is Severity.ERROR
+    assert clock_findings(trials, config, again(0.0), beyond=True) == []
+    assert clock_findings((), config, again(0.0), beyond=True) == []
 
 
 def test_all_clocks_against_the_gyros_accuse_the_gyros():
