@@ -32,7 +32,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.graph.measurement_log import LandmarkFactor, MeasurementLog
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.noise_models import whitening_of
 from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import (
@@ -111,6 +111,26 @@ class BatchSmoother:
         }
         self._optimize()
 
+    def reconsider(self) -> bool:
+        """Of a known map: gate all sightings by this solution instead of the online one's, and solve again.
+
+        With another installation others fit: those that were refused online may be what determines it.
+
+        Returns:
+            Whether there are more than before.
+        """
+        if self._sightings is None:
+            return False
+        before = sum(map(len, self.accepted.values()))
+        every = [_seen(frame) for frame in self.frames]
+        squares, rows = BatchSightings(self.frames, every, self._factors).squares(self._whole_poses(), self._theta())
+        fits = squares <= np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
+        kept = iter(fits.tolist())
+        self.accepted = {f.k: tuple(s for s in seen if next(kept)) for f, seen in zip(self.frames, every, strict=True)}
+        self._sightings = BatchSightings(self.frames, list(self.accepted.values()), self._factors)
+        self._optimize()
+        return sum(map(len, self.accepted.values())) > before
+
     def stamps_ns(self) -> IntArray:
         """Times of the keyframes ``(n,)``."""
         return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
@@ -157,11 +177,12 @@ class BatchSmoother:
                 left_out = [s for s in frame.sightings if s not in kept]
                 total += sum(0.5 * chi2_bound(self._probability, _dof(s)) for s in left_out)
             return total
-        rejected = BatchSightings(self.frames, [frame.rejected for frame in self.frames], self._factors)
+        refused = [tuple(s for s in _seen(frame) if s not in self.accepted[frame.k]) for frame in self.frames]
+        rejected = BatchSightings(self.frames, refused, self._factors)
         for squares, rows in (s.squares(self._whole_poses(), self._theta()) for s in (self._sightings, rejected)):
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
-        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
+        seen = [s for frame in self.frames for s in _seen(frame)]
         covs = [s.alone.cov for s in seen if not isinstance(s.measurement, PixelMeasurement)]  # type: ignore[union-attr]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
@@ -169,7 +190,7 @@ class BatchSmoother:
 
     def rows(self) -> int:
         """Length of the residuals of all sightings that `cost` counts."""
-        seen = [s for frame in self.frames for s in (*frame.sightings, *frame.rejected)]
+        seen = [s for frame in self.frames for s in _seen(frame)]
         return sum(s.measurement.dof for s in seen)
 
     def _cost_of_installation(self) -> float:
@@ -230,6 +251,8 @@ class BatchSmoother:
             before, cost, refused = self._damped(before, cost)
             if refused:
                 break
+        if not np.isfinite(self._error):  # the last step was shortened
+            self._error = cost
         if not np.isfinite(self._error):
             raise EstimatorError("the batch optimum is not finite; look at steps.csv for what broke it")
 
@@ -308,6 +331,10 @@ class BatchSmoother:
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
         self._values = optimizer.optimize()
         return float(optimizer.error())
+
+
+def _seen(frame: Keyframe) -> tuple[LandmarkFactor, ...]:
+    return (*frame.sightings, *frame.rejected)
 
 
 def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:

@@ -23,7 +23,8 @@ from fgloc.graph.measurement_log import MeasurementLog
 from fgloc.stats import GATE, evidence_bound
 from fgloc.types import FloatArray
 
-_MOST_ROUNDS = 4  # of solutions until no constant is beyond its gate: one gives way to the next
+_MOST_ROUNDS = 6  # of solutions until no constant is beyond its gate: one gives way to the next
+_MOST_GATED = 3  # times that sightings are gated anew with what was freed
 _MOST_RIVALS = 6  # solutions more, each with others freed
 _SHARE = 0.05  # of what the best of them makes better, that another may lack to explain as much: models are no better
 # Prior sigmas of constants that are freed, by the end of their name: of a robot that was put together by eye.
@@ -84,7 +85,7 @@ def smoothed_within_priors(
     beyond = installation.beyond_gate(asked) if installation.constants else ()
     held: tuple[str, ...] = ()
     for _ in range(_MOST_ROUNDS if beyond else 0):
-        held = tuple(dict.fromkeys((*held, *beyond)))
+        held = (*held, *(name for name in beyond[:1] if name not in held))  # what is wrong pulls others along
         inside = factors.with_installation(installation.with_sigmas(held, {}))
         solver = BatchSmoother(log, inside, config, gate_probability)
         beyond = inside.installation.beyond_gate(solver.installed())
@@ -93,10 +94,13 @@ def smoothed_within_priors(
     if not held:
         return solver, None
     rivals: list[Rival] = []
-    for names in _candidates(installation, held)[:_MOST_RIVALS]:
-        freed = {name: by_eye(name) for name in names}
+    for freed in _candidates(installation, held, factors.known)[:_MOST_RIVALS]:
         free = factors.with_installation(installation.with_sigmas(held, freed))
-        rivals += _rivals(names, BatchSmoother(log, free, config, gate_probability), free)
+        other = BatchSmoother(log, free, config, gate_probability)
+        for _ in range(_MOST_GATED):
+            if not other.reconsider():
+                break
+        rivals += _rivals(tuple(freed), other, free)
     return solver, Contradiction(held, asked, explaining(rivals, solver.cost(), solver.rows()))
 
 
@@ -121,17 +125,18 @@ def explaining(rivals: Sequence[Rival], held: float, rows: int) -> tuple[Rival, 
     tells = 0.5 * evidence_bound(GATE, len(tried)) * max(1.0, 2.0 * best / max(rows, 1))
     if held - best < tells:
         return ()
-    return tuple(r for r in tried if r.cost - best <= max(tells, _SHARE * (held - best)))
+    alike = [r for r in tried if r.cost - best <= max(tells, _SHARE * (held - best))]
+    return tuple(sorted(alike, key=lambda r: (len(r.names), r.cost)))
 
 
-def _candidates(installation: Installation, held: Sequence[str]) -> list[tuple[str, ...]]:
-    """What is freed: each of those that are held, those of one effect together, and others of the same effect."""
-    effects = installation.effects
-    concerned = sorted({effect for name in held for effect in effects.get(name, ())})
-    others = [name for name in installation.free if name not in held and set(effects.get(name, ())) & set(concerned)]
-    together = [tuple(name for name in held if effect in effects.get(name, ())) for effect in concerned]
-    pairs = dict.fromkeys(names for names in together if len(names) > 1)
-    return [*((name,) for name in held), *pairs, *((name,) for name in others)]
+def _candidates(installation: Installation, held: Sequence[str], known: bool) -> list[dict[str, float]]:
+    """What is freed: each constant that is held, the length of the motion alone, and others of the same effects."""
+    effects, length = installation.effects, dict.fromkeys(installation.length, _BY_EYE_RATIO)
+    concerned = {effect for name in held for effect in effects.get(name, ())}
+    alone = [{name: by_eye(name)} for name in held]
+    others = [n for n in installation.free if n not in held and concerned & set(effects.get(n, ()))]
+    together = [length] if length and LENGTH in concerned and (len(length) > 1 or not known) else []
+    return [*alone, *(t for t in together if t not in alone), *({n: by_eye(n)} for n in others)]
 
 
 def _rivals(names: tuple[str, ...], solver: BatchSmoother, factors: LandmarkFactors) -> Iterator[Rival]:
@@ -141,12 +146,15 @@ def _rivals(names: tuple[str, ...], solver: BatchSmoother, factors: LandmarkFact
     eye = np.array([by_eye(name) for name in names])
     sensible = bool((np.abs(mean - installation.prior().mean[rows]) < SENSIBLE * eye).all())
     cost, poses = solver.cost(), solver.poses()
+    if len(names) > 1:  # to the second order, turns are as they were
+        by_turn = [LENGTH not in installation.effects.get(name, ()) for name in names]
+        mean = np.where(by_turn, mean / (1.0 + mean), mean)
     yield Rival(names, mean, sigmas, sensible, cost, poses)
-    if not factors.known and len(names) == 1 and LENGTH in installation.effects.get(names[0], ()) and mean[0] > -1.0:
-        # Without a map wheels that are longer by a factor are ranges that are shorter by it, bit by bit
+    if not factors.known and set(names) == set(installation.length) and mean[0] > -1.0:
+        # Without a map motions that are longer by a factor are ranges that are shorter by it, bit by bit
         smaller = poses.copy()
         smaller[:, :2] /= 1.0 + mean[0]
-        yield Rival((RANGE_SCALE,), -np.log1p(mean), sigmas / (1.0 + mean), sensible, cost, smaller)
+        yield Rival((RANGE_SCALE,), -np.log1p(mean[:1]), sigmas[:1] / (1.0 + mean[0]), sensible, cost, smaller)
 
 
 def spread(held: FloatArray, rivals: Sequence[Rival]) -> FloatArray:

@@ -181,10 +181,13 @@ class Estimator(ABC):
         return [3 + self.installation.index[name] for name in self.contradicted]
 
     def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
-        """From now on hold what this belief has beyond the gate of its prior; whether there was something new."""
+        """From now on hold what this belief has furthest beyond the gate of its prior; whether there was something.
+
+        Not all at once: what one wrong constant makes impossible pulls others along.
+        """
         known = belief.installation
         names = () if known is None else self.installation.beyond_gate(known)
-        new = [name for name in names if name not in self.contradicted]
+        new = [name for name in names if name not in self.contradicted][:1]
         for name in new:
             i = self.installation.index[name]
             assert known is not None

@@ -61,6 +61,7 @@ class Installation:
         ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
             newest pose; in the graph each keyframe has its own.
         effects: what a constant changes; constants of one effect may be taken for one another.
+        length: constants that change the length of motions, and no turn, if all change alike.
         constants: how many rows are the same for all poses: all, or all but those.
     """
 
@@ -69,6 +70,7 @@ class Installation:
         parameters: Mapping[str, float],
         landmark_cov: Mapping[int, FloatArray] | None = None,
         effects: Mapping[str, Sequence[str]] | None = None,
+        length: Sequence[str] = (),
     ) -> None:
         """Take prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
@@ -78,12 +80,14 @@ class Installation:
             landmark_cov: covariance of landmarks for which the map gives it, as `Landmark` has it; what it leaves out
                 (z, the rotation) keeps its sigma, what is no state is passed over.
             effects: as the attribute; default: none is known.
+            length: likewise.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
         kept = {name: s for name, s in parameters.items() if s > 0.0 or _block(name) in blocks}
         self.names = tuple(kept)
         self.effects = {name: tuple(effects[name]) for name in kept if effects and name in effects}
+        self.length = tuple(name for name in length if kept.get(name))
         sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
@@ -123,7 +127,9 @@ class Installation:
         return InstallationEstimate(self._prior_mean.copy(), self._prior_cov.copy())
 
     def beyond_gate(self, belief: InstallationEstimate) -> tuple[str, ...]:
-        """Constants that measurements put further off than the gate of their prior; no landmark, none taken as exact.
+        """Constants that measurements put further off than the gate of their prior, the furthest first.
+
+        No landmark, and none that is taken as exact.
 
         What measurements say lies beyond what was found, which the prior pulls: as `Setting.off` has it.
         """
@@ -132,7 +138,8 @@ class Installation:
         prior, found = np.diag(self._prior_cov)[rows], np.diag(belief.cov)[rows]
         spread = np.sqrt(np.maximum(prior - found, _UNSEEN * prior))
         beyond = (off > PRIOR_GATE * spread) & (off > SURE_SIGMAS * np.sqrt(np.maximum(found, 0.0)))
-        return tuple(self.names[i] for i in rows[beyond])
+        order = np.argsort(-off / spread, kind="stable")
+        return tuple(self.names[rows[i]] for i in order if beyond[i])
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -146,14 +153,21 @@ class Installation:
         return np.array([i for i in own if self.sigmas[i] > _HELD], dtype=np.int64)
 
     def with_sigmas(self, held: Iterable[str], freed: Mapping[str, float]) -> Installation:
-        """The same parameters, some taken as exact at what was given, some with another prior sigma."""
+        """The same parameters, some taken as exact at what was given, some free together in one direction.
+
+        Args:
+            held: constants that are taken as exact.
+            freed: prior sigmas of those that are free; of several they change in this proportion.
+        """
         other = copy.copy(self)
         other.__dict__.pop("_gated", None)
         other.sigmas, other._prior_cov = self.sigmas.copy(), self._prior_cov.copy()
         for name, sigma in {**dict.fromkeys(held, _HELD), **freed}.items():
             i = self.index[name]
             other._prior_cov[i], other._prior_cov[:, i] = 0.0, 0.0
-            other._prior_cov[i, i], other.sigmas[i] = sigma**2, sigma
+            other._prior_cov[i, i], other.sigmas[i] = _HELD**2, sigma
+        rows = [self.index[name] for name in freed]
+        other._prior_cov[np.ix_(rows, rows)] += np.outer(list(freed.values()), list(freed.values()))
         return other
 
     def measured(self, row: FloatArray, value: float, sigma: float) -> None:
@@ -215,9 +229,10 @@ def installation_of(
     parameters = registry.motion_parameters(config, roles)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}
     effects = _EFFECTS | {parameter.name: parameter.effects for parameter in parameters}
+    length = [parameter.name for parameter in parameters if parameter.lengthens]
     ground = dict(zip(GROUND, _GROUND_SIGMAS, strict=True)) if config.estimator.ground == "uneven" else {}
     if landmark_map is None:
-        return Installation(sigmas | ground, effects=effects)
+        return Installation(sigmas | ground, None, effects, length)
     if corners:
         m, r = camera.position_sigma_m, camera.rotation_sigma_rad
         focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
@@ -230,7 +245,9 @@ def installation_of(
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)
     sigmas |= ground
-    return Installation(sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None}, effects)
+    return Installation(
+        sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None}, effects, length
+    )
 
 
 def _landmark_sigmas(i: int, landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:

@@ -140,12 +140,14 @@ class Parameter(NamedTuple):
         rank: its place among the parameters of all sensors.
         effects: what it changes: "length" (distances), "turn", "heading" (where landmarks are seen while the robot
             turns). Parameters of one effect may be taken for one another.
+        lengthens: whether it is one of those that, changed alike, make motions longer and leave turns as they are.
     """
 
     name: str
     sigma: float
     rank: Rank = Rank.GAIN
     effects: tuple[str, ...] = ()
+    lengthens: bool = False
 
 
 class FoundRow(NamedTuple):

@@ -43,18 +43,21 @@ def write_mistaken(
     places = beacons(9)
     legs = rng.uniform([0.15, -0.9], [0.5, 0.9], (int(seconds / _LEG_S) + 1, 2))
     pose, spread = np.zeros(3), math.sqrt(0.3 / 0.05)
+    moved: list[tuple[float, float]] = []
     delayed: list[tuple[int, list[tuple[int, float, float]]]] = []
     with BagWriter(folder / "bag") as bag:
         for tick in range(round(seconds * 100)):
             stamp = START_NS + tick * 10_000_000
             v, omega = legs[int(tick * 0.01 / _LEG_S)]
             omega += 0.5 * math.hypot(*pose[:2]) * math.sin(math.atan2(-pose[1], -pose[0]) - pose[2])  # back
+            moved.append((v, omega))
             if tick % 5 == 0:
-                reported_v = wheels * v + rng.normal(0.0, NOISE["x_per_sqrt_m"] * spread)
-                turn = wheels * wheel_turn * omega + rng.normal(0.0, 0.2 * NOISE["yaw_per_sqrt_m"] * spread)
+                mean_v, mean_omega = np.mean(moved[-6:-1] or moved, axis=0)  # of the interval that ends here
+                reported_v = wheels * mean_v + rng.normal(0.0, NOISE["x_per_sqrt_m"] * spread)
+                turn = wheels * wheel_turn * mean_omega + rng.normal(0.0, 0.2 * NOISE["yaw_per_sqrt_m"] * spread)
                 bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (reported_v, turn))
             if gyro and tick % 2 == 0:
-                bag.imu("/imu", stamp, (0.0, 0.0, omega + 0.005 + rng.normal(0.0, 0.004)), (0.0, 0.0, 9.81))
+                bag.imu("/imu", stamp, (0.0, 0.0, omega + 0.005 + rng.normal(0.0, 0.004)), (0.0, v * omega, 9.81))
             if tick % 10 == 0:
                 bag.truth("/truth", stamp, (*pose[:2], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
                 seen = []

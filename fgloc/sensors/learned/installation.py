@@ -19,7 +19,11 @@ def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter
     """With their priors."""
     return (
         Parameter(
-            "learned.scale", config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0, Rank.MODEL, ("length",)
+            "learned.scale",
+            config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0,
+            Rank.MODEL,
+            ("length",),
+            lengthens=True,
         ),
     )
 

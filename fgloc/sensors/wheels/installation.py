@@ -27,8 +27,8 @@ def parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter
     """With their priors. Without a gyro theirs is the clock that others are compared to."""
     wheels = config.wheels
     return (
-        Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn")),
-        Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",)),
+        Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn"), lengthens=True),
+        Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",), lengthens=True),
         Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma, effects=("turn",)),
         Parameter("wheels.slowdown", wheels.slowdown_sigma),
         Parameter("wheels.delay_s", wheels.delay_sigma_s),
