@@ -16,11 +16,13 @@ from fgloc.graph.batch_factors import BatchMotions, BatchSightings
 from fgloc.graph.batch_ground import GroundMotions, ground_covs, ground_of
 from fgloc.graph.batch_solve import (
     Solved,
+    dead_reckoned,
     elimination_order,
     estimated_landmarks,
     initial_values,
     pose_covs,
     solved,
+    values_at,
     with_deep_stack,
     without_orphans,
 )
@@ -99,9 +101,19 @@ class BatchSmoother:
         self._order = elimination_order(self.frames, factors.installation.constants) if factors.known else None
         self._values = initial_values(self.frames, self.accepted, self._factors)
         self._solved: Solved | None = None  # covariances of the last solution
+        if not factors.known:
+            self._begin_at_best()
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
+
+    def _begin_at_best(self) -> None:
+        """Of an unknown map: begin by dead reckoning where the online poses, one by one, fit worse: they ran away."""
+        online = self._values
+        by_beliefs = self._relinearize()
+        self._values = values_at(self.frames, dead_reckoned(self.frames), self.accepted, self._factors)
+        if not self._relinearize() < by_beliefs:
+            self._values = online
 
     def _leave_out_unlikely(self) -> None:
         """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""

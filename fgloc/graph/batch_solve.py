@@ -19,6 +19,7 @@ from fgloc.graph.factors import (
     pose_key,
 )
 from fgloc.graph.ground import ground_key
+from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.types import (
     FloatArray,
@@ -51,9 +52,30 @@ def initial_values(
     frames: list[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
     """Where the batch starts: poses, landmarks and installation as the incremental estimator has them."""
-    values = gtsam.Values()
+    return values_at(frames, [frame.belief.pose for frame in frames], accepted, factors)
+
+
+def dead_reckoned(frames: Sequence[Keyframe]) -> list[FloatArray]:
+    """Poses ``(3,)`` by the motions alone, from the pose that each segment begins at."""
+    poses: list[FloatArray] = []
     for frame in frames:
-        values.insert(pose_key(frame.k), gtsam.Pose2(*frame.belief.pose))
+        if frame.prior is not None or not frame.motions or not poses:
+            poses.append(frame.belief.pose if frame.prior is None else frame.prior.pose)
+        else:
+            poses.append(se2.compose(poses[-1], fuse(frame.motions)[0]))
+    return poses
+
+
+def values_at(
+    frames: list[Keyframe],
+    poses: Sequence[FloatArray],
+    accepted: Mapping[int, tuple[LandmarkFactor, ...]],
+    factors: LandmarkFactors,
+) -> gtsam.Values:
+    """Values with these poses of the keyframes, and the landmarks where they are seen from there."""
+    values = gtsam.Values()
+    for frame, pose in zip(frames, poses, strict=True):
+        values.insert(pose_key(frame.k), gtsam.Pose2(*pose))
         if frame.ground is not None:
             values.insert(ground_key(frame.k), frame.ground)
     if factors.installation.constants:
@@ -61,14 +83,14 @@ def initial_values(
     if factors.known:
         return values
     seen: dict[int, list[FloatArray]] = {}
-    for frame in frames:
+    for frame, pose in zip(frames, poses, strict=True):
         for sighting in accepted[frame.k]:
             m = sighting.measurement
             if isinstance(m, FrameMeasurement):
-                seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, m.pose))
+                seen.setdefault(m.landmark_id, []).append(se2.compose(pose, m.pose))
             elif isinstance(m, PointMeasurement):
                 local = [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0]
-                seen.setdefault(m.landmark_id, []).append(se2.compose(frame.belief.pose, local)[:2])
+                seen.setdefault(m.landmark_id, []).append(se2.compose(pose, local)[:2])
     for landmark_id, places in seen.items():
         middle = places[int(np.argsort([p[0] for p in places])[len(places) // 2])]  # one of them: yaw has no median
         value = middle if len(middle) == 2 else gtsam.Pose2(*middle)

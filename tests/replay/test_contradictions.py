@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mistaken_robot import write_mistaken
+from real_data import real_data
 from robot_world import config
 
 from fgloc.config import Config
@@ -91,3 +92,14 @@ def test_without_a_map_ranges_or_wheels_are_named_together(tmp_path):
     assert not finding.lines
     assert "wheels.scale_v" in finding.text
     assert "landmarks.range_scale" in finding.text
+
+
+@pytest.mark.real_data
+def test_a_batch_without_a_map_never_runs_away():
+    """Marker positions in optical axes, read as if they were the base's."""
+    settings = Config.model_validate({"truth": {"align": "se2"}, "recording": {"received_stamps": ["odometry"]}})
+    result = run(real_data("pioneer_aruco", "duarte.bag"), None, settings, "batch", check=False)
+    assert np.hypot(*result.trajectory.poses[:, :2].T).max() < 30.0
+    assert not beyond(result)
+    (finding,) = contradictions(result)
+    assert not finding.lines
