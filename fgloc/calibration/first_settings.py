@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 
 from fgloc.config import Config, Role, config_of
-from fgloc.diagnosis.conventions import conventions
+from fgloc.diagnosis.conventions import Conventions, conventions
+from fgloc.diagnosis.pairs import Noise
 from fgloc.diagnosis.signals import read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
@@ -23,6 +24,7 @@ from fgloc.sensors import registry
 from fgloc.sensors.first_settings import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
+_CORRELATED_S = 0.1  # shorter than between two messages of most sensors
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
@@ -83,15 +85,39 @@ def first_settings(bag: Path) -> RobotFile:
         "#   model: models/model.safetensors",
     ]
     text = "\n".join(lines) + "\n"
-    found = () if seen.info.problems else _compared(bag, text)
+    compared = None if seen.info.problems else _compared(bag, text)
+    found = () if compared is None else ordered(compared.findings)
     text = with_findings(text, found)
+    if compared is not None and compared.noise is not None:
+        text = _with_lines(text, _noise_lines(compared.noise))
     missing += [f.text for f in found if not f.lines]
     lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
     return RobotFile(text, dict(seen.info.roles), tuple(dict.fromkeys(missing)), found)
 
 
-def _compared(bag: Path, text: str) -> tuple[Finding, ...]:
+def _noise_lines(noise: Noise) -> dict[str, list[str]]:
+    """Noise of the sensor of landmarks that the recording shows beyond the defaults, by section.
+
+    A recording can show that errors are larger than the defaults; that they are smaller it does not: over seconds the
+    errors of one view are alike, and hidden.
+    """
+    section, lines = Config().landmarks, []
+    if noise.correlated_s >= _CORRELATED_S:
+        lines += ["  # So long the errors of one landmark are alike.", f"  repeat_s: {noise.correlated_s:.2g}"]
+    wide = {"range_sigma_m": noise.range_m, "bearing_sigma_rad": noise.bearing_rad}
+    wide = {key: value for key, value in wide.items() if value > getattr(section, key)}
+    if wide:
+        lines += ["  # Noise that the wheels' motion leaves unexplained."]
+        lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
+    blocks = {"landmarks": lines} if lines else {}
+    if noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
+        about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."
+        blocks["map"] = [about, f"  position_sigma_m: {noise.map_m:.2g}"]
+    return blocks
+
+
+def _compared(bag: Path, text: str) -> Conventions:
     """Conventions of the recording, read as the settings so far have it."""
     config = config_of(yaml.safe_load(text) or {})
     map_path = find_beside(bag, "map.yaml")
@@ -102,8 +128,7 @@ def _compared(bag: Path, text: str) -> tuple[Finding, ...]:
             landmark_map, T_base_sensor, imu_up = setup.landmark_map, setup.T_base_sensor, setup.imu_up
         except FglocError:  # what is missing is said elsewhere; without it less can be compared
             pass
-        found = conventions(read_signals(recording, config), config, T_base_sensor, imu_up, landmark_map)
-    return ordered(found.findings)
+        return conventions(read_signals(recording, config), config, T_base_sensor, imu_up, landmark_map)
 
 
 def with_findings(text: str, findings: Sequence[Finding]) -> str:
@@ -123,7 +148,13 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
         comment = textwrap.wrap(why, 110, initial_indent="  # ", subsequent_indent="  # ")
         block = written.setdefault(section, [])
         block += [*(() if comment[0] in block else comment), f"  {name}: {value}"]
-    for section, block in written.items():
+    return _with_lines("\n".join(lines) + "\n", written)
+
+
+def _with_lines(text: str, blocks: Mapping[str, Sequence[str]]) -> str:
+    """A robot.yaml with lines put at the head of its sections."""
+    lines = text.splitlines()
+    for section, block in blocks.items():
         if f"{section}:" not in lines:
             lines += ["", f"{section}:"]
         at = lines.index(f"{section}:") + 1

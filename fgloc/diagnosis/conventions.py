@@ -22,12 +22,15 @@ from fgloc.diagnosis.pairs import (
     BodyFit,
     Figure,
     Mounting,
+    Noise,
     RateFit,
     fit_body,
     fit_map,
+    fit_on_map,
     fit_rate,
     fit_sightings,
     planar,
+    track_noise,
 )
 from fgloc.diagnosis.pose_text import sensor_pose
 from fgloc.diagnosis.signals import Path, Sightings, Signals
@@ -39,6 +42,7 @@ _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
+_BIAS_M = 0.03  # of a range
 _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
@@ -57,12 +61,14 @@ class Conventions:
         findings: with the lines that undo them.
         config: with those lines.
         compared: sentences on the pairs that were compared and agree, for `init`'s comments.
+        noise: of the sensor of landmarks, where its axes are right; no finding, but a better start than the defaults.
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
     """
 
     config: Config
     findings: list[Finding] = field(default_factory=list)
     compared: list[str] = field(default_factory=list)
+    noise: Noise | None = None
     opposite: bool = False
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
@@ -411,7 +417,9 @@ def _sensor(
     """Axes, mirror, scale and place of the sensor of landmarks; None: the wheels do not tell."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     section = found.config.landmarks
-    turned = (seen.points * section.range_scale) @ T[:3, :3].T
+    distance = np.maximum(np.linalg.norm(seen.points, axis=1, keepdims=True), 1e-9)
+    ranged = section.range_scale * np.maximum(1.0 - section.range_bias_m / distance, 1e-3) * seen.points
+    turned = ranged @ T[:3, :3].T
     c, s = math.cos(section.bearing_bias_rad), math.sin(section.bearing_bias_rad)
     turned[:, :2] = turned[:, :2] @ np.array([[c, -s], [s, c]])
     as_given = Sightings(seen.times, seen.ids, turned, seen.spatial)
@@ -426,7 +434,7 @@ def _sensor(
     if best.axes == "body" or (sound is not None and sound.misfit < _WORSE * best.misfit):
         assert sound is not None
         return _constants(found, path, as_given, sound, T, landmark_map)
-    raw = Sightings(seen.times, seen.ids, seen.points * section.range_scale, seen.spatial)
+    raw = Sightings(seen.times, seen.ids, ranged, seen.spatial)
     chosen = best if T_base_sensor is None else _best(fit_sightings(path, raw) or {best.axes: best})
     pose = _pose_of(chosen, T)
     lines: dict[str, Any] = {}
@@ -486,8 +494,11 @@ def _constants(
 ) -> Mounting:
     """Scale and mounting of a sensor whose axes are right."""
     scaled = m.scale.off(1.0, _SCALE)
+    before = len(found.findings)
     if scaled or landmark_map is not None:
         _scale(found, path, seen, m, landmark_map)
+    if len(found.findings) == before:
+        m, scaled = _by_map(found, path, seen, m, landmark_map), False
     place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], _PLACED_M) and f.sigma < 0.5 * _PLACED_M]
     turned = m.yaw.off(0.0, _TURNED_RAD)
     if place or turned:
@@ -518,6 +529,34 @@ def _constants(
             f"{math.degrees(m.yaw.value):+.1f} ± {math.degrees(m.yaw.sigma):.1f}° to the left"
         )
     return m
+
+
+def _by_map(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmark_map: LandmarkMap | None) -> Mounting:
+    """Name ranges that the map refutes, and note the noise; the mounting as wheels and map determine it best."""
+    section = found.config.landmarks
+    known = {} if landmark_map is None else {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
+    fitted = fit_on_map(path, seen, m, known) if len(known) > 2 else None
+    if fitted is None:
+        found.noise = track_noise(path, seen, m)
+        return m
+    by_map, found.noise = fitted
+    long = by_map.too_long_m
+    if long.off(0.0, _BIAS_M, 4.0):
+        found.add(
+            "sightings.range",
+            f"Ranges are {long.value:+.3f} ± {long.sigma:.3f} m too long at {by_map.distance_m:.1f} m, by the map",
+            {
+                "landmarks.range_bias_m": round(section.range_bias_m + by_map.bias_m.value / section.range_scale, 4),
+                "landmarks.range_scale": round(section.range_scale * by_map.scale.value, 4),
+            },
+            long,
+            Severity.ERROR,
+        )
+    better = {}
+    for name in ("yaw", "x", "y", "late_s"):
+        wheels, on_map = getattr(m, name), getattr(by_map, name)
+        better[name] = on_map if on_map.sigma < wheels.sigma else wheels
+    return replace(m, **better)
 
 
 def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmark_map: LandmarkMap | None) -> None:

@@ -10,6 +10,7 @@ Tibshirani, An Introduction to the Bootstrap, chapter 11 (jackknife); Umeyama 19
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -583,3 +584,227 @@ def _point_similarity(a: ComplexArray, b: ComplexArray) -> tuple[float, float] |
         return None
     s = np.vdot(a, b) / size_a
     return math.sqrt(size_b / size_a), math.sqrt(float(np.sum(np.abs(b - s * a) ** 2)) / size_b)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What a sensor of landmarks is off by on a known map, over short stretches of the wheels' path.
+
+    Attributes:
+        scale: true over reported range, once the bias is subtracted.
+        bias_m: subtracted from reported ranges.
+        yaw: of the sensor in the base frame, beside its axes [rad].
+        x: place of the sensor in the base frame [m].
+        y: likewise.
+        late_s: how much later its stamps are than the wheels'.
+        too_long_m: reported less true range at the median distance, which is known better than scale and bias.
+        distance_m: that distance.
+    """
+
+    scale: Figure
+    bias_m: Figure
+    yaw: Figure
+    x: Figure
+    y: Figure
+    late_s: Figure
+    too_long_m: Figure
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of a sensor of landmarks, by what the wheels leave unexplained over some seconds.
+
+    Attributes:
+        range_m: standard deviation of a range.
+        bearing_rad: standard deviation of a bearing.
+        correlated_s: time over which one landmark's errors are alike.
+        map_m: by how much landmarks stand elsewhere than on the map, on each axis; None: there is no map.
+    """
+
+    range_m: float
+    bearing_rad: float
+    correlated_s: float
+    map_m: float | None
+
+
+_WINDOW_S = (
+    20.0  # over which the wheels' path is laid on the map: shorter ones hardly turn, and leave range and place alike
+)
+_SPREAD_M = 0.5  # of the landmarks of a window, for its yaw
+_ROUNDS = 3  # of the noise and the fit
+_LONGEST_CORRELATION_S = 2.0
+
+
+class _OnMap:
+    """Residuals of sightings of known landmarks, each window of the wheels' path laid on the map by itself."""
+
+    # sigmas of log scale, bias [m], yaw [rad], place [m, m] and lag [s]: what a careless installation is off by
+    PRIOR = np.array([0.05, 0.1, 0.2, _Places.PLACE_M, _Places.PLACE_M, 0.2])
+
+    def __init__(self, path: Path, seen: Sightings, z: ComplexArray, places: dict[int, FloatArray]) -> None:
+        known = np.array([int(i) in places for i in seen.ids])
+        known &= path.known(seen.times - MOST_LAG_S, seen.times + MOST_LAG_S) & (np.abs(z) > 1e-6)
+        window = ((seen.times - seen.times[0]) / _WINDOW_S).astype(np.int64)
+        m = np.array([complex(*places[int(i)]) if k else 0j for i, k in zip(seen.ids, known, strict=True)])
+        for w in np.unique(window):
+            use = known & (window == w)
+            known[use] = use.sum() >= 8 and float(np.std(m[use])) > _SPREAD_M
+        self.times, self.ids, self.z, self.m = seen.times[known], seen.ids[known], z[known], m[known]
+        _, self.window = np.unique(window[known], return_inverse=True)
+        self._path = path
+        self.sigma_m, self.sigma_rad = 0.1, 0.02
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def take(self, keep: NDArray[np.bool_]) -> _OnMap:
+        """The same for a part of the sightings."""
+        part = copy.copy(self)
+        part.times, part.ids, part.z, part.m = self.times[keep], self.ids[keep], self.z[keep], self.m[keep]
+        _, part.window = np.unique(self.window[keep], return_inverse=True)
+        return part
+
+    def errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """Range [m] and bearing [rad] reported less predicted ``(n,)``, and the latter's direction on the map."""
+        scale, bias, yaw, bx, by, late = x.tolist()
+        r, bearing = np.abs(self.z), np.angle(self.z)
+        p, turned = _complex_poses(self._path, self.times - late)
+        seen = math.exp(np.clip(scale, -3.0, 3.0)) * (r - bias) * np.exp(1j * (bearing + yaw))
+        q = p + turned * (seen + complex(bx, by))
+        weights = 1.0 / (self.sigma_m**2 + (self.sigma_rad * r) ** 2)
+        total = np.bincount(self.window, weights)
+
+        def mean(values: ComplexArray) -> ComplexArray:
+            parts = [np.bincount(self.window, weights * part) / total for part in (values.real, values.imag)]
+            return np.asarray((parts[0] + 1j * parts[1])[self.window])
+
+        dq, dm = q - mean(q), self.m - mean(self.m)
+        product = weights * dm * dq.conj()
+        sums = np.bincount(self.window, product.real) + 1j * np.bincount(self.window, product.imag)
+        rotation = (sums / np.maximum(np.abs(sums), 1e-12))[self.window]  # takes the path to the map
+        away = (dm * rotation.conj() + mean(q) - p) / turned - complex(bx, by)  # where the map has it, from the sensor
+        off = np.angle(seen * away.conj())
+        return np.abs(seen) - np.abs(away), np.asarray(off), np.asarray(rotation * turned * away)
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """``(2 n,)`` whitened."""
+        along, across, _ = self.errors(x)
+        off = np.concatenate([along / self.sigma_m, across / self.sigma_rad])
+        return np.where(np.isfinite(off), off, 1e3)
+
+    def solve(self, x: FloatArray) -> FloatArray:
+        """Gauss-Newton with Cauchy weights; sightings of one landmark within a second count as one."""
+        cells = len(np.unique(np.column_stack([self.ids, self.times.astype(np.int64)]), axis=0))
+        share, prior = cells / len(self), self.PRIOR**-2.0
+        for _ in range(20):
+            r = self.residuals(x)
+            J = np.column_stack([(self.residuals(x + 1e-5 * e) - r) / 1e-5 for e in np.eye(len(x))])
+            weights = share / (1.0 + (r / 1.5) ** 2)
+            H = (J.T * weights) @ J + np.diag(prior)
+            step = np.linalg.solve(H, -(J.T @ (weights * r) + prior * x))
+            x = x + step / max(1.0, float(np.abs(step / self.PRIOR).max()))
+            if np.abs(step / self.PRIOR).max() < 1e-3:
+                break
+        return x
+
+
+def fit_on_map(
+    path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]
+) -> tuple[Calibration, Noise] | None:
+    """Calibration and noise of a sensor whose axes are right, on a known map; None: too little is seen of it.
+
+    Args:
+        path: motion of the wheels.
+        seen: sightings in the base's axes.
+        mounting: by the wheels alone.
+        places: ``(2,)`` of landmarks on the map [m], by id.
+    """
+    on_map = _OnMap(path, seen, planar(seen.points, "body"), places)
+    if len(on_map) < 100 or on_map.window.max() < 2:
+        return None
+    x = np.array([0.0, 0.0, mounting.yaw.value, mounting.x.value, mounting.y.value, mounting.late_s.value])
+    x[3:5] = np.clip(x[3:5], -1.0, 1.0)
+
+    for _ in range(_ROUNDS):
+        x = on_map.solve(x)
+        along, across, _ = on_map.errors(x)
+        on_map.sigma_m = max(_MAD * float(np.median(np.abs(along))), 0.005)
+        on_map.sigma_rad = max(_MAD * float(np.median(np.abs(across))), 0.001)
+    blocks = (on_map.window * _BLOCKS) // (int(on_map.window.max()) + 1)
+    used = [b for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(on_map)]
+    left_out = np.array([on_map.take(blocks != b).solve(x) for b in used])
+    s = jackknife(left_out).tolist()
+    values = [math.exp(x[0]), *x[1:].tolist()]
+    figures = [Figure(v, sigma) for v, sigma in zip(values, [values[0] * s[0], *s[1:]], strict=True)]
+    typical = float(np.median(np.abs(on_map.z)))
+    long = [typical - math.exp(one[0]) * (typical - one[1]) for one in (x, *left_out)]
+    too_long = Figure(long[0], float(jackknife(np.array(long[1:])[:, None])[0]))
+    along, across, _ = on_map.errors(x)
+    scale, bias_m, yaw, place_x, place_y, late_s = figures
+    found = Calibration(scale, bias_m, yaw, place_x, place_y, late_s, too_long, typical)
+    return found, _noise(on_map, x, along, across)
+
+
+def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray) -> Noise:
+    """Noise by the residuals: what is alike for a landmark in all its views is the map's."""
+    _, _, direction = on_map.errors(x)
+    unit = direction / np.maximum(np.abs(direction), 1e-9)
+    off = unit * (along + 1j * np.abs(direction) * np.clip(across, -0.2, 0.2))  # on the map
+    mean = {}
+    for i in np.unique(on_map.ids):
+        own = on_map.ids == i
+        if own.sum() >= 20:
+            mean[int(i)] = complex(np.median(off[own].real), np.median(off[own].imag))
+    moved = np.array([mean.get(int(i), 0j) for i in on_map.ids])
+    local = (off - moved) / unit
+    spread = [_MAD * float(np.median(np.abs(part))) for part in (local.real, local.imag / np.abs(direction))]
+    parts = [v for one in mean.values() for v in (one.real, one.imag)]
+    map_m = float(np.sqrt(np.mean(np.square(parts)))) if len(mean) > 2 else 0.0
+    correlated = correlation_time(on_map.times, on_map.ids, np.asarray(local.real / max(spread[0], 1e-9)))
+    return Noise(max(spread[0], 0.003), max(spread[1], 0.0005), correlated, map_m)
+
+
+def track_noise(path: Path, seen: Sightings, m: Mounting) -> Noise:
+    """Noise of a sensor by the scatter of each landmark's place over some seconds, without a map."""
+    z = planar(seen.points, m.axes)
+    keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
+    times, ids, z = seen.times[keep], seen.ids[keep], z[keep]
+    part = _Places(path, times, z, _tracks(times, ids))
+    x = np.array([math.log(max(m.scale.value, 1e-9)), m.yaw.value, m.x.value, m.y.value, m.late_s.value])
+    n = len(z)
+    off = part.residuals(x)[: 2 * n] * part.SIGMA
+    along, across = off[:n] * np.abs(z) * m.scale.value, off[n:]
+    sigma_m, sigma_rad = (_MAD * float(np.median(np.abs(one))) for one in (along, across))
+    correlated = correlation_time(times, ids, along / max(sigma_m, 1e-9))
+    return Noise(max(sigma_m, 0.003), max(sigma_rad, 0.0005), correlated, None)
+
+
+def correlation_time(times: FloatArray, ids: IntArray, errors: FloatArray) -> float:
+    """Time [s] over which errors ``(n,)`` of one landmark, of about unit size, are alike: integral of the correlation.
+
+    Source: Priestley, Spectral Analysis and Time Series, 5.3 (integral time scale), both sides of it.
+    """
+    errors = np.clip(errors, -3.0, 3.0)
+    width = 0.1
+    sums, counts = np.zeros(int(_LONGEST_CORRELATION_S / width) + 1), np.zeros(int(_LONGEST_CORRELATION_S / width) + 1)
+    for i in np.unique(ids):
+        own = np.flatnonzero(ids == i)
+        for step in range(1, 80):
+            if step >= len(own):
+                break
+            apart = times[own[step:]] - times[own[:-step]]
+            use = apart <= _LONGEST_CORRELATION_S
+            if not use.any():
+                break
+            k = (apart[use] / width).astype(int)
+            np.add.at(sums, k, (errors[own[step:]] * errors[own[:-step]])[use])
+            np.add.at(counts, k, 1.0)
+    variance = float(np.mean(errors**2))
+    seen = counts > 20
+    if not seen.any() or variance <= 0.0:
+        return 0.0
+    rho = np.interp(np.arange(len(sums)), np.flatnonzero(seen), sums[seen] / counts[seen]) / variance
+    ends = np.flatnonzero(rho < 0.05)
+    rho = np.clip(rho[: int(ends[0])] if len(ends) else rho, 0.0, 1.0)
+    return float(min(2.0 * width * rho.sum(), _LONGEST_CORRELATION_S))
