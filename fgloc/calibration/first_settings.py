@@ -24,7 +24,7 @@ from fgloc.sensors import registry
 from fgloc.sensors.first_settings import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
-_CORRELATED_S = 0.1  # shorter than between two messages of most sensors
+_CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
@@ -103,14 +103,14 @@ def _noise_lines(noise: Noise) -> dict[str, list[str]]:
     errors of one view are alike, and hidden.
     """
     section, lines = Config().landmarks, []
-    if noise.correlated_s >= _CORRELATED_S:
-        lines += ["  # So long the errors of one landmark are alike.", f"  repeat_s: {noise.correlated_s:.2g}"]
+    repeat_s = max(noise.correlated_s, _CORRELATED_S)
+    lines += ["  # So long the errors of one landmark are taken to be alike.", f"  repeat_s: {repeat_s:.2g}"]
     wide = {"range_sigma_m": noise.range_m, "bearing_sigma_rad": noise.bearing_rad}
     wide = {key: value for key, value in wide.items() if value > getattr(section, key)}
     if wide:
         lines += ["  # Noise that the wheels' motion leaves unexplained."]
         lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
-    blocks = {"landmarks": lines} if lines else {}
+    blocks = {"landmarks": lines}
     if noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
         about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."
         blocks["map"] = [about, f"  position_sigma_m: {noise.map_m:.2g}"]

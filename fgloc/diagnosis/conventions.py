@@ -460,6 +460,7 @@ def _sensor(
     found.add(code, text, lines, None, Severity.ERROR)
     if chosen.scale.off(1.0, _SCALE):
         _scale(found, path, raw, chosen, landmark_map)
+    found.noise = track_noise(path, raw, chosen)
     return chosen
 
 
