@@ -29,6 +29,7 @@ _LAG_STEP_S = 0.05
 _PAIR_S = (0.4, 6.0)  # between two sightings of one landmark: the wheels err little over seconds
 _MOST_PAIRS = 4000
 _BLOCKS = 8  # of time, of the jackknife
+_MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _RATE_HALF_S = 0.15  # yaw rates are means over twice this
 _TURN_HALF_S = 1.0
@@ -207,6 +208,9 @@ def _refined(
     left_out = [solve(blocks != b, x)[0] for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(blocks)]
     sigmas = jackknife(np.array(left_out)) if len(left_out) > 2 else np.full(5, np.inf)
     scale, yaw, bx, by, late = x.tolist()
+    if abs(late) >= MOST_LAG_S or abs(scale) > _MOST_LOG_SCALE:  # it ran to where nothing tells
+        sigmas = np.full(5, np.inf)
+        late, scale = min(max(late, -MOST_LAG_S), MOST_LAG_S), min(max(scale, -_MOST_LOG_SCALE), _MOST_LOG_SCALE)
     height = _wander(up_of(seen.points[keep][::every], name), tracks) if seen.spatial else 0.0
     return Mounting(
         name,
@@ -255,7 +259,7 @@ class _Places:
         """``(2 n + 2,)``: along and across the line of sight, over the range, in units of `SIGMA`; and the prior."""
         scale, yaw, bx, by, late = x.tolist()
         alpha, beta = math.exp(min(scale, 50.0)) * np.exp(1j * yaw), complex(bx, by)
-        p, r = _complex_poses(self._path, self._times - late)
+        p, r = _complex_poses(self._path, self._times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
         q = p + r * (alpha * self._z + beta)
         real, imaginary = (np.bincount(self._tracks, part) / self._counts for part in (q.real, q.imag))
         place = (real + 1j * imaginary)[self._tracks]
@@ -669,7 +673,7 @@ class _OnMap:
         """Range [m] and bearing [rad] reported less predicted ``(n,)``, and the latter's direction on the map."""
         scale, bias, yaw, bx, by, late = x.tolist()
         r, bearing = np.abs(self.z), np.angle(self.z)
-        p, turned = _complex_poses(self._path, self.times - late)
+        p, turned = _complex_poses(self._path, self.times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
         seen = math.exp(np.clip(scale, -3.0, 3.0)) * (r - bias) * np.exp(1j * (bearing + yaw))
         q = p + turned * (seen + complex(bx, by))
         weights = 1.0 / (self.sigma_m**2 + (self.sigma_rad * r) ** 2)
