@@ -36,7 +36,7 @@ class BagWriter(LandmarkMessages):
         covs: tuple[ArrayLike | None, ArrayLike | None] = (None, None),
         frames: tuple[str, str] = ("odom", "base_link"),
     ) -> None:
-        """``nav_msgs/Odometry``: pose x, y, yaw; twist v, omega.
+        """``nav_msgs/Odometry``: pose x, y, yaw; twist v, omega or vx, vy, omega.
 
         Args:
             topic: of the message.
@@ -56,7 +56,7 @@ class BagWriter(LandmarkMessages):
             ),
             twist=self._make(
                 "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._twist([twist[0], 0.0, 0.0], [0.0, 0.0, twist[1]]),
+                twist=self._twist([twist[0], twist[1] if len(twist) > 2 else 0.0, 0.0], [0.0, 0.0, twist[-1]]),
                 covariance=flat_cov(twist_cov),
             ),
         )

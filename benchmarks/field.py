@@ -1,0 +1,352 @@
+"""Recordings that others made, as a user would run them: ``python -m benchmarks.field [--quick] [--only NAME,...]``.
+
+Each of `benchmarks.field_recordings.RECORDINGS` goes through ``fgloc init`` into a fresh folder, then ``info``,
+``smooth`` and ``online`` with the ``robot.yaml`` that ``init`` wrote and the set's own map, as command lines. Beside
+them odometry alone and a textbook's iSAM2 run on the same messages (`benchmarks.field_peers`). What a recording is to
+tell by itself is in `benchmarks.field_sheet`.
+
+ATE is the rmse of positions at the stamps of the odometry (10 Hz at most) against a truth without frozen poses and
+glitches. Where the truth's frame is not the map's, one rigid motion is fitted for each estimator alike, and likewise
+the place of the tracked body on the robot where it is not stated, and the clock of a truth without stamps. An odometry
+has a frame of its own always.
+
+- ``field.NAME.{batch,online}.{ate_m,ate_over_odometry,ate_over_textbook,nees_over_3,exit}``
+- ``field.worse``: runs whose ATE is over 1.05 times and 2 mm more than that of odometry or of the textbook, without
+  exit 3 and the right cause first. ``field.crashes``: commands that ended neither with 0 or 3 nor with a sentence.
+- ``field.geomean_over_odometry``: of runs with truth and landmarks. ``field.nees``: share of runs with NEES/3 in 0.4 to
+  2.5, or exit 3 with the right cause. ``field.traps_found``, ``field.false``: see `benchmarks.field_sheet`.
+- ``field.beyond_gate``: constants that were used more than 4 prior sigmas from what was given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.common import Row, main, not_run
+from benchmarks.field_peers import Heard, hear, textbook
+from benchmarks.field_recordings import DATA, RECORDINGS, Recording
+from benchmarks.field_sheet import SHEET, SOUND, false_findings, found, right_cause
+from benchmarks.installed_runs import kept
+from fgloc import se2
+from fgloc.recording.outputs import read_tum
+from fgloc.sensors.maps import load_map
+from fgloc.types import FloatArray, IntArray, Trajectory
+
+Mode = Literal["batch", "online"]
+MODES: tuple[Mode, ...] = ("batch", "online")
+QUICK = ("duarte", "turtlebot_aruco", "uwb_indoor")
+_WORKERS = 2
+_LIMIT_S = 600.0  # of a command
+_WORSE, _WORSE_M = 1.05, 0.002
+_GATE = 4.0  # prior sigmas
+_NEES = (0.4, 2.5)
+_LAGS_S = np.arange(-0.3, 0.3001, 0.02)  # of a truth without stamps
+_BRIDGED_S = 1.0  # between poses of an estimate
+_LEAST = 10  # compared positions
+_ESCAPES = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+
+
+@dataclass(slots=True)
+class Outcome:
+    """Results of one recording.
+
+    Attributes:
+        said: what ``init``, ``info``, ``smooth`` and ``online`` printed.
+        codes: their exit codes; 124: longer than the limit.
+        metrics: ``metrics.json`` of the two modes; empty: none was written.
+        ate: of "odometry", "textbook.batch", "textbook.online", "batch", "online" [m].
+        error: why the recording could not be read for the comparison.
+    """
+
+    said: dict[str, str] = field(default_factory=dict)
+    codes: dict[str, int] = field(default_factory=dict)
+    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)
+    ate: dict[str, float] = field(default_factory=dict)
+    error: str = ""
+
+    def findings(self, mode: Mode) -> list[dict[str, Any]]:
+        """Findings of a run, the gravest first; its error, if it gave no result."""
+        if mode in self.metrics:
+            return list(self.metrics[mode].get("findings", []))
+        lines = [line for line in self.said.get(mode, "").splitlines() if line.startswith("error")]
+        return [{"code": "error", "severity": "error", "text": line} for line in lines[:1]]
+
+    def best(self, mode: Mode) -> float:
+        """Least ATE of odometry and textbook [m]; infinite: there is none."""
+        return min((self.ate[k] for k in ("odometry", f"textbook.{mode}") if k in self.ate), default=math.inf)
+
+
+# --- Errors -----------------------------------------------------------------------------------------------------------
+
+
+def distances(poses: FloatArray, truth: FloatArray, align: bool, lever: bool) -> FloatArray:
+    """Distances ``(n,)`` [m] of ``poses (n, 3)`` from positions ``truth (n, 2)``, by the best motion and lever arm.
+
+    Least squares over the angle and place of the truth's frame (``align``) and the place of the tracked body on the
+    robot (``lever``), in closed form: with complex numbers z + exp(i yaw) a = c w + t, where c has length one.
+    """
+    z, w = (p[:, 0] + 1j * p[:, 1] for p in (poses, truth))
+    columns = [np.exp(1j * poses[:, 2])] if lever else []
+    if align:
+        columns.append(np.ones(len(z), dtype=complex))
+    if columns:
+        basis = np.linalg.qr(np.column_stack(columns))[0]
+        z, w = (p - basis @ (basis.conj().T @ p) for p in (z, w))
+    if align:
+        turn = np.vdot(w, z)
+        w = w * (turn / abs(turn) if abs(turn) > 0.0 else 1.0)
+    return np.asarray(np.abs(z - w))
+
+
+def ate(estimate: Trajectory, truth: Trajectory, at_ns: IntArray, align: bool, lever: bool, clock: bool) -> float:
+    """Rmse of positions at these stamps [m]; NaN where too few can be compared."""
+    gap = max(0.25, 3.0 * float(np.median(np.diff(truth.stamps_ns))) * 1e-9)
+    at_ns = at_ns[_covered(estimate.stamps_ns, at_ns, _BRIDGED_S)]
+    if len(at_ns) == 0:
+        return math.nan
+    poses = se2.interpolate(estimate.stamps_ns, estimate.poses, at_ns)
+    best = math.inf
+    for lag in _LAGS_S if clock else np.zeros(1):
+        shifted = at_ns + round(float(lag) * 1e9)
+        known = _covered(truth.stamps_ns, shifted, gap)
+        if known.sum() < _LEAST:
+            continue
+        true = np.column_stack([np.interp(shifted[known], truth.stamps_ns, truth.poses[:, k]) for k in (0, 1)])
+        best = min(best, float(np.sqrt(np.mean(distances(poses[known], true, align, lever) ** 2))))
+    return best if math.isfinite(best) else math.nan
+
+
+def _covered(stamps: IntArray, at_ns: IntArray, gap_s: float) -> Any:
+    """Which stamps lie between two that are no further apart than this."""
+    if len(stamps) < 2:
+        return np.zeros(len(at_ns), dtype=bool)
+    k = np.clip(np.searchsorted(stamps, at_ns), 1, len(stamps) - 1)
+    inside = (at_ns >= stamps[0]) & (at_ns <= stamps[-1])
+    return inside & (stamps[k] - stamps[k - 1] <= gap_s * 1e9)
+
+
+# --- Runs -------------------------------------------------------------------------------------------------------------
+
+
+def outcome(recording: Recording) -> Outcome:
+    """Run a recording through the commands and score it; the commands' results are kept by the sources' hash."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        try:
+            bag = recording.bag(folder)
+            ran = kept(f"field_{recording.name}", lambda: _commands(recording, bag, folder))
+        except Exception as error:  # a recording that breaks is a row
+            return Outcome(error=f"{type(error).__name__}: {error}")
+        out = Outcome(
+            {name: r["said"] for name, r in ran.items()},
+            {name: r["code"] for name, r in ran.items()},
+            {name: r["metrics"] for name, r in ran.items() if r.get("metrics")},
+        )
+        try:
+            heard = hear(bag, recording.truth)
+            places = recording.map_path(folder)
+            landmarks = {} if places is None else {i: k.position[:2] for i, k in load_map(places).landmarks.items()}
+            out.ate = _ates(recording, heard, landmarks, ran)
+        except Exception as error:
+            out.error = f"{type(error).__name__}: {error}"
+    return out
+
+
+def _commands(recording: Recording, bag: Path, folder: Path) -> dict[str, Any]:
+    """Exit code, output, time, poses and metrics of each command line."""
+    config, found_map = folder / "init" / "robot.yaml", recording.map_path(folder)
+    config.parent.mkdir()
+    given = [str(bag), "--config", str(config), *([] if found_map is None else ["--map", str(found_map)])]
+    results = {"init": _command(["init", str(bag), "--out", str(config)])}
+    if not config.is_file():
+        given = [part for part in given if part not in ("--config", str(config))]
+    results["info"] = _command(["info", *given])
+    for mode, name in (("batch", "smooth"), ("online", "online")):
+        out = folder / mode
+        results[mode] = _command([name, *given, "--out", str(out)])
+        if (out / "metrics.json").is_file():
+            results[mode]["metrics"] = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+        if (out / "trajectory.tum").is_file():
+            tum = read_tum(out / "trajectory.tum")
+            results[mode] |= {"stamps": tum.stamps_ns.tolist(), "poses": tum.poses.tolist()}
+    return results
+
+
+def _command(arguments: Sequence[str]) -> dict[str, Any]:
+    began = time.monotonic()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "fgloc.cli", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=_LIMIT_S,
+            check=False,
+        )
+        said, code = done.stdout + done.stderr, done.returncode
+    except subprocess.TimeoutExpired:
+        said, code = f"error: longer than {_LIMIT_S:.0f} s", 124
+    return {"code": code, "said": _ESCAPES.sub("", said), "seconds": round(time.monotonic() - began, 1)}
+
+
+def _ates(
+    recording: Recording, heard: Heard, landmarks: Mapping[int, FloatArray], ran: Mapping[str, Any]
+) -> dict[str, float]:
+    truth = heard.truth
+    if truth is None or len(truth.stamps_ns) < 2:
+        return {}
+    estimates: dict[str, Trajectory] = {}
+    if heard.odometry is not None:
+        estimates["odometry"] = heard.odometry
+    given = landmarks if recording.frame == "map" else {}
+    if (plain := textbook(heard, given)) is not None:
+        estimates["textbook.online"], estimates["textbook.batch"] = plain
+    for mode in MODES:
+        if "poses" in ran[mode] and len(ran[mode]["poses"]) > 1:
+            estimates[mode] = Trajectory(np.array(ran[mode]["stamps"]), np.array(ran[mode]["poses"]))
+    base = heard.odometry or estimates.get("batch") or estimates.get("online")
+    if base is None:
+        return {}
+    at_ns = base.stamps_ns[np.r_[True, np.diff(base.stamps_ns // 100_000_000) > 0]]
+    stampless = recording.truth.endswith("ground_pose")
+    out = {}
+    for name, estimate in estimates.items():
+        align = recording.frame == "se2" or name == "odometry" or not given
+        value = ate(estimate, truth, at_ns, align, recording.lever, stampless)
+        if math.isfinite(value):
+            out[name] = value
+    return out
+
+
+# --- Rows -------------------------------------------------------------------------------------------------------------
+
+
+def measure(quick: bool, only: Sequence[str] = (), page: Path | None = None) -> Iterator[Row]:
+    """All rows; a quick run has three recordings."""
+    chosen = [r for r in RECORDINGS if r.name in (only or (QUICK if quick else [x.name for x in RECORDINGS]))]
+    if not DATA.is_dir():
+        yield from not_run(["field.worse", "field.traps_found"], f"no {DATA}; set FGLOC_REAL_DATA")
+        return
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        outcomes = {}
+        for recording, o in zip(chosen, pool.map(outcome, chosen), strict=True):
+            outcomes[recording.name] = o
+            _say(recording, o)
+    for recording in chosen:
+        yield from _of_recording(recording, outcomes[recording.name])
+    yield from _of_all(chosen, outcomes)
+    if page is not None:
+        from benchmarks.field_page import write_page
+
+        write_page(page, chosen, outcomes)
+
+
+def _of_recording(recording: Recording, o: Outcome) -> Iterator[Row]:
+    for name in ("odometry", "textbook.batch", "textbook.online"):
+        if name in o.ate:
+            yield Row(f"field.{recording.name}.{name}.ate_m", o.ate[name], unit="m")
+    for mode in MODES:
+        row = f"field.{recording.name}.{mode}"
+        yield Row(f"{row}.exit", float(o.codes.get(mode, -1)))
+        if mode in o.ate:
+            yield Row(f"{row}.ate_m", o.ate[mode], unit="m")
+            for name, key in (("odometry", "odometry"), ("textbook", f"textbook.{mode}")):
+                if key in o.ate:
+                    yield Row(f"{row}.ate_over_{name}", o.ate[mode] / o.ate[key])
+        elif recording.truth:
+            first = next(iter(o.findings(mode)), {"text": o.error or "no poses"})
+            yield from not_run([f"{row}.ate_m"], str(first["text"])[:120])
+        if (nees := nees_of(o, mode)) is not None:
+            yield Row(f"{row}.nees_over_3", nees)
+
+
+def _of_all(chosen: Sequence[Recording], outcomes: Mapping[str, Outcome]) -> Iterator[Row]:
+    runs = [(r, outcomes[r.name], mode) for r in chosen for mode in MODES]
+    compared = [run for run in runs if run[2] in run[1].ate and math.isfinite(run[1].best(run[2]))]
+    bad = [run for run in compared if worse(*run)]
+    yield Row("field.worse", float(len(bad)), n=len(compared), unit=" ".join(f"{r.name}.{m}" for r, _, m in bad))
+    crashed = [f"{name}.{c}" for name, o in outcomes.items() for c, code in o.codes.items() if crash(o, c, code)]
+    yield Row(
+        "field.crashes", float(len(crashed)), n=sum(len(o.codes) for o in outcomes.values()), unit=" ".join(crashed)
+    )
+    ratios = [o.ate[m] / o.ate["odometry"] for r, o, m in compared if r.landmarks and "odometry" in o.ate]
+    if ratios:
+        logs = np.log(ratios)
+        yield Row("field.geomean_over_odometry", float(np.exp(logs.mean())), float(logs.std()), len(ratios))
+    judged = [(r, o, m, nees) for r, o, m in runs if (nees := nees_of(o, m)) is not None]
+    good = [_NEES[0] <= nees <= _NEES[1] or excused(r, o, m) for r, o, m, nees in judged]
+    if good:
+        yield Row("field.nees", float(np.mean(good)), n=len(good))
+    traps = [(trap, found(trap, outcomes[trap.recording])) for trap in SHEET if trap.recording in outcomes]
+    if traps:
+        missed = ", ".join(f"{t.recording}: {t.what}" for t, hit in traps if not hit)
+        yield Row(
+            "field.traps_found", float(np.mean([hit for _, hit in traps])), n=len(traps), unit=f"missed: {missed}"
+        )
+    wrong = [text for name, o in outcomes.items() for text in false_findings(name, o)]
+    yield Row("field.false", float(len(wrong)), n=sum(s.recording in outcomes for s in SOUND), unit=" | ".join(wrong))
+    beyond = [name for r, o, m in runs for name in beyond_gate(r, o, m)]
+    yield Row("field.beyond_gate", float(len(beyond)), n=len(runs), unit=" ".join(beyond))
+
+
+def nees_of(o: Outcome, mode: Mode) -> float | None:
+    """NEES/3 by the run's own metrics; None without a truth."""
+    value = o.metrics.get(mode, {}).get("nees_over_3")
+    return None if value is None else float(value)
+
+
+def worse(recording: Recording, o: Outcome, mode: Mode) -> bool:
+    """Whether a run is worse than odometry or textbook without exit 3 and the right cause first."""
+    value, best = o.ate[mode], o.best(mode)
+    return value > max(_WORSE * best, best + _WORSE_M) and not excused(recording, o, mode)
+
+
+def excused(recording: Recording, o: Outcome, mode: Mode) -> bool:
+    """Whether a run ended with exit 3 and one of the recording's peculiarities as its first finding."""
+    return o.codes.get(mode) == 3 and right_cause(recording.name, o.findings(mode))
+
+
+def crash(o: Outcome, command: str, code: int) -> bool:
+    """Whether a command ended without a sentence of its own."""
+    return code not in (0, 3) and ("Traceback" in o.said[command] or "error" not in o.said[command])
+
+
+def beyond_gate(recording: Recording, o: Outcome, mode: Mode) -> list[str]:
+    """Names of constants that were used beyond the gate of their prior."""
+    out = []
+    for name, c in (o.metrics.get(mode, {}).get("installation") or {}).items():
+        sigma = c.get("prior_sigma") or 0.0
+        if sigma > 0.0 and abs(c["found"] - c["given"]) > _GATE * sigma:
+            out.append(f"{recording.name}.{mode}:{name}")
+    return out
+
+
+def _say(recording: Recording, o: Outcome) -> None:
+    errors = " ".join(f"{k} {v:.3f}" for k, v in o.ate.items())
+    nees = " ".join(f"{n:.2f}" for m in MODES if (n := nees_of(o, m)) is not None)
+    codes = " ".join(f"{k} {v}" for k, v in o.codes.items())
+    print(f"{recording.name:20} {codes}; {errors}; NEES/3 {nees} {o.error}", file=sys.stderr, flush=True)
+    for mode in MODES:
+        for f in o.findings(mode)[:2]:
+            print(f"    {mode} {f['severity']} {f['code']}: {f['text'][:160]}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--only", default="", help="comma-separated names; default: all")
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="also write the table as a page")
+    known, rest = parser.parse_known_args()
+    main(lambda quick: measure(quick, tuple(filter(None, known.only.split(","))), known.page), __doc__ or "", rest)
