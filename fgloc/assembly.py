@@ -9,6 +9,7 @@ from pathlib import Path
 from fgloc.config import Config, Role
 from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.diagnosis.floor import FloorWatch
+from fgloc.diagnosis.sanity import Sanity
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.stream_facts import StreamFacts
 from fgloc.intake.validation import EventValidator
@@ -40,6 +41,7 @@ class Assembly:
     sensors: tuple[Sensor, ...]
     localizer: Localizer
     diagnosis: Diagnosis
+    sanity: Sanity
     notes: tuple[str, ...]
 
     @property
@@ -101,6 +103,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     joint = None if learned is None else registry.motion_model().correlation(config, learned)
     wheels = registry.odometer().build(config)
     gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
+    watched_gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
     attitude = None if setup.T_base_imu is None else registry.rate_sensor().attitude(config, setup.T_base_imu)
     flat = config.estimator.ground == "flat"
     motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude)
@@ -124,5 +127,6 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
         sensors=sensors,
         localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
         diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up, floor),
+        sanity=Sanity(config, landmark_map, camera, setup.T_base_sensor, wheels, watched_gyro),
         notes=setup.notes,
     )

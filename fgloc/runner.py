@@ -73,6 +73,8 @@ def run(
     smoothed = _smoothed(parts, outcome) if mode == "batch" else None
     all_estimates = replay.estimates if smoothed is None else smoothed.estimates
     estimates = last_pass(all_estimates)
+    left_out = len(all_estimates) - len(estimates)
+    sane = parts.sanity.judge(estimates, causal=mode == "online")
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, outcome.roles, installed)
     contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction
@@ -82,10 +84,18 @@ def run(
         trials = clock_trials(asked, parts.diagnosis.clock_offsets(parts.wheels.source), config)
         again = partial(_tried, recording_path, map_path, options.get("detections"))
         of_constants = clock_findings(trials, config, again, contradiction is not None) or of_constants
-    findings = _findings(outcome, smoothed, len(all_estimates) - len(estimates), of_constants)
-    result = _result(parts, replay, outcome, estimates, smoothed)
+    findings = _findings(outcome, smoothed, left_out, of_constants, sane.findings)
+    result = _result(parts, replay, outcome, sane.simpler or estimates, smoothed)
     wall_s = time.perf_counter() - began
-    return replace(result, findings=findings, source=recording_path, config=config, found=found, wall_s=wall_s)
+    return replace(
+        result,
+        findings=findings,
+        source=recording_path,
+        config=config,
+        found=found,
+        wall_s=wall_s,
+        odometry=sane.odometry,
+    )
 
 
 def _findings(
@@ -93,6 +103,7 @@ def _findings(
     smoothed: SmoothedRun | None,
     left_out: int,
     of_constants: Sequence[Finding],
+    sane: Sequence[Finding],
 ) -> tuple[Finding, ...]:
     """What is wrong and what the user should know, the gravest first."""
     return ordered(
@@ -101,6 +112,7 @@ def _findings(
             *note("batch", () if smoothed is None else smoothed.notes),
             *note("clock.back", _left_out(left_out)),
             *of_constants,
+            *sane,
         ]
     )
 
@@ -124,7 +136,7 @@ def _replayed(
         # What a file remembers must not depend on which images came before; without one they are followed, as live.
         detector = parts.detector.following() if file is None else parts.detector
         memory = parts.detector.remembering(detector, file, None, note=file is not None)
-    replay = Replay(parts, recording, memory, progress, options)
+    replay = Replay(parts, recording, memory, progress, options, causal=mode == "online")
     replay.run(recording.events())
     if mode == "batch" or not replay.estimates:
         replay.make_up(parts.localizer.finish(replay.no_landmark_sensor))

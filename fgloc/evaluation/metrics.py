@@ -81,6 +81,15 @@ class GroundMetrics(BaseModel):
     nees_over_6: float  # of x, y, z, roll, pitch and yaw
 
 
+class OdometryMetrics(BaseModel):
+    """Odometry alone against the truth, moved onto it by the rigid motion that fits best: it has no frame."""
+
+    model_config = ConfigDict(frozen=True)
+
+    ate_rmse_m: float
+    ate_over_odometry: float | None  # of the run's `ate_rmse_m`; None: odometry alone is without error
+
+
 class Metrics(BaseModel):
     """What ``metrics.json`` holds. Keys that need a truth are None without one."""
 
@@ -97,6 +106,7 @@ class Metrics(BaseModel):
     nees_over_3: float | None
     coverage: dict[str, float] | None  # by number of sigmas: "1", "2", "3"
     ground: GroundMetrics | None  # None: estimated on a flat floor, or no truth
+    odometry: OdometryMetrics | None  # None: no truth, or nothing measured the motion
     real_time_factor: float | None  # seconds of recording per second of work
     step_ms: StepTimes | None
     factors: dict[str, int]
@@ -204,6 +214,7 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
         nees_over_3=honest[0],
         coverage=honest[1],
         ground=against_truth(ground_metrics),
+        odometry=None if matched is None else odometry_metrics(result, config, ate_rmse_m(matched)),
         real_time_factor=duration / result.wall_s if result.wall_s > 0 else None,
         step_ms=_step_times(result.step_ms),
         factors=dict(sorted(result.counts.items())),
@@ -228,6 +239,15 @@ def ground_metrics(matched: Matched) -> GroundMetrics | None:
         pitch_rmse_deg=math.degrees(_rms(errors[:, 4])),
         nees_over_6=float(np.mean(nees(errors, covs))) / 6.0,
     )
+
+
+def odometry_metrics(result: RunResult, config: Config, ate_m: float) -> OdometryMetrics | None:
+    """Figures of odometry alone, beside the run's own error [m]; None: there is none at the truth's times."""
+    truth, odometry = result.truth, result.odometry
+    if truth is None or odometry is None or len(matchable(odometry, truth, config.truth.max_gap_s)) < FEWEST:
+        return None
+    alone = ate_rmse_m(match(odometry, truth, "se2", config.truth.max_gap_s))
+    return OdometryMetrics(ate_rmse_m=alone, ate_over_odometry=ate_m / alone if alone > 0.0 else None)
 
 
 def match_result(result: RunResult, config: Config) -> Matched | None:

@@ -93,7 +93,9 @@ class Anchors:
         frame = estimator.log.keyframes.get(estimator.k)
         gyro, learned = localizer.motion.sources.gyro, self._run.learned
         body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
-        if frame is not None and frame.stamp_ns == estimate.stamp_ns:
+        same_time = frame is not None and frame.stamp_ns == estimate.stamp_ns
+        # Another pose is of the odometry that stands in for the estimate, see `fgloc.diagnosis.sanity`
+        if frame is not None and same_time and np.array_equal(frame.belief.pose, estimate.pose):
             belief = frame.belief
             known = belief.installation or installation.estimated
             budget = replace(frame.budget, overruled_cov=None)  # that is of one step alone

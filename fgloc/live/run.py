@@ -133,7 +133,7 @@ class OnlineRun:
             if belief is not None:
                 parts.localizer.restart_at(belief)
         self._reset = self._resumed = None
-        estimate = parts.localizer.update(step)
+        estimate = parts.sanity.observe(step, parts.localizer.update(step), keep=False)
         self.keyframes += 1
         self._last_step = step
         if estimate is not None:
@@ -206,7 +206,9 @@ class OnlineRun:
         now = time.monotonic()
         if now - self._told_s > _TOLD_EVERY_S:
             diagnosis = self.parts.diagnosis
-            self._told, self._told_s = (*diagnosis.mistakes, *diagnosis.notes(self.parts.wheels.source)), now
+            watched = self.parts.sanity.watch.sentence
+            told = (*diagnosis.mistakes, *diagnosis.notes(self.parts.wheels.source))
+            self._told, self._told_s = (told if watched is None else (watched, *told)), now
         return (*self._notes, *self._told, *self.parts.sentences)
 
 

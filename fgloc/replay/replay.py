@@ -26,9 +26,12 @@ class Replay:
         detector: Detector | None,
         progress: Progress | None,
         options: RunOptions,
+        causal: bool = False,
     ) -> None:
+        """Take the parts of a run; ``causal``: what is given is what was known then, and is checked on the way."""
         self._parts = parts
         self._detector = detector
+        self._causal = causal
         self._duration_s = recording.duration_s
         self._progress = progress
         self._pace = options.get("pace")
@@ -64,6 +67,8 @@ class Replay:
         for step in self.steps(self._events(events)):
             start = time.perf_counter()
             estimate = self._parts.localizer.update(step)
+            checked = self._parts.sanity.observe(step, estimate)
+            estimate = checked if self._causal else estimate
             self.record(step, estimate, (time.perf_counter() - start) * 1e3)
             self._parts.diagnosis.observe(step, self._parts.wheels.measure(step))
             if self._on_step is not None:

@@ -207,6 +207,7 @@ class RunResult:
     cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
     config: Config | None = None  # as the run used it: with the mistakes undone
+    odometry: Trajectory | None = None  # odometry alone, beside the run; None: nothing measured the motion
 
     @property
     def notes(self) -> tuple[str, ...]:

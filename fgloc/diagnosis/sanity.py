@@ -1,0 +1,855 @@
+"""Whether a run explains its recording no worse than simpler pipelines: odometry alone, and the textbook's smoother.
+
+Both are computed beside the run from the same steps, with constants as they are configured. No truth is read. What is
+compared:
+
+- **motion**: the estimate's motion over windows of two seconds and the odometry's. Wheels slip now and then, which a
+  median does not see; an estimate that moves differently most of the time does not describe this robot, unless
+  sightings of a surveyed map, explained to within their noise, contradict the wheels.
+- **sightings**: the share of them that a trajectory explains, all against one place for each landmark: the map's or, of
+  an unknown map, the median of where the trajectory itself has it.
+
+`Sanity.judge` compares whole trajectories at the end of a run, and gives the simpler one where it is better. `Watch`
+does so while a run goes on, by the motion alone: its poses depend on nothing later.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.diagnosis.collect import SightingCollector
+from fgloc.graph.textbook import Seen, textbook_poses
+from fgloc.sensors.equipment import Odometer, RateSensor
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.types import (
+    Camera,
+    Estimate,
+    Finding,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    Mode,
+    MotionMeasurement,
+    Severity,
+    Step,
+    Trajectory,
+)
+
+_WINDOW_S = 2.0  # wheels are good to a percent over it, and a pose jumps at most once
+_MOVING_M, _MOVING_RAD = 0.1, 0.15  # by the odometry within a window: less tells nothing of scale or direction
+_FEWEST = 5  # windows in motion that a median needs
+_FLOOR_SIGMA_M, _FLOOR_SIGMA_RAD = 0.02, 0.01  # of a window's motion, beside the noise as configured
+_SCALES = 0.02  # how far wheels' scales are off, for the same
+_FLOOR_M = 0.05  # added to a window's path: sightings move a pose by centimetres however short the path is
+_DEPARTS = 0.25  # median departure over path; sound runs have at most 0.04, also with slip on a third of the floor
+_DEPARTS_UNMAPPED, _STRAINS_UNMAPPED = 0.055, 0.6  # without a surveyed map, departure and strain; sound: 0.04, 0.26
+_STRETCH = 0.05  # least deviation of the median speed ratio from 1 that counts ...
+_STRETCH_SIGMAS = 5.0  # ... in sigmas of the wheels' scale as configured
+_LEAST_PATH_M = 0.5  # in windows along which the robot moves, for a ratio of paths
+_LEFT_OUT = 0.25  # logarithm of path over the odometry's that a run without a map may have ...
+_LEFT_OUT_UNSURE = 0.1  # ... and without a doubt, if it has no sightings either
+_EXPLAINED = 3.0  # sigmas: a sighting this near its landmark is explained
+_MORE = 0.15  # share of all sightings that a simpler trajectory must explain beyond the estimate
+_NOT_MORE = 0.02  # share by which it may explain fewer without a doubt
+_SUPPORTED = 0.5  # share of the sightings of a surveyed map that an estimate explains at least; sound runs 0.9 ...
+_HARDLY, _HARDLY_SIGMAS = (
+    0.75,
+    2.0,
+)  # ... or this share, if half of all are further from their landmarks: wrong ids are far
+_WELL = 0.8  # share explained beyond which no other trajectory is looked for
+_SIGHTINGS = 30  # fewer do not contradict anything
+_SPARSE_NS = 200_000_000  # sightings of one sensor nearer in time share their errors
+_MOST_SIGHTINGS = 4000  # that are compared, evenly chosen; bounds time, not memory
+_MOST_POSES = 3000  # of the textbook's smoother; of a longer run some are left out between
+_GYRO_AGREES = 0.3  # median relative difference of its turn from the wheels'
+_CAUCHY_M = 0.3  # scale at which a sighting loses its weight when the odometry is laid onto the map
+_ITERATIONS = 15
+_WATCHED, _FEWEST_WATCHED = 60, 10  # windows that are remembered while a run goes on, and that a verdict needs
+_SEEN_S, _MOST_WATCHED = 30.0, 1000  # sightings that are remembered: a kidnapped robot takes seconds to find its place
+_LEAP_M = 1.0  # farthest that a pose corrects itself within a step without a map
+_RETURNED = 3.0  # sigmas of the odometry within which an estimate has come back
+_CONTRADICTED = 2.0  # factor of the odometry's sigmas while it is given in place of an estimate
+_SPANS_TOLD = 5
+_WORST = 10.0  # most that a contradicted odometry's sigmas grow by
+_LEAST_VARIANCE = 1e-8  # m², rad²
+_LEAST_SCALE = 0.01  # of what wheels are off by, however well they are said to be known
+_PLAIN = 0.7  # median whitened residual of sightings that fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Odometry ``(n,)`` and sightings ``(m,)`` of a run.
+
+    ``motions`` lead from the keyframe before to each; those of the first keyframe and of the first one after a clock
+    jump mean nothing.
+    """
+
+    stamps_ns: IntArray
+    joined: IntArray  # 1 where the motion is known
+    motions: FloatArray  # (n, 3)
+    covs: FloatArray  # (n, 3, 3) right perturbation
+    seen_ns: IntArray
+    ids: IntArray
+    places: FloatArray  # (m, 2) in the base frame
+    sigmas: FloatArray  # (m,) [m]
+    landmarks: Mapping[int, FloatArray] | None
+    scale_sigma: float  # of the wheels, as configured
+    turn_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A trajectory against odometry and sightings.
+
+    Attributes:
+        windows: in which the robot moves by its odometry.
+        departure: median distance from where the odometry leads within a window, over the path.
+        strain: median squared departure in units of the odometry's covariance; 2.4 is expected of three coordinates.
+        speed: median path over the odometry's; NaN: too few windows.
+        path: whole path over the odometry's.
+        explained: share of the sightings that it explains; NaN: too few.
+        residual: median whitened distance of a sighting from its landmark.
+    """
+
+    windows: int
+    departure: float
+    strain: float
+    speed: float
+    path: float
+    explained: float
+    residual: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What came of the comparison.
+
+    Attributes:
+        findings: none where nothing is to be said.
+        simpler: estimates to be written in place of the run's; None: the run's are no worse.
+        odometry: odometry alone, laid onto the run's frame; None: nothing measured the motion.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    simpler: list[Estimate] | None = None
+    odometry: Trajectory | None = None
+
+
+class Sanity:
+    """Collects odometry and sightings of a run, some 150 bytes a keyframe, and judges its trajectory."""
+
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        camera: Camera | None,
+        T_base_sensor: FloatArray | None,
+        wheels: Odometer,
+        gyro: RateSensor | None,
+    ) -> None:
+        """Set up for the sensors of a run.
+
+        Args:
+            config: as the run uses it.
+            landmark_map: the known map; None if landmarks are estimated.
+            camera: of corners; None if there is none.
+            T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
+            wheels: the run's.
+            gyro: one of its own, whose bias only rest corrects; None: there is none.
+        """
+        place = camera.T_base_cam if camera is not None else T_base_sensor
+        self._place: FloatArray = np.eye(4) if place is None else np.asarray(place, dtype=float)
+        sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
+        self._collector = SightingCollector(config, landmark_map, sensor, self._place)
+        self._config, self._wheels, self._gyro = config, wheels, gyro
+        self._landmarks = None
+        if landmark_map is not None:
+            self._landmarks = {i: lm.position[:2].copy() for i, lm in landmark_map.landmarks.items()}
+        self._stamps, self._joined = array("q"), array("b")
+        self._motions, self._covs, self._turns = array("d"), array("d"), array("d")
+        self._seen_ns, self._ids, self._seen = array("q"), array("q"), array("d")
+        self._segment, self._last_seen_ns = -1, -_SPARSE_NS
+        self.watch = Watch(landmark_map is not None, config)
+
+    def observe(self, step: Step, estimate: Estimate | None, keep: bool = True) -> Estimate | None:
+        """Keep the odometry and the sightings of a step, and hold its estimate against them.
+
+        Args:
+            step: as the localizer got it.
+            estimate: what came of it; None: no pose is known yet.
+            keep: for `judge`; else memory is bounded.
+
+        Returns:
+            The estimate, or what is to be given in its place while it fails: the odometry from the last sane pose on.
+        """
+        measured = self._wheels.measure(step)
+        if measured is None:
+            return estimate
+        turn = None if self._gyro is None else self._gyro.measure(step, measured.motion)
+        joined = step.segment == self._segment
+        self._segment = step.segment
+        seen = list(self._sightings(step))
+        if keep:
+            self._stamps.append(step.stamp_ns)
+            self._joined.append(joined)
+            self._motions.extend(measured.motion.tolist())
+            self._covs.extend(measured.cov.ravel().tolist())
+            self._turns.append(math.nan if turn is None else turn.yaw)
+            for stamp_ns, landmark_id, place, sigma in seen:
+                self._seen_ns.append(stamp_ns)
+                self._ids.append(landmark_id)
+                self._seen.extend((place[0], place[1], sigma))
+        away = [] if estimate is None else list(self._away(step, estimate, seen))
+        return self.watch.checked(step, measured, joined, estimate, away)
+
+    def _sightings(self, step: Step) -> Iterator[tuple[int, int, FloatArray, float]]:
+        """Stamp, landmark, place in the base frame and sigma [m] of the sightings that are compared."""
+        for event in step.sightings:
+            if abs(event.stamp_ns - self._last_seen_ns) < _SPARSE_NS:
+                continue
+            self._last_seen_ns = event.stamp_ns
+            for sighting in self._collector.sightings(event, 0.0):
+                place = (self._place[:3, :3] @ sighting.point + self._place[:3, 3])[:2]
+                sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
+                yield event.stamp_ns, sighting.landmark_id, place, sigma
+
+    def _away(
+        self, step: Step, estimate: Estimate, seen: Sequence[tuple[int, int, FloatArray, float]]
+    ) -> Iterator[float]:
+        """Whitened distances of sightings from their landmarks of a known map, by the estimate."""
+        if self._landmarks is None:
+            return
+        for stamp_ns, landmark_id, place, sigma in seen:
+            if landmark_id in self._landmarks:
+                pose = estimate.pose
+                if stamp_ns != step.stamp_ns:
+                    pose = se2.compose(pose, self._wheels.motion_between(step, step.stamp_ns, stamp_ns)[0])
+                x, y = se2.compose(pose, (*place, 0.0))[:2] - self._landmarks[landmark_id]
+                yield math.hypot(x, y) / sigma
+
+    def judge(self, estimates: Sequence[Estimate], causal: bool = False) -> Verdict:
+        """Compare the run's trajectory with the simpler ones.
+
+        Args:
+            estimates: of the run, with increasing stamps.
+            causal: the run's poses depend on nothing later: they are judged and not replaced.
+        """
+        track = self._track(estimates[0].stamp_ns, estimates[-1].stamp_ns)
+        if track is None:
+            return Verdict(self.watch.findings())
+        verdict = judged(track, estimates)
+        if not causal:
+            return verdict
+        findings = self.watch.findings() or verdict.findings
+        return replace(verdict, simpler=None, findings=findings)
+
+    def _track(self, first_ns: int, last_ns: int) -> Track | None:
+        """All between two times; where the clock jumped back, the last pass. None: nothing measured the motion."""
+        stamps = np.array(self._stamps, dtype=np.int64)
+        if len(stamps) == 0:
+            return None
+        last_pass = stamps <= np.minimum.accumulate(np.append(stamps[1:], stamps.max() + 1)[::-1])[::-1]
+        last_pass &= stamps < np.minimum.accumulate(np.append(stamps[1:], stamps.max() + 1)[::-1])[::-1]
+        kept = last_pass & (stamps >= first_ns) & (stamps <= last_ns)
+        if kept.sum() < 2:
+            return None
+        motions = np.array(self._motions).reshape(-1, 3)
+        covs = np.array(self._covs).reshape(-1, 3, 3)
+        joined = np.array(self._joined, dtype=np.int64)
+        joined[1:] &= last_pass[:-1]
+        motions, covs = self._with_gyro(motions, covs)
+        joined &= (covs[:, 0, 0] < _silent_variance(motions, self._config)).astype(np.int64)
+        seen_ns = np.array(self._seen_ns, dtype=np.int64)
+        inside = np.flatnonzero((seen_ns >= stamps[kept][0]) & (seen_ns <= stamps[kept][-1]))
+        inside = inside[:: max(1, -(-len(inside) // _MOST_SIGHTINGS))]
+        seen = np.array(self._seen).reshape(-1, 3)[inside]
+        return Track(
+            stamps[kept],
+            joined[kept],
+            motions[kept],
+            covs[kept],
+            seen_ns[inside],
+            np.array(self._ids, dtype=np.int64)[inside],
+            seen[:, :2],
+            seen[:, 2],
+            self._landmarks,
+            self._config.wheels.scale_sigma,
+            self._config.wheels.turn_scale_sigma,
+        )
+
+    def _with_gyro(self, motions: FloatArray, covs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The odometry with the gyro's turn, where there is one; as it is if the two contradict each other."""
+        turns = np.array(self._turns)
+        known = np.isfinite(turns)
+        if not gyro_agrees(motions[known, 2], turns[known]):
+            return motions, covs
+        motions, covs = motions.copy(), covs.copy()
+        motions[known, 2] = turns[known]
+        return motions, covs
+
+
+def gyro_agrees(wheels: FloatArray, gyro: FloatArray) -> bool:
+    """Whether two series of turns ``(n,)`` [rad] are of one robot: by the median over stretches of ten steps."""
+    stretches = len(wheels) // 10
+    if stretches < 1:
+        return False
+    a, b = (np.add.reduceat(x, np.arange(stretches) * 10) for x in (wheels, gyro))
+    larger = np.maximum(np.abs(a), np.abs(b))
+    turning = larger > _MOVING_RAD
+    return bool(not turning.any() or np.median(np.abs(a - b)[turning] / larger[turning]) < _GYRO_AGREES)
+
+
+def _silent_variance(motions: FloatArray, config: Config) -> FloatArray:
+    """Variance ``(n,)`` [m²] along a step beyond which its wheels were silent: ten times what their noise can be."""
+    noise = config.wheels.noise
+    length, turn = np.hypot(motions[:, 0], motions[:, 1]), np.abs(motions[:, 2])
+    across = noise.x_per_sqrt_m**2 + noise.y_per_sqrt_m**2 + noise.yaw_per_sqrt_m**2
+    known = across * length + noise.xy_per_sqrt_rad**2 * turn + noise.xy_per_sqrt_s**2
+    return np.asarray(10.0 * known + 1e-4)
+
+
+# --- the whole run ---
+
+
+def judged(track: Track, estimates: Sequence[Estimate]) -> Verdict:
+    """Compare a trajectory with odometry alone and, where sightings doubt it, with the textbook's smoother."""
+    stamps = np.array([e.stamp_ns for e in estimates], dtype=np.int64)
+    poses = np.array([e.pose for e in estimates])
+    alone = chained(track)
+    if not (np.isfinite(poses).all() and np.isfinite([e.cov for e in estimates]).all()):
+        laid = laid_onto(track, alone, np.zeros(3))
+        return _simpler(track, estimates, laid, compared(track, laid, alone), "poses of the estimate are not finite")
+    at = se2.interpolate(stamps, poses, track.stamps_ns)
+    ours = compared(track, at, alone)
+    laid = laid_onto(track, alone, at[0])
+    by_odometry = compared(track, laid, alone)
+    why = _worse_than_odometry(track, ours, by_odometry)
+    if why is not None or ours.explained < _WELL:
+        textbook = _textbook(track, alone, laid, max(ours.explained, by_odometry.explained))
+        if textbook is not None:
+            return replace(textbook, odometry=_as_trajectory(track, laid, _dead_reckoned(track, estimates[0])))
+    if why is not None:
+        return _simpler(track, estimates, laid, by_odometry, why)
+    unsure = _unsure(track, ours, by_odometry)
+    findings = () if unsure is None else (Finding("sanity.unsure", unsure, Severity.WARNING),)
+    return Verdict(findings, None, _as_trajectory(track, laid, _dead_reckoned(track, estimates[0])))
+
+
+def _worse_than_odometry(track: Track, ours: Comparison, odometry: Comparison) -> str | None:
+    """Evidence that the estimate explains the recording worse; None: it does not."""
+    motion = (
+        f"over {ours.windows} windows of {_WINDOW_S:.0f} s it departs from the odometry by {_percent(ours.departure)} "
+        f"of the path (median), at {ours.speed:.3g} times its speed, over {ours.path:.3g} times its path"
+    )
+    sightings = (
+        f"it explains {_percent(ours.explained)} of the sightings, odometry alone {_percent(odometry.explained)}"
+        if math.isfinite(ours.explained)
+        else "no sightings support it"
+    )
+    if odometry.explained > ours.explained + _MORE:
+        return f"{sightings}; {motion}"
+    if track.landmarks is not None and not supported(ours.explained, ours.residual):
+        return f"{sightings}; {motion}"
+    if ours.windows < _FEWEST or (track.landmarks is not None and ours.explained > odometry.explained + _MORE):
+        return None
+    if departs(ours.departure, ours.strain, track.landmarks is not None):
+        return f"{motion}; {sightings}"
+    if track.landmarks is not None:
+        return None
+    if abs(math.log(max(ours.path, 1e-9))) > _LEFT_OUT:
+        return f"{motion}; {sightings}"
+    if len(track.ids) and abs(math.log(max(ours.speed, 1e-9))) > max(_STRETCH, _STRETCH_SIGMAS * track.scale_sigma):
+        return (
+            f"{motion}, which wheels known to {_percent(track.scale_sigma)} do not allow, and without a map they are "
+            f"the measure of length; {sightings}"
+        )
+    return None
+
+
+def supported(explained: float, residual: float) -> bool:
+    """Whether an estimate explains the sightings of a surveyed map: by the share, and the median whitened distance."""
+    return not (explained < _SUPPORTED or (explained < _HARDLY and residual > _HARDLY_SIGMAS))
+
+
+def departs(departure: float, strain: float, mapped: bool) -> bool:
+    """Whether an estimate moves as the robot does not, by medians over windows; with a surveyed map or without."""
+    if mapped:
+        return departure > _DEPARTS
+    return departure > _DEPARTS_UNMAPPED and strain > _STRAINS_UNMAPPED
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %"
+
+
+def _unsure(track: Track, ours: Comparison, odometry: Comparison) -> str | None:
+    """What leaves doubt, though not beyond doubt; None: nothing."""
+    if track.landmarks is not None and ours.explained < _WELL and ours.residual > 1.0:
+        return (
+            f"The estimate explains {_percent(ours.explained)} of the sightings, though more than odometry alone: the "
+            "map, the sightings or their sensor's place contradict the rest of the recording."
+        )
+    if ours.windows >= _FEWEST and ours.explained < odometry.explained - _NOT_MORE:
+        return (
+            f"The estimate explains {_percent(ours.explained)} of the sightings, odometry alone "
+            f"{_percent(odometry.explained)}: the poses may be no better than those of odometry alone."
+        )
+    if ours.windows < _FEWEST or len(track.ids) or track.landmarks is not None:
+        return None
+    if abs(math.log(max(ours.path, 1e-9))) > _LEFT_OUT_UNSURE:
+        return (
+            f"The estimate's path is {ours.path:.3g} times the odometry's, and no sighting confirms it: the poses may "
+            "be worse than those of odometry alone."
+        )
+    return None
+
+
+def _simpler(track: Track, estimates: Sequence[Estimate], poses: FloatArray, by: Comparison, why: str) -> Verdict:
+    """The odometry in place of the estimate, and the finding that says so."""
+    contradicted = 1.0
+    if math.isfinite(by.residual):
+        contradicted = float(np.clip(by.residual / _PLAIN, 1.0, _WORST))
+    trajectory = _as_trajectory(track, poses, _dead_reckoned(track, estimates[0], contradicted))
+    text = f"The estimate explains the recording worse than odometry alone, which is given in its place: {why}."
+    return Verdict((Finding("sanity.odometry", text, Severity.ERROR),), _estimates(trajectory), trajectory)
+
+
+def _estimates(trajectory: Trajectory, mode: Mode = Mode.DEAD_RECKONING) -> list[Estimate]:
+    assert trajectory.covs is not None
+    rows = zip(trajectory.stamps_ns.tolist(), trajectory.poses, trajectory.covs, strict=True)
+    return [Estimate(stamp, pose, cov, mode) for stamp, pose, cov in rows]
+
+
+def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: float) -> Verdict | None:
+    """The textbook's trajectory where it moves as the odometry does and explains more than this share; else None."""
+    if len(track.ids) < _SIGHTINGS or track.landmarks is None:  # without a map it can bend as the estimate does
+        return None
+    kept = np.arange(0, len(laid), max(1, -(-len(laid) // _MOST_POSES)))
+    some = replace(track, stamps_ns=track.stamps_ns[kept], joined=np.ones(len(kept), dtype=np.int64))
+    nearest = np.clip(np.searchsorted(some.stamps_ns, track.seen_ns), 0, len(kept) - 1)
+    then = se2.interpolate(track.stamps_ns, alone, track.seen_ns)
+    places = _world(
+        np.array([se2.between(alone[kept[k]], pose) for k, pose in zip(nearest, then, strict=True)]), track.places
+    )
+    solved = textbook_poses(
+        laid[kept],
+        _between(alone, kept[:-1], kept[1:]),
+        Seen(nearest, track.ids, places, track.sigmas),
+        track.landmarks,
+    )
+    if solved is None:
+        return None
+    poses, covs = solved
+    inside = (track.seen_ns >= some.stamps_ns[0]) & (track.seen_ns <= some.stamps_ns[-1])
+    some = replace(
+        some,
+        seen_ns=track.seen_ns[inside],
+        ids=track.ids[inside],
+        places=track.places[inside],
+        sigmas=track.sigmas[inside],
+    )
+    theirs = compared(some, poses, alone[kept])
+    if departs(theirs.departure, theirs.strain, mapped=False) or theirs.explained < max(explained + _MORE, _WELL):
+        return None
+    worst = max(1.0, theirs.residual / _PLAIN)
+    given = _as_trajectory(some, poses, covs * worst**2)
+    text = (
+        "The estimate explains the recording worse than plain smoothing with fixed constants, which is given in its "
+        f"place: that explains {_percent(theirs.explained)} of the sightings, the estimate at most "
+        f"{_percent(explained)}."
+    )
+    return Verdict((Finding("sanity.textbook", text, Severity.ERROR),), _estimates(given, Mode.OK), None)
+
+
+def _as_trajectory(track: Track, poses: FloatArray, covs: FloatArray) -> Trajectory:
+    """A trajectory of poses with covariances of their right perturbations."""
+    turned = np.array([se2.rotate_cov(cov, yaw) for cov, yaw in zip(covs, poses[:, 2].tolist(), strict=True)])
+    return Trajectory(track.stamps_ns, poses, 0.5 * (turned + turned.transpose(0, 2, 1)))
+
+
+def _dead_reckoned(track: Track, first: Estimate, contradicted: float = 1.0) -> FloatArray:
+    """Covariances ``(n, 3, 3)`` of the odometry's poses, right perturbation.
+
+    Noise adds up from step to step; the wheels' scales, always off alike, add up in proportion to the way.
+
+    Args:
+        track: of the run.
+        first: the run's first pose, whose covariance the odometry begins with.
+        contradicted: factor of all sigmas.
+    """
+    cov = np.eye(3) * _LEAST_VARIANCE
+    begun = se2.rotate_cov(first.cov, -float(first.pose[2]))
+    if np.isfinite(begun).all() and np.linalg.eigvalsh(begun)[0] > 0.0:
+        cov += begun
+    by_scale = np.zeros((3, 2))  # derivative of the pose by the scales of way and turn
+    sigmas = np.array([max(track.scale_sigma, _LEAST_SCALE), max(track.turn_sigma, _LEAST_SCALE)])
+    covs = np.empty((len(track.stamps_ns), 3, 3))
+    for k, (motion, noise) in enumerate(zip(track.motions, track.covs, strict=True)):
+        if k:
+            ad = se2.adjoint(se2.inverse(motion if track.joined[k] else np.zeros(3)))
+            cov = ad @ cov @ ad.T + noise
+            by_scale = ad @ by_scale
+            if track.joined[k]:
+                by_scale[:2, 0] += motion[:2]
+                by_scale[2, 1] += motion[2]
+        scaled = by_scale * sigmas
+        covs[k] = (cov + scaled @ scaled.T) * contradicted**2
+    return covs
+
+
+def chained(track: Track) -> FloatArray:
+    """Poses ``(n, 3)`` of the odometry from zero; where a motion is not known it stands still."""
+    poses = np.zeros((len(track.stamps_ns), 3))
+    x = y = yaw = 0.0
+    for k, (joined, (dx, dy, turn)) in enumerate(zip(track.joined.tolist(), track.motions.tolist(), strict=True)):
+        if k and joined:
+            c, s = math.cos(yaw), math.sin(yaw)
+            x, y, yaw = x + c * dx - s * dy, y + s * dx + c * dy, yaw + turn
+        poses[k] = x, y, yaw
+    poses[:, 2] = se2.wrap_array(poses[:, 2])
+    return poses
+
+
+def compared(track: Track, poses: FloatArray, odometry: FloatArray | None) -> Comparison:
+    """Figures of a trajectory ``(n, 3)`` at the track's keyframes; of the motion only with the odometry's poses."""
+    away = _distances(track, poses)
+    explained, residual = math.nan, math.nan
+    if len(away) >= _SIGHTINGS:
+        explained, residual = float(np.mean(away < _EXPLAINED)), float(np.median(away))
+    windows = [] if odometry is None else _windows(track, poses, odometry)
+    along = [w for w in windows if w.moved > _MOVING_M]
+    speed, path = math.nan, 1.0
+    if len(along) >= _FEWEST:
+        speed = float(np.median([w.our_moved / w.moved for w in along]))
+    if sum(w.moved for w in along) > _LEAST_PATH_M:
+        path = sum(w.our_moved for w in along) / sum(w.moved for w in along)
+    departure = float(np.median([w.departure for w in windows])) if windows else 0.0
+    strain = float(np.median([w.strain for w in windows])) if windows else 0.0
+    return Comparison(len(windows), departure, strain, speed, path, explained, residual)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Motion over a window by the odometry and by the estimate.
+
+    Attributes:
+        moved: distance of its ends by the odometry [m].
+        our_moved: by the estimate [m].
+        departure: distance of the two ends over the odometry's path.
+        strain: squared difference of the motions in units of the odometry's covariance.
+    """
+
+    moved: float
+    our_moved: float
+    departure: float
+    strain: float
+
+    @classmethod
+    def of(cls, odometry: FloatArray, cov: FloatArray, path: float, ours: FloatArray) -> Window | None:
+        """Compare two motions ``(3,)``; None: the robot hardly moves by its odometry.
+
+        Args:
+            odometry: motion over the window.
+            cov: ``(3, 3)`` of its noise, right perturbation.
+            path: length of the odometry's path [m].
+            ours: motion by the estimate.
+        """
+        if path < _MOVING_M and abs(odometry[2]) < _MOVING_RAD:
+            return None
+        moved, our_moved = math.hypot(odometry[0], odometry[1]), math.hypot(ours[0], ours[1])
+        away = math.hypot(ours[0] - odometry[0], ours[1] - odometry[1]) / (path + _FLOOR_M)
+        scale = np.diag(np.square([_FLOOR_SIGMA_M, _FLOOR_SIGMA_M, _FLOOR_SIGMA_RAD]))
+        scale += np.outer(odometry, odometry) * np.eye(3) * _SCALES**2
+        off = se2.log(se2.between(odometry, ours))
+        return cls(moved, our_moved, away, float(off @ np.linalg.solve(cov + scale, off)))
+
+
+def _windows(track: Track, poses: FloatArray, odometry: FloatArray) -> list[Window]:
+    """Windows in which the robot moves and the odometry is known throughout."""
+    t = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    edges = np.unique(np.searchsorted(t, np.arange(0.0, t[-1] + 1e-6, _WINDOW_S)))
+    edges = edges[edges < len(t)]
+    lengths = np.hypot(track.motions[:, 0], track.motions[:, 1])
+    theirs, ours = _between(odometry, edges[:-1], edges[1:]), _between(poses, edges[:-1], edges[1:])
+    found = []
+    for a, b, motion, our_motion in zip(edges[:-1], edges[1:], theirs, ours, strict=True):
+        inside = slice(a + 1, b + 1)
+        if not track.joined[inside].all() or t[b] - t[a] > 2.0 * _WINDOW_S:
+            continue
+        cov = np.zeros((3, 3))
+        for step, noise in zip(track.motions[inside], track.covs[inside], strict=True):
+            cov = se2.compose_cov(cov, step, noise)
+        window = Window.of(motion, cov, float(lengths[inside].sum()), our_motion)
+        if window is not None:
+            found.append(window)
+    return found
+
+
+def _between(poses: FloatArray, starts: IntArray, ends: IntArray) -> FloatArray:
+    """Motions ``(k, 3)`` between pairs of poses."""
+    a, d = poses[starts], poses[ends] - poses[starts]
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], se2.wrap_array(d[:, 2])])
+
+
+def _distances(track: Track, poses: FloatArray) -> FloatArray:
+    """Whitened distances ``(k,)`` of the sightings from their landmarks under a trajectory."""
+    places = _world(se2.interpolate(track.stamps_ns, poses, track.seen_ns), track.places)
+    if track.landmarks is not None:
+        known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
+        where = np.array([track.landmarks[i] for i in track.ids[known].tolist()]).reshape(-1, 2)
+        return np.asarray(np.hypot(*(places[known] - where).T) / track.sigmas[known], dtype=float)
+    away = np.full(len(places), np.nan)
+    for landmark_id in np.unique(track.ids):
+        same = np.flatnonzero(track.ids == landmark_id)
+        if len(same) > 1:
+            middle = np.median(places[same], axis=0)
+            away[same] = np.hypot(*(places[same] - middle).T) / track.sigmas[same]
+    return np.asarray(away[np.isfinite(away)])
+
+
+def _world(poses: FloatArray, places: FloatArray) -> FloatArray:
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = poses[:, 0] + c * places[:, 0] - s * places[:, 1]
+    return np.column_stack([x, poses[:, 1] + s * places[:, 0] + c * places[:, 1]])
+
+
+def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArray:
+    """The odometry's poses ``(n, 3)`` in the map's frame: by its sightings of a known map, else by the first pose.
+
+    Args:
+        track: of the run.
+        odometry: from zero.
+        first: pose of the estimate at the first keyframe.
+    """
+    begun = _moved(first, odometry)
+    if track.landmarks is None or len(track.ids) < _SIGHTINGS:
+        return begun
+    known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
+    if known.sum() < _SIGHTINGS:
+        return begun
+    where = np.array([track.landmarks[i] for i in track.ids[known].tolist()])
+    places = _world(se2.interpolate(track.stamps_ns, odometry, track.seen_ns[known]), track.places[known])
+    T, weights = np.asarray(first, dtype=float), np.ones(len(places))
+    for _ in range(_ITERATIONS):
+        T = _aligned(places, where, weights)
+        off = np.hypot(*(_moved(T, np.column_stack([places, np.zeros(len(places))]))[:, :2] - where).T)
+        weights = 1.0 / (1.0 + (off / _CAUCHY_M) ** 2)
+    aligned = _moved(T, odometry)
+    return min((aligned, begun), key=lambda poses: float(np.median(_distances(track, poses))))
+
+
+def _aligned(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
+    """Rigid motion ``(3,)`` between weighted points; source: Umeyama 1991, in the plane and without scale."""
+    w = weights[:, None] / weights.sum()
+    a, b = (w * source).sum(axis=0), (w * target).sum(axis=0)
+    s, t = source - a, target - b
+    turned = float((w[:, 0] * (s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])).sum())
+    yaw = math.atan2(turned, float((w * s * t).sum()))
+    return np.array([*(b - se2.compose((0.0, 0.0, yaw), (*a, 0.0))[:2]), yaw])
+
+
+def _moved(T: FloatArray, poses: FloatArray) -> FloatArray:
+    return se2.compose_array(np.broadcast_to(T, poses.shape), poses)
+
+
+# --- while a run goes on ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """Between two windows: time, the estimate, and the odometry from there on to the next edge."""
+
+    stamp_ns: int
+    estimate: Estimate
+    motion: FloatArray
+    cov: FloatArray
+    path: float
+
+
+class Watch:
+    """Holds the estimate against the odometry while a run goes on; gives the odometry where the estimate fails.
+
+    It remembers the last two minutes. The odometry goes on from the last pose before the first window that departs.
+    """
+
+    def __init__(self, mapped: bool, config: Config) -> None:
+        """Nothing has come in.
+
+        Args:
+            mapped: the landmarks' places are surveyed.
+            config: as the run uses it.
+        """
+        self._mapped, self._config = mapped, config
+        self._edges: deque[_Edge] = deque(maxlen=_WATCHED)  # with what was driven from each to the next
+        self._windows: deque[Window | None] = deque(maxlen=_WATCHED)  # one for each edge; None: in rest
+        self._away: deque[tuple[int, float]] = deque(maxlen=_MOST_WATCHED)
+        self._start: Estimate | None = None  # of the window that is not complete, and what was driven since
+        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
+        self._carried: tuple[FloatArray, FloatArray] | None = None  # pose and covariance, right perturbation
+        self._given: FloatArray | None = None  # pose that was given last ...
+        self._predicted: FloatArray | None = None  # ... and where the odometry leads from it
+        self._first_ns: int | None = None
+        self._spans: list[tuple[float, float]] = []  # [s] from the first pose, in which the odometry was given
+        self._why = ""
+
+    def checked(
+        self,
+        step: Step,
+        measured: MotionMeasurement,
+        joined: bool,
+        estimate: Estimate | None,
+        away: Sequence[float],
+    ) -> Estimate | None:
+        """The estimate, or the odometry in its place.
+
+        Args:
+            step: the newest one.
+            measured: its odometry.
+            joined: it goes on from the step before.
+            estimate: None: no pose is known; the comparison begins anew.
+            away: whitened distances of the step's sightings from their landmarks.
+        """
+        if estimate is None or not joined:
+            self._restart(estimate)
+            return estimate
+        if self._first_ns is None:
+            self._first_ns = estimate.stamp_ns
+        if self._carried is not None:
+            pose, cov = self._carried
+            cov = se2.compose_cov(cov, measured.motion, measured.cov * _CONTRADICTED**2)
+            self._carried = se2.compose(pose, measured.motion), cov
+        finite = bool(np.isfinite(estimate.pose).all() and np.isfinite(estimate.cov).all())
+        self._predicted = None if self._given is None else se2.compose(self._given, measured.motion)
+        self._given = estimate.pose
+        self._drive(step, measured, estimate, finite)
+        self._away.extend((step.stamp_ns, distance) for distance in away)
+        why = self._failure(step, estimate, finite)
+        if why is None and not self._returned(estimate):
+            why = self._why
+        if why is None:
+            self._carried = None
+            return estimate
+        self._why = self._why or why
+        if self._carried is None:
+            self._carried = self._last_sane()
+        if self._carried is None:
+            return estimate
+        self._note(step)
+        pose, cov = self._carried
+        self._given = pose
+        turned = se2.rotate_cov(cov, float(pose[2]))
+        ground = None if estimate.ground is None else estimate.ground.with_planar(turned)
+        return replace(estimate, pose=pose, cov=turned, mode=Mode.DEAD_RECKONING, ground=ground)
+
+    @property
+    def sentence(self) -> str | None:
+        """What was found; None: nothing."""
+        if not self._spans:
+            return None
+        spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans[:_SPANS_TOLD])
+        return (
+            f"The estimate explains the recording worse than odometry alone, which is given in its place from {spans} "
+            f"after the first pose: {self._why}."
+        )
+
+    def findings(self) -> tuple[Finding, ...]:
+        """The same as a finding."""
+        return () if self.sentence is None else (Finding("sanity.odometry", self.sentence, Severity.ERROR),)
+
+    def _restart(self, estimate: Estimate | None) -> None:
+        self._edges.clear()
+        self._windows.clear()
+        self._away.clear()
+        self._start, self._carried = estimate, None
+        self._given = None if estimate is None else estimate.pose
+        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
+
+    def _drive(self, step: Step, measured: MotionMeasurement, estimate: Estimate, finite: bool) -> None:
+        """Add a step to the window, and close it where it is long enough."""
+        if self._start is None:
+            self._start = estimate
+            return
+        self._motion = se2.compose(self._motion, measured.motion)
+        self._cov = se2.compose_cov(self._cov, measured.motion, measured.cov)
+        self._path += math.hypot(measured.motion[0], measured.motion[1])
+        if (step.stamp_ns - self._start.stamp_ns) * 1e-9 < _WINDOW_S:
+            return
+        window = None
+        if finite and np.isfinite(self._start.pose).all():
+            window = Window.of(self._motion, self._cov, self._path, se2.between(self._start.pose, estimate.pose))
+        self._edges.append(_Edge(self._start.stamp_ns, self._start, self._motion, self._cov, self._path))
+        self._windows.append(window)
+        self._start = estimate
+        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
+
+    def _failure(self, step: Step, estimate: Estimate, finite: bool) -> str | None:
+        """Evidence against the estimate as it is now; None: there is none."""
+        if not finite:
+            return "its pose is not finite"
+        if estimate.mode is Mode.LOST:  # it says so itself, and sightings of another place are no surprise
+            return None
+        since_ns = step.stamp_ns - round(_SEEN_S * 1e9)
+        while self._away and self._away[0][0] < since_ns:
+            self._away.popleft()
+        explained = math.nan
+        if len(self._away) >= _SIGHTINGS and (self._away[-1][0] - self._away[0][0]) * 1e-9 > 0.5 * _SEEN_S:
+            away = np.array([distance for _, distance in self._away])
+            explained = float(np.mean(away < _EXPLAINED))
+            if not supported(explained, float(np.median(away))):
+                return f"it explains {_percent(explained)} of the sightings of {_SEEN_S:.0f} s"
+        moving = [w for w in self._windows if w is not None]
+        if not self._mapped and self._predicted is not None:
+            leap = math.hypot(*(estimate.pose - self._predicted)[:2])
+            if leap > _LEAP_M + self._config.gate.max_speed * step.dt:
+                return f"it leaps by {leap:.3g} m within a step"
+        if len(moving) < _FEWEST_WATCHED or (self._mapped and explained > _SUPPORTED):
+            return None
+        departure = float(np.median([w.departure for w in moving]))
+        strain = float(np.median([w.strain for w in moving]))
+        if departs(departure, strain, self._mapped):
+            return f"over {len(moving)} windows of {_WINDOW_S:.0f} s it departs by {_percent(departure)} of the path"
+        return None
+
+    def _returned(self, estimate: Estimate) -> bool:
+        """Whether an estimate that has failed can be given again; without a map it must be near the odometry."""
+        if self._carried is None or self._mapped:
+            return True
+        pose, cov = self._carried
+        away = math.hypot(*(estimate.pose - pose)[:2])
+        return away < _LEAP_M + _RETURNED * math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+
+    def _last_sane(self) -> tuple[FloatArray, FloatArray] | None:
+        """Pose and covariance now: those before the first window that departs, with the odometry since."""
+        strained = [w is None or departs(w.departure, w.strain, self._mapped) for w in self._windows]
+        first = next((i for i, w in enumerate(self._windows) if w is not None and strained[i]), len(self._windows))
+        edges = list(self._edges)
+        pending = [] if self._start is None else [_Edge(0, self._start, self._motion, self._cov, self._path)]
+        edges = [*edges, *pending][first if first < len(edges) else max(len(edges) - 1, 0) :]
+        while edges and not np.isfinite(edges[0].estimate.pose).all():
+            edges = edges[1:]
+        if not edges:
+            return None
+        begun = edges[0].estimate
+        pose, cov = begun.pose, se2.rotate_cov(begun.cov, -float(begun.pose[2]))
+        for edge in edges:
+            cov = se2.compose_cov(cov, edge.motion, edge.cov * _CONTRADICTED**2)
+            pose = se2.compose(pose, edge.motion)
+        return pose, cov
+
+    def _note(self, step: Step) -> None:
+        """Add the step to the time in which the odometry was given."""
+        assert self._first_ns is not None
+        at = (step.stamp_ns - self._first_ns) * 1e-9
+        if self._spans and (step.start_ns - self._first_ns) * 1e-9 - self._spans[-1][1] < _WINDOW_S:
+            self._spans[-1] = self._spans[-1][0], at
+        elif len(self._spans) < _SPANS_TOLD:
+            self._spans.append((at, at))

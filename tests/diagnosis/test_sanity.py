@@ -1,0 +1,312 @@
+"""An estimate that explains a recording worse than odometry alone is not given; a sound one is never doubted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from fgloc import se2
+from fgloc.cli.terminal import EXIT_LOST, exit_code
+from fgloc.config import Config
+from fgloc.datasets.bag import BagWriter
+from fgloc.diagnosis.sanity import Track, Watch, gyro_agrees, judged
+from fgloc.errors import FglocError
+from fgloc.evaluation.metrics import compute_metrics
+from fgloc.localizer import Localizer
+from fgloc.runner import run
+from fgloc.types import Estimate, Mode, MotionMeasurement, Step
+
+SECOND = 1_000_000_000
+T0 = 1_700_000_000 * SECOND
+TICK_NS = SECOND // 5
+BEACONS = {1: np.array([3.0, 1.0]), 2: np.array([-1.0, 3.0]), 3: np.array([-2.0, -2.0]), 4: np.array([2.0, -3.0])}
+STEP_COV = np.diag([0.004, 0.003, 0.008]) ** 2
+
+
+def driven(n=400, seed=3):
+    """True poses, the odometry's motions with noise and the sightings of a robot on a winding way."""
+    rng = np.random.default_rng(seed)
+    poses, motions = [np.zeros(3)], [np.zeros(3)]
+    for k in range(1, n):
+        true = np.array([0.06, 0.0, 0.05 + 0.06 * math.sin(0.07 * k)])
+        poses.append(se2.compose(poses[-1], true))
+        motions.append(true + rng.normal(0.0, [0.002, 0.001, 0.003]))
+    return np.array(poses), np.array(motions), rng
+
+
+def track_of(poses, motions, rng, known=True, ids=(1, 2, 3, 4), mirror=1.0):
+    n = len(poses)
+    seen = [(k, i) for k in range(0, n, 2) for i in ids]
+    places = np.array([se2.compose(se2.inverse(poses[k]), (*BEACONS[i], 0.0))[:2] for k, i in seen]).reshape(-1, 2)
+    places = places * [1.0, mirror] + rng.normal(0.0, 0.02, places.shape)
+    stamps = T0 + np.arange(n) * TICK_NS
+    return Track(
+        stamps,
+        np.ones(n, dtype=np.int64),
+        motions,
+        np.tile(STEP_COV, (n, 1, 1)),
+        np.array([stamps[k] for k, _ in seen], dtype=np.int64),
+        np.array([i for _, i in seen], dtype=np.int64),
+        places,
+        np.full(len(seen), 0.05),
+        BEACONS if known else None,
+        0.01,
+        0.01,
+    )
+
+
+def estimates(track, poses):
+    return [Estimate(int(t), p, np.eye(3) * 1e-4) for t, p in zip(track.stamps_ns, poses, strict=True)]
+
+
+def codes(verdict):
+    return [finding.code for finding in verdict.findings]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_sound_estimate_is_not_doubted(known):
+    poses, motions, rng = driven()
+    track = track_of(poses, motions, rng, known)
+    verdict = judged(track, estimates(track, poses))
+    assert not verdict.findings
+    assert verdict.simpler is None
+    assert len(verdict.odometry) == len(poses)
+
+
+def test_slip_is_not_held_against_the_estimate():
+    poses, motions, rng = driven()
+    motions[100:180, 0] += 0.08  # the wheels spin for a fifth of the run
+    for known in (True, False):
+        track = track_of(poses, motions, rng, known)
+        assert not judged(track, estimates(track, poses)).findings
+
+
+def test_wheels_of_a_wrong_size_do_not_outweigh_a_surveyed_map():
+    poses, motions, rng = driven()
+    motions[:, :2] *= 3.28
+    track = track_of(poses, motions, rng)
+    assert judged(track, estimates(track, poses)).simpler is None
+
+
+def test_a_runaway_scale_gives_odometry_instead():
+    poses, motions, rng = driven()
+    track = track_of(poses, motions, rng, known=False)
+    far = poses * [-3657.0, -3657.0, 1.0]
+    verdict = judged(track, estimates(track, far))
+    assert codes(verdict) == ["sanity.odometry"]
+    given = np.array([e.pose for e in verdict.simpler])
+    assert np.hypot(*(given - poses)[:, :2].T).max() < 1.0
+    assert all(e.mode is Mode.DEAD_RECKONING for e in verdict.simpler)
+
+
+def test_without_a_map_the_wheels_are_the_measure_of_length():
+    poses, motions, rng = driven()
+    track = track_of(poses, motions, rng, known=False)
+    assert codes(judged(track, estimates(track, poses * [1.11, 1.11, 1.0]))) == ["sanity.odometry"]
+
+
+def test_poses_that_are_not_finite_are_not_given():
+    poses, motions, rng = driven()
+    track = track_of(poses, motions, rng, ids=())
+    lost = poses.copy()
+    lost[50:, 0] = np.nan
+    verdict = judged(track, estimates(track, lost))
+    assert codes(verdict) == ["sanity.odometry"]
+    assert np.isfinite([e.pose for e in verdict.simpler]).all()
+    assert (np.linalg.eigvalsh([e.cov for e in verdict.simpler])[:, 0] > 0.0).all()
+
+
+def test_an_estimate_that_stands_while_the_wheels_drive_needs_a_sighting():
+    poses, motions, rng = driven()
+    track = track_of(poses, motions, rng, known=False, ids=())
+    stuck = poses.copy()
+    stuck[100:, :2] = stuck[100, :2]
+    assert codes(judged(track, estimates(track, stuck))) == ["sanity.odometry"]
+
+
+def test_the_textbook_is_given_where_it_alone_explains_the_sightings():
+    poses, motions, rng = driven(600)
+    motions[:, 2] += 0.004  # odometry alone drifts off
+    track = track_of(poses, motions, rng)
+    wrong = poses + np.array([1.5, 0.0, 0.0])
+    verdict = judged(track, estimates(track, wrong))
+    assert codes(verdict) == ["sanity.textbook"]
+    given = np.array([e.pose for e in verdict.simpler])
+    assert np.hypot(*(given - poses)[:, :2].T).max() < 0.1
+
+
+def test_odometry_in_place_of_the_estimate_has_an_honest_covariance():
+    nees = []
+    for seed in range(12):
+        poses, motions, rng = driven(seed=seed)
+        motions[:, 0] *= 1.0 + rng.normal(0.0, 0.01)
+        track = track_of(poses, motions, rng, known=False, ids=())
+        far = poses * [9.0, 9.0, 1.0]
+        last = judged(track, estimates(track, far)).simpler[-1]
+        off = last.pose - poses[-1]
+        off[2] = se2.wrap(off[2])
+        nees.append(off @ np.linalg.solve(last.cov, off) / 3.0)
+    assert 0.02 < np.mean(nees) < 2.0
+
+
+def watched(poses, given, motions, away=None, mapped=True):
+    """What a watch gives for each step."""
+    watch, out = Watch(mapped, Config()), []
+    for k in range(len(poses)):
+        stamp = T0 + k * TICK_NS
+        step = Step(k, 0, stamp - TICK_NS, stamp)
+        measured = MotionMeasurement("wheels", step.start_ns, stamp, motions[k], STEP_COV)
+        estimate = Estimate(stamp, given[k], np.eye(3) * 1e-4)
+        out.append(watch.checked(step, measured, k > 0, estimate, [] if away is None else away[k]))
+    return watch, out
+
+
+def test_a_watch_leaves_sound_estimates_as_they_are():
+    poses, motions, _ = driven()
+    watch, out = watched(poses, poses, motions, mapped=False)
+    assert watch.sentence is None
+    assert all(np.array_equal(e.pose, p) for e, p in zip(out, poses, strict=True))
+
+
+def test_a_watch_carries_the_last_sane_pose_on_and_ends_when_the_estimate_is_sane_again():
+    poses, motions, _ = driven()
+    given = poses.copy()
+    given[200:300, 0] += 1e6
+    watch, out = watched(poses, given, motions, mapped=False)
+    off = np.array([math.hypot(*(e.pose - p)[:2]) for e, p in zip(out, poses, strict=True)])
+    assert off.max() < 0.5
+    assert {e.mode for e in out[200:215]} == {Mode.DEAD_RECKONING}
+    assert np.trace(out[214].cov) > np.trace(out[201].cov)
+    assert [f.code for f in watch.findings()] == ["sanity.odometry"]
+
+
+def test_a_watch_is_causal():
+    poses, motions, _ = driven()
+    given = poses.copy()
+    given[200:, 0] += 1e6
+    _, whole = watched(poses, given, motions, mapped=False)
+    _, part = watched(poses[:250], given[:250], motions[:250], mapped=False)
+    assert all(np.array_equal(a.pose, b.pose) for a, b in zip(whole[:250], part, strict=True))
+
+
+def test_a_watch_does_not_believe_sightings_that_the_estimate_does_not_explain():
+    poses, motions, _ = driven()
+    given = poses + np.linspace(0.0, 5.0, len(poses))[:, None] * [1.0, 0.0, 0.0]
+    watch, out = watched(poses, given, motions, away=[[9.0]] * len(poses))
+    assert watch.findings()
+    assert math.hypot(*(out[-1].pose - poses[-1])[:2]) < math.hypot(*(given[-1] - poses[-1])[:2])
+
+
+def test_a_gyro_of_another_axis_does_not_agree():
+    turns = np.array([0.05, -0.03] * 100)
+    turns[:100] += 0.05
+    assert gyro_agrees(turns, turns * 1.02)
+    assert not gyro_agrees(turns, np.zeros(200))
+
+
+# --- whole runs ---
+
+
+def bag(folder, n=300, topics=("odometry", "sightings", "truth"), moving=True, hz=10.0):
+    """A drive with sightings of the beacons and the truth."""
+    with BagWriter(folder / "bag", storage="mcap") as out:
+        for k in range(n):
+            stamp = T0 + round(k * SECOND / hz)
+            speed, turn = (0.3, 0.25) if moving else (0.0, 0.0)
+            angle = turn * k / hz
+            x, y = (speed / turn * math.sin(angle), speed / turn * (1 - math.cos(angle))) if moving else (0.0, 0.0)
+            pose = (x, y, angle)
+            if "odometry" in topics:
+                covs = (np.eye(6) * 1e-3, np.eye(6) * 1e-3)
+                out.odometry("/odom", stamp, pose, (speed, turn), stamp, covs)
+            if "truth" in topics:
+                quaternion = (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
+                out.truth("/truth", stamp, (x, y, 0.0), quaternion, received_ns=stamp)
+            if "sightings" in topics:
+                seen = []
+                for i, place in BEACONS.items():
+                    at = se2.compose(se2.inverse(np.array(pose)), (*place, 0.0))
+                    seen.append((i, math.hypot(at[0], at[1]), math.atan2(at[1], at[0])))
+                out.range_bearing("/landmarks", stamp, seen, stamp)
+    return folder / "bag"
+
+
+@pytest.mark.parametrize("mode", ["batch", "online"])
+def test_a_run_that_is_broken_gives_odometry_and_exit_code_3(tmp_path, monkeypatch, mode):
+    path = bag(tmp_path)
+    if mode == "online":
+        update = Localizer.update
+
+        def broken(self, step):
+            estimate = update(self, step)
+            return None if estimate is None else dataclasses.replace(estimate, pose=estimate.pose * 1e6)
+
+        monkeypatch.setattr(Localizer, "update", broken)
+    else:
+        import fgloc.runner as runner
+
+        smooth = runner.smooth_run
+
+        def runaway(parts):
+            smoothed = smooth(parts)
+            far = [dataclasses.replace(e, pose=e.pose * [-3657.0, 3657.0, 1.0]) for e in smoothed.estimates]
+            return dataclasses.replace(smoothed, estimates=far)
+
+        monkeypatch.setattr(runner, "smooth_run", runaway)
+    config = Config.model_validate({"truth": {"align": "se2"}})
+    result = run(path, None, config, mode, check=False)
+    assert "sanity.odometry" in {f.code for f in result.findings}
+    assert exit_code(result) == EXIT_LOST
+    metrics = compute_metrics(result, config)
+    assert metrics.ate_rmse_m < 0.3
+    assert metrics.odometry.ate_rmse_m < 0.3
+
+
+def test_a_sound_run_has_the_figures_of_odometry_alone_and_no_finding(tmp_path):
+    config = Config.model_validate({"truth": {"align": "se2"}})
+    result = run(bag(tmp_path), None, config, "batch")
+    assert not [f for f in result.findings if f.code.startswith("sanity")]
+    assert compute_metrics(result, config).odometry.ate_rmse_m < 0.05
+
+
+# --- bad input: a sentence or figures that mean something, never others ---
+
+
+@pytest.mark.parametrize("mode", ["batch", "online"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"n": 300, "moving": False},  # static
+        {"n": 20},  # 2 s
+        {"n": 100, "topics": ("odometry",)},  # of one sensor
+        {"n": 100, "topics": ("sightings",)},
+        {"n": 1},
+        {"n": 0},  # silent
+    ],
+    ids=["static", "2s", "odometry", "sightings", "one", "silent"],
+)
+def test_bad_input_ends_with_a_sentence_or_with_poses_that_mean_something(tmp_path, mode, asked):
+    config = Config.model_validate({"truth": {"align": "se2"}})
+    try:
+        result = run(bag(tmp_path, **asked), None, config, mode)
+    except FglocError as error:
+        message = str(error)
+        if not message:
+            raise
+        return
+    assert not [f for f in result.findings if f.code.startswith("sanity")]
+    poses = result.trajectory.poses
+    assert np.isfinite(poses).all()
+    seconds = asked["n"] / 10.0
+    assert np.hypot(*poses[:, :2].T).max() < (0.1 if asked.get("moving") is False else 0.3 * seconds + 0.5)
+    compute_metrics(result, config)
+
+
+def test_twenty_hours_at_a_low_rate(tmp_path):
+    config = Config.model_validate({"keyframes": {"max_interval_s": 60.0}, "wheels": {"hold_s": 60.0}})
+    result = run(bag(tmp_path, n=1200, hz=1.0 / 60.0, topics=("odometry",)), None, config, "online")
+    assert np.isfinite(result.trajectory.poses).all()
+    assert not [f for f in result.findings if f.code.startswith("sanity")]
