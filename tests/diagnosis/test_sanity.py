@@ -243,7 +243,7 @@ def test_a_run_that_is_broken_gives_odometry_and_exit_code_3(tmp_path, monkeypat
         def broken(self, step):
             estimate = update(self, step)
             late = estimate is not None and step.stamp_ns > T0 + 5 * SECOND
-                return dataclasses.replace(estimate, pose=estimate.pose * 1e6) if late else estimate
+            return dataclasses.replace(estimate, pose=estimate.pose * 1e6) if late else estimate
 
         monkeypatch.setattr(Localizer, "update", broken)
     else:
