@@ -1,7 +1,7 @@
 """Answer sheet of `benchmarks.field`: what a recording is to tell by itself, and what is sound in it.
 
-A trap is found if a finding of a run in ``metrics.json`` has its code, or if ``init`` or ``info`` says its sentence,
-and the figure, if it has one, is within the tolerance of what was measured by hand (signs are not compared: a lag is
+A trap is found if a finding of a run in ``metrics.json`` has its code, or if it, ``init`` or ``info`` says its
+sentence, and the figure, if it has one, is within the tolerance of what was measured by hand (signs are not compared: a lag is
 ahead or behind as one looks at it). Patterns of sentences are alternatives of plain words for the one thing.
 """
 
@@ -49,11 +49,9 @@ class Sound:
 def found(trap: Trap, o: Outcome) -> bool:
     """Whether ``init``, ``info`` or a run's findings tell a peculiarity, with its figure."""
     for finding in (*o.findings("batch"), *o.findings("online")):
-        if trap.code and re.fullmatch(trap.code, finding["code"]):
-            if trap.figure is None or _near(trap, finding.get("value")):
-                return True
-            if _said(trap, finding["text"]):
-                return True
+        coded = bool(trap.code) and re.fullmatch(trap.code, finding["code"]) is not None
+        if coded and (trap.figure is None or _near(trap, finding.get("value"))) or _said(trap, finding["text"]):
+            return True
     return any(_said(trap, line) for name in ("init", "info") for line in _lines(o.said.get(name, "")))
 
 
@@ -114,10 +112,10 @@ SHEET: tuple[Trap, ...] = (
             Trap(f"mrclam6_{k}", "robot follows commands later", r"clock\.\w+", rf"(late|delay|behind|lag).*{_NUMBER} s", 0.17, 0.08),
         )
     ),
-    Trap("turtlebot3_15_11_34", "spikes in the twist", r"odometry\.(twist_)?spikes?", r"spike|jumps? of|12\d(\.\d+)? rad/s"),
-    Trap("turtlebot3_15_11_34", "nine ids, eight coordinates", "", r"9 ids?\b|nine ids|8 (coordinates|positions|values)"),
-    Trap("turtlebot3_15_11_34", "blackout of 21 s", "", rf"landmarks.*(longest|silent for) {_NUMBER} s", 21.0, 1.5),
-    Trap("turtlebot3_14_27_38", "spikes in the twist", r"odometry\.(twist_)?spikes?", r"spike|jumps? of|12\d(\.\d+)? rad/s"),
+    Trap("turtlebot3_15_11_34", "spikes in the twist", r"odometry\.(twist_)?spikes?", rf"yaw rate.*up to {_NUMBER}", 125.0, 3.0),
+    Trap("turtlebot3_15_11_34", "nine ids, eight coordinates", "", r"unequal length|9 ids?\b|nine ids"),
+    Trap("turtlebot3_15_11_34", "blackout of 21 s", "", rf"landmarks.*longest {_NUMBER} s", 21.0, 1.5),
+    Trap("turtlebot3_14_27_38", "spikes in the twist", r"odometry\.(twist_)?spikes?", rf"yaw rate.*up to {_NUMBER}", 125.0, 3.0),
     *(
         trap
         for name, (held, hand) in _TB3.items()
