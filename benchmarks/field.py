@@ -12,7 +12,8 @@ has a frame of its own always.
 
 - ``field.NAME.{batch,online}.{ate_m,ate_over_odometry,ate_over_textbook,nees_over_3,exit}``
 - ``field.worse``: runs whose ATE is over 1.05 times and 2 mm more than that of odometry or of the textbook, without
-  exit 3 and the right cause first. ``field.crashes``: commands that ended neither with 0 or 3 nor with a sentence.
+  exit 3 and the right cause first. A run that gives poses for less than half of the time has no ATE, and is worse if it
+  ends with 0. ``field.crashes``: commands that ended neither with 0 or 3 nor with a sentence.
 - ``field.geomean_over_odometry``: of runs with truth and landmarks. ``field.nees``: share of runs with NEES/3 in 0.4 to
   2.5, or exit 3 with the right cause. ``field.traps_found``, ``field.false``: see `benchmarks.field_sheet`.
 - ``field.beyond_gate``: constants that were used more than 4 prior sigmas from what was given.
@@ -57,6 +58,7 @@ _NEES = (0.4, 2.5)
 _LAGS_S = np.arange(-0.3, 0.3001, 0.02)  # of a truth without stamps
 _BRIDGED_S = 1.0  # between poses of an estimate
 _LEAST = 10  # compared positions
+_SHARE = 0.5  # of the stamps with a truth: an estimate of less is none of the recording
 _ESCAPES = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
@@ -113,8 +115,9 @@ def distances(poses: FloatArray, truth: FloatArray, align: bool, lever: bool) ->
 
 
 def ate(estimate: Trajectory, truth: Trajectory, at_ns: IntArray, align: bool, lever: bool, clock: bool) -> float:
-    """Rmse of positions at these stamps [m]; NaN where too few can be compared."""
+    """Rmse of positions at these stamps [m]; NaN if there are poses for less than half of those with a truth."""
     gap = max(0.25, 3.0 * float(np.median(np.diff(truth.stamps_ns))) * 1e-9)
+    asked = int(_covered(truth.stamps_ns, at_ns, gap).sum())
     at_ns = at_ns[_covered(estimate.stamps_ns, at_ns, _BRIDGED_S)]
     if len(at_ns) == 0:
         return math.nan
@@ -123,7 +126,7 @@ def ate(estimate: Trajectory, truth: Trajectory, at_ns: IntArray, align: bool, l
     for lag in _LAGS_S if clock else np.zeros(1):
         shifted = at_ns + round(float(lag) * 1e9)
         known = _covered(truth.stamps_ns, shifted, gap)
-        if known.sum() < _LEAST:
+        if known.sum() < max(_LEAST, _SHARE * asked):
             continue
         true = np.column_stack([np.interp(shifted[known], truth.stamps_ns, truth.poses[:, k]) for k in (0, 1)])
         best = min(best, float(np.sqrt(np.mean(distances(poses[known], true, align, lever) ** 2))))
@@ -275,14 +278,14 @@ def _of_recording(recording: Recording, o: Outcome) -> Iterator[Row]:
 
 def _of_all(chosen: Sequence[Recording], outcomes: Mapping[str, Outcome]) -> Iterator[Row]:
     runs = [(r, outcomes[r.name], mode) for r in chosen for mode in MODES]
-    compared = [run for run in runs if run[2] in run[1].ate and math.isfinite(run[1].best(run[2]))]
+    compared = [run for run in runs if math.isfinite(run[1].best(run[2])) and run[1].codes.get(run[2]) != 1]
     bad = [run for run in compared if worse(*run)]
     yield Row("field.worse", float(len(bad)), n=len(compared), unit=" ".join(f"{r.name}.{m}" for r, _, m in bad))
     crashed = [f"{name}.{c}" for name, o in outcomes.items() for c, code in o.codes.items() if crash(o, c, code)]
     yield Row(
         "field.crashes", float(len(crashed)), n=sum(len(o.codes) for o in outcomes.values()), unit=" ".join(crashed)
     )
-    ratios = [o.ate[m] / o.ate["odometry"] for r, o, m in compared if r.landmarks and "odometry" in o.ate]
+    ratios = [o.ate[m] / o.ate["odometry"] for r, o, m in compared if r.landmarks and {m, "odometry"} <= o.ate.keys()]
     if ratios:
         logs = np.log(ratios)
         yield Row("field.geomean_over_odometry", float(np.exp(logs.mean())), float(logs.std()), len(ratios))
@@ -310,7 +313,9 @@ def nees_of(o: Outcome, mode: Mode) -> float | None:
 
 def worse(recording: Recording, o: Outcome, mode: Mode) -> bool:
     """Whether a run is worse than odometry or textbook without exit 3 and the right cause first."""
-    value, best = o.ate[mode], o.best(mode)
+    value, best = o.ate.get(mode, math.inf), o.best(mode)
+    if mode not in o.ate:
+        return o.codes.get(mode) != 3
     return value > max(_WORSE * best, best + _WORSE_M) and not excused(recording, o, mode)
 
 

@@ -178,8 +178,14 @@ def _car_park(source: Path, out: Path) -> None:
     fixes = np.column_stack([data["GPSLon"].ravel(), data["GPSLat"].ravel()])
     with new_bag(out, "mcap") as bag:
         write_merged(
-            _joints(bag, "/steering", stamps, ("steering",), steering[:, None]),
-            _joints(bag, "/wheel_speed", stamps, ("rear_left_wheel",), None, speed[:, None]),
+            _joints(
+                bag,
+                "/joints",
+                stamps,
+                ("steering", "rear_left_wheel"),  # an angle [rad] and a speed [m/s]
+                np.column_stack([steering, np.full(len(stamps), np.nan)]),
+                np.column_stack([np.full(len(stamps), np.nan), speed]),
+            ),
             _odometry(bag, stamps, poses, twists),
             (
                 (t, partial(_scan, bag, t, ranges, intensity))

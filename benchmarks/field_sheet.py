@@ -50,7 +50,7 @@ def found(trap: Trap, o: Outcome) -> bool:
     """Whether ``init``, ``info`` or a run's findings tell a peculiarity, with its figure."""
     for finding in (*o.findings("batch"), *o.findings("online")):
         coded = bool(trap.code) and re.fullmatch(trap.code, finding["code"]) is not None
-        if coded and (trap.figure is None or _near(trap, finding.get("value"))) or _said(trap, finding["text"]):
+        if (coded and (trap.figure is None or _near(trap, finding.get("value")))) or _said(trap, finding["text"]):
             return True
     return any(_said(trap, line) for name in ("init", "info") for line in _lines(o.said.get(name, "")))
 

@@ -56,6 +56,7 @@ def test_ate_compares_only_where_both_are_known():
     broken = poses.copy()
     broken[100:, 0] += 5.0
     known = Trajectory(stamps[:100], poses[:100])
+    assert np.isnan(ate(Trajectory(stamps[:40], poses[:40]), known, stamps, False, False, False))  # too little
     assert ate(Trajectory(stamps, broken), known, stamps, align=False, lever=False, clock=False) < 1e-9
     assert np.isnan(ate(Trajectory(stamps[150:], poses[150:]), known, stamps, False, False, False))
 
