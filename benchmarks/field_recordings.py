@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -252,9 +252,10 @@ def _pyfg(robot: str, source: Path, out: Path) -> None:
     true = np.array(truth)
     steps, others = np.array(edges), np.array(ranges).reshape(-1, 3)
     stamps = nanoseconds([true[0, 0], *steps[:, 0]])
+    poses = np.array(list(accumulate(steps[:, 1:], se2.compose, initial=np.zeros(3))))
     with new_bag(out, "mcap") as bag:
         write_merged(
-            _odometry(bag, stamps, *_integrated(stamps * 1e-9, steps[:, 1:])),
+            _odometry(bag, stamps, poses, _twists(stamps * 1e-9, poses)),
             _sightings(bag, sorted(seen)),
             _ranges(bag, nanoseconds(others[:, 0]), others[:, 1].astype(int), others[:, 2]),
             _poses(bag, nanoseconds(true[:, 0]), true[:, 1:], "map"),
@@ -349,7 +350,7 @@ def _write_map(out: Path, places: dict[int, Any]) -> None:
 
 
 def _integrated(seconds: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses ``(n, 3)`` from the origin on, and twists ``(n, 3)``, of steps ``(n - 1, 3)``: travel and turn."""
+    """Poses ``(n, 3)`` from the origin on, and twists ``(n, 3)``, of arcs ``(n - 1, 3)``: travel and turn."""
     poses = [np.zeros(3)]
     for step in steps:
         half = 0.5 * step[2]
