@@ -1,0 +1,246 @@
+"""Injected conventions: ``python -m benchmarks.conventions [--quick] [--json FILE]``.
+
+Each convention of each sensor is broken, one at a time, in recordings that agree with the robot.yaml that
+``fgloc init`` makes of them, and the engine that all commands share is asked what it finds first.
+
+- ``conventions.named``: share of injected mistakes that the first new finding names by its code, with a figure within
+  the tolerance where the mistake has one.
+- ``conventions.false``: findings on the recordings as they are.
+
+Recordings: two samples of the simulator, and those of other people that the folder ``FGLOC_REAL_DATA`` holds. The
+half of the mistakes that ``--quick`` has was looked at while thresholds were chosen; the other was not.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from benchmarks.common import Row, main
+from fgloc.calibration.first_settings import first_settings
+from fgloc.config import Config, config_of
+from fgloc.diagnosis.conventions import conventions
+from fgloc.diagnosis.signals import SignalCollector
+from fgloc.errors import FglocError
+from fgloc.recording.files import find_beside
+from fgloc.recording.reader import Recording
+from fgloc.sensor_setup import recorded_setup
+from fgloc.sensors.marker_pose.events import MarkerPose
+from fgloc.sensors.range_bearing.events import RangeBearing
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Event, Finding, InertialEvent, SightingsEvent, TruthEvent
+
+ROOT = Path(__file__).resolve().parent.parent
+REAL = Path(os.environ.get("FGLOC_REAL_DATA", ROOT.parent / "shared" / "data"))
+RECORDINGS = {
+    "installed_run": ROOT / "datasets" / "samples" / "installed_run" / "bag",
+    "first_run": ROOT / "datasets" / "samples" / "first_run" / "bag",
+    "duarte": REAL / "pioneer_aruco" / "duarte.bag",
+    "tb3_landmarks": REAL / "turtlebot3" / "rosbag2_2025_11_25-15_11_34",
+    "husky": REAL / "robot_localization_bags" / "test1.bag",
+    "tb3_imu": REAL / "turtlebot3" / "rosbag2_2025_11_06-17_25_46",
+}
+Change = Callable[[Any], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """One broken convention.
+
+    Attributes:
+        of: class of event that it is in.
+        change: of an event.
+        code: of the finding that has to come first.
+        value: figure that the finding has to have; None: it has none.
+        tolerance: of that figure, as a share (or in seconds for a lag).
+        choice: whether it was looked at while thresholds were chosen.
+    """
+
+    of: type[Event]
+    change: Change
+    code: str
+    value: float | None = None
+    tolerance: float = 0.1
+    choice: bool = True
+
+
+def _sightings(change: Change) -> Change:
+    return lambda event: replace(event, sightings=tuple(change(s) for s in event.sightings))
+
+
+def _late(seconds: float) -> Change:
+    return lambda event: replace(event, stamp_ns=event.stamp_ns + round(seconds * 1e9))
+
+
+def _mirrored(s: Any) -> Any:
+    if isinstance(s, RangeBearing):
+        return replace(s, bearing_rad=-s.bearing_rad)
+    return replace(s, position=s.position * [-1.0, 1.0, 1.0])  # optical: x to the left
+
+
+def _scaled(factor: float) -> Change:
+    def change(s: Any) -> Any:
+        if isinstance(s, RangeBearing):
+            return replace(s, range_m=s.range_m / factor)
+        return replace(s, position=s.position / factor)
+
+    return _sightings(change)
+
+
+def _axes(s: Any) -> Any:
+    """Optical axes instead of body axes, and back."""
+    if not isinstance(s, MarkerPose):
+        return s
+    x, y, z = s.position
+    return replace(s, position=np.array([z, -x, -y]))
+
+
+def _imu(M: Any) -> Change:
+    R = np.asarray(M, dtype=float)
+    return lambda e: replace(e, angular_velocity=R @ e.angular_velocity, linear_acceleration=R @ e.linear_acceleration)
+
+
+def _in_world(e: OdometryEvent) -> OdometryEvent:
+    assert e.odometer is not None
+    c, s = math.cos(e.odometer.pose[2]), math.sin(e.odometer.pose[2])
+    x, y = e.linear[:2]
+    return replace(e, linear=np.array([c * x - s * y, s * x + c * y, 0.0]))
+
+
+def _ned(e: TruthEvent) -> TruthEvent:
+    x, y, z = e.position
+    qx, qy, qz, qw = e.orientation
+    yaw = 0.5 * math.pi - math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+    half = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
+    return replace(e, position=np.array([y, x, -z]), orientation=half)
+
+
+def _turned(angle: float) -> Change:
+    s, c = math.sin(0.5 * angle), math.cos(0.5 * angle)
+
+    def change(e: TruthEvent) -> TruthEvent:
+        x, y, z, w = e.orientation
+        return replace(e, orientation=np.array([x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s]))
+
+    return change
+
+
+MISTAKES: dict[str, Mistake] = {
+    "sightings mirrored": Mistake(SightingsEvent, _sightings(_mirrored), "sightings.mirrored|sightings.axes"),
+    "sightings axes": Mistake(SightingsEvent, _sightings(_axes), "sightings.axes", choice=False),
+    "ranges in feet": Mistake(SightingsEvent, _scaled(0.3048), "sightings.scale", 0.3048),
+    "ranges x 0.3048": Mistake(SightingsEvent, _scaled(3.2808), "sightings.scale", 3.2808, choice=False),
+    "ranges in cm": Mistake(SightingsEvent, _scaled(0.01), "sightings.scale", 0.01, choice=False),
+    "ranges in km": Mistake(SightingsEvent, _scaled(1000.0), "sightings.scale", 1000.0, choice=False),
+    "sightings 0.1 s late": Mistake(SightingsEvent, _late(0.1), "clock.sightings", 0.1, 0.05),
+    "sightings 0.4 s late": Mistake(SightingsEvent, _late(0.4), "clock.sightings", 0.4, 0.05, choice=False),
+    "sightings 1 s late": Mistake(SightingsEvent, _late(1.0), "clock.sightings", 1.0, 0.05, choice=False),
+    "IMU z flipped": Mistake(InertialEvent, _imu(np.diag([1, 1, -1])), "imu.axes"),
+    "IMU x and z exchanged": Mistake(InertialEvent, _imu([[0, 0, 1], [0, 1, 0], [1, 0, 0]]), "imu.axes"),
+    "IMU negated": Mistake(InertialEvent, _imu(-np.eye(3)), "imu.axes", choice=False),
+    "IMU in degrees": Mistake(
+        InertialEvent,
+        lambda e: replace(e, angular_velocity=np.degrees(e.angular_velocity)),
+        "imu.unit",
+        math.pi / 180.0,
+        0.2,
+    ),
+    "IMU 0.1 s late": Mistake(InertialEvent, _late(0.1), "clock.imu|clock.odometry|clock.joints", 0.1, 0.05),
+    "IMU 0.7 s late": Mistake(
+        InertialEvent, _late(0.7), "clock.imu|clock.odometry|clock.joints", 0.7, 0.05, choice=False
+    ),
+    "speeds in mm/s": Mistake(
+        OdometryEvent, lambda e: replace(e, linear=1e3 * e.linear), "odometry.twist_unit", 1e-3, 0.05
+    ),
+    "yaw rate in degrees": Mistake(
+        OdometryEvent, lambda e: replace(e, angular=np.degrees(e.angular)), "odometry.yaw_unit", choice=False
+    ),
+    "yaw rate negated": Mistake(OdometryEvent, lambda e: replace(e, angular=-e.angular), "odometry.yaw_sign"),
+    "twist in the world": Mistake(OdometryEvent, _in_world, "odometry.twist_frame", choice=False),
+    "truth in NED": Mistake(TruthEvent, _ned, "truth.axes"),
+    "truth 0.5 s late": Mistake(TruthEvent, _late(0.5), "clock.truth", 0.5, 0.05),
+    "truth in mm": Mistake(
+        TruthEvent, lambda e: replace(e, position=1e3 * e.position), "truth.scale", 1e3, 0.1, choice=False
+    ),
+    "truth turned": Mistake(TruthEvent, _turned(0.5), "truth.mounting", 0.5, 0.15, choice=False),
+}
+
+
+def found_in(bag: Path, config: Config, mistake: Mistake | None) -> tuple[Finding, ...]:
+    """Findings on a recording with one convention broken; none broken: as it is."""
+    with Recording(bag, config.recording) as recording:
+        collector = SignalCollector(config)
+        collector.found.images = "image" in recording.roles
+        role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
+        for message in recording.messages(role_of.keys()):
+            for event in recording.decode(message, role_of[message[0]]):
+                broken = mistake is not None and isinstance(event, mistake.of)
+                collector.found.delays[role_of[message[0]]].append((event.received_ns - event.stamp_ns) * 1e-9)
+                collector.add(mistake.change(event) if broken and mistake is not None else event)
+        T_base_sensor = imu_up = landmark_map = None
+        try:
+            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)[1]
+            T_base_sensor, imu_up, landmark_map = setup.T_base_sensor, setup.imu_up, setup.landmark_map
+        except FglocError:
+            pass
+        found = conventions(collector.found, config, T_base_sensor, imu_up, landmark_map)
+    return tuple(sorted(found.findings, key=lambda f: -f.severity))
+
+
+def has(bag: Path, config: Config, kind: type[Event]) -> bool:
+    """Whether a recording has events of a class that the engine reads."""
+    with Recording(bag, config.recording) as recording:
+        roles = {SightingsEvent: "sightings", InertialEvent: "imu", OdometryEvent: "odometry", TruthEvent: "truth"}
+        return roles[kind] in recording.roles
+
+
+def named(mistake: Mistake, found: tuple[Finding, ...]) -> bool:
+    """Whether the first finding is that of the mistake, with its figure."""
+    if not found or found[0].code not in mistake.code.split("|"):
+        return False
+    value = found[0].value
+    if mistake.value is None:
+        return True
+    if value is None:
+        return False
+    if found[0].code.startswith("clock."):
+        return abs(abs(value) - mistake.value) < mistake.tolerance
+    return min(abs(math.log(abs(value) / mistake.value)), abs(math.log(abs(value) * mistake.value))) < mistake.tolerance
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """A row for each recording, and the totals; a quick run has the mistakes that thresholds were chosen on."""
+    total, hits, false = 0, 0, 0
+    for name, bag in RECORDINGS.items():
+        if not bag.exists():
+            continue
+        config = config_of(yaml.safe_load(first_settings(bag).text))
+        sound = found_in(bag, config, None)
+        false += len(sound)
+        count = right = 0
+        for what, mistake in MISTAKES.items():
+            if (quick and not mistake.choice) or not has(bag, config, mistake.of):
+                continue
+            if what == "sightings axes" and name != "duarte":
+                continue  # ranges and bearings have no axes
+            found = found_in(bag, config, mistake)
+            ok = named(mistake, found)
+            count, right = count + 1, right + ok
+            if not ok:
+                print(f"  {name}: {what}: {[(f.code, f.value) for f in found[:2]]}")
+        total, hits = total + count, hits + right
+        yield Row(f"conventions.named.{name}", right / max(count, 1), n=count, unit="share")
+        yield Row(f"conventions.false.{name}", len(sound), n=1, unit="findings")
+    yield Row("conventions.named", hits / max(total, 1), n=total, unit="share")
+    yield Row("conventions.false", false, n=len(RECORDINGS), unit="findings")
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")
