@@ -13,7 +13,7 @@ from sim_ramp import estimated, record_ramp
 from fgloc.cli.terminal import exit_code
 from fgloc.evaluation.metrics import ground_metrics, match_result
 from fgloc.frames import quaternion_matrix
-from fgloc.types import RunResult
+from fgloc.types import RunResult, Severity
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def check_files(result: RunResult, out: Path) -> None:
 
 def test_a_flat_configuration_is_named(folder: Path) -> None:
     result, _ = estimated(folder, "online", ground="flat")
-    assert any("the floor is not flat: pitch up to" in mistake for mistake in result.mistakes)
-    assert any("set estimator.ground: uneven" in note for note in result.notes)
+    codes = {f.code: f.severity for f in result.findings}
+    assert codes.get("floor.uneven") is Severity.ERROR, result.findings
     assert exit_code(result) == 3
     assert result.trajectory.ground is None

@@ -42,6 +42,7 @@ KEYS = [
     "nees_over_3",
     "coverage",
     "ground",
+    "odometry",
     "real_time_factor",
     "step_ms",
     "factors",
@@ -89,7 +90,7 @@ def test_truth_based_metrics_are_null_without_truth(tmp_path):
     report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert list(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == KEYS[3:11]
+    assert [key for key in KEYS if content[key] is None] == KEYS[3:12]
 
 
 def test_truth_of_another_time_counts_as_none(tmp_path):

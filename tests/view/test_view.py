@@ -17,7 +17,7 @@ from fgloc.cli import app
 from fgloc.config import Config, load_config
 from fgloc.errors import OutputError
 from fgloc.sensors.maps import load_map
-from fgloc.types import Decision, Estimate, Mode, RunResult, Trajectory
+from fgloc.types import Decision, Estimate, Finding, Mode, RunResult, Trajectory
 from fgloc.view import scene as scenes
 from fgloc.view.file import write_rrd
 from fgloc.view.private import PrivatePage
@@ -49,7 +49,7 @@ def result(n=250):
         tuple(d for e in estimates for d in e.decisions),
         {},
         {},
-        ("something to know.",),
+        (Finding("test", "something to know."),),
         np.zeros(n),
         1.0,
         truth=Trajectory(stamps, poses + np.array([0.0, 0.03, 0.0])),
