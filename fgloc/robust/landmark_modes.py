@@ -3,7 +3,8 @@
 If landmark i is displaced by δ, the estimator, which takes it to be in place, errs by ``M δ``; M follows from the
 estimator's own gains. The innovations of all sightings then have a mean linear in δ, and a filter of δ alone, one per
 landmark, tells how much likelier they are than if everything were in place. A sighting that neither of the two explains
-is misread: it costs as much as the gate's quantile, whatever it is.
+is misread: it costs as much as the gate's quantile, whatever it is, once in the time over which errors of one landmark
+are alike. A landmark that was left out is used again when its sightings contradict the displacement.
 
 Sources: Friedland 1969, "Treatment of bias in recursive filtering" (M); Willsky and Jones 1976, "A generalized
 likelihood ratio approach to the detection and estimation of jumps in linear systems" (with a prior on the jump).
@@ -58,11 +59,13 @@ class LandmarkModes:
         self._information = np.zeros((n, 2, 2))  # on δ, of independent sightings of itself
         self._last_ns: dict[int, int] = {}
         self.displacements: dict[int, FloatArray] = {}
+        self._returned: dict[int, float] = {}  # evidence that a landmark which is left out is in place
         self.restart()
 
     def restart(self) -> None:
         """The pose was set anew, and proves nothing yet."""
         self._reset(np.ones(len(self._ids), dtype=np.bool_))
+        self._returned.clear()
         self._in_place: set[int] = set()
         self._fused_ns = 0
 
@@ -114,7 +117,9 @@ class LandmarkModes:
             self._fused_ns = fused[0].measurement.stamp_ns
         P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
         for m in (s.alone for s in against):
-            if m.stamp_ns - self._fused_ns < _STILL_RIGHT_S * 1e9 and not self.excludes(m.landmark_id):
+            if self.excludes(m.landmark_id):
+                self._weigh_return(P, belief, m)
+            elif m.stamp_ns - self._fused_ns < _STILL_RIGHT_S * 1e9:
                 self._contradicted(P, belief, m)
         self._last_ns.update({s.alone.landmark_id: s.alone.stamp_ns for s in (*seen, *against)})
         self._reset(self._evidence.sum(1) < -self.alarm)  # it was in place; it may be moved from now on
@@ -196,12 +201,30 @@ class LandmarkModes:
             return
         found = innovation(P, [one])
         W = sighting_whitening(found.cov) / scale
-        misread = chi2_bound(self._gate, len(one.residual))
+        misread = chi2_bound(self._gate, len(one.residual)) / scale**2
         explained = self._explain_own(own, P, belief, observed, scale)
         if explained[0][0] > misread and self._evidence[own].sum() <= 0.0:
             self._reset(np.arange(len(self._ids)) == own)  # it was in place; it may be moved from now on
             explained = self._explain_own(own, P, belief, observed, scale)
-        self._weigh(m, W @ found.residual, -W @ found.H @ self._M, explained)
+        self._weigh(m, W @ found.residual, -W @ found.H @ self._M, explained, misread)
+
+    def _weigh_return(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
+        """Hold a sighting of a left-out landmark against its displacement; use the landmark again if that is wrong."""
+        observed, scale, by = self._factors.observe([m]), self._shared(m), self.displacements[m.landmark_id]
+        theta, costs = self._known(belief).mean, []
+        for moved in (np.zeros(2), by):
+            x, y = belief.pose[:2] - moved  # moving the landmark one way is moving the robot the other
+            one = observed.linearize(np.array([x, y, belief.pose[2]]), theta)[0]
+            if one.behind:
+                return
+            misread = chi2_bound(self._gate, len(one.residual))
+            found = innovation(P, [one])
+            w = sighting_whitening(found.cov) @ found.residual
+            costs.append(min(float(w @ w), misread) / scale**2)
+        evidence = max(self._returned.get(m.landmark_id, 0.0) + costs[1] - costs[0], 0.0)
+        self._returned[m.landmark_id] = evidence
+        if evidence > self.alarm:
+            del self.displacements[m.landmark_id], self._returned[m.landmark_id]
 
     def _explain_own(
         self, row: int, P: FloatArray, belief: PoseWithCovariance, observed: Observations, scale: float
@@ -223,7 +246,14 @@ class LandmarkModes:
             moved = explained[1][0]
         return explained
 
-    def _weigh(self, m: LandmarkMeasurement, w: FloatArray, G: FloatArray, own: Explained | None = None) -> None:
+    def _weigh(
+        self,
+        m: LandmarkMeasurement,
+        w: FloatArray,
+        G: FloatArray,
+        own: Explained | None = None,
+        misread: float | None = None,
+    ) -> None:
         """Take in the evidence of one sighting.
 
         Args:
@@ -231,8 +261,10 @@ class LandmarkModes:
             w: ``(d,)`` its white innovation if all are in place.
             G: ``(L, d, 2)`` derivative of that one's mean by each landmark's displacement.
             own: how its own landmark's displacement explains it, if that is not linear.
+            misread: cost of its being misread; None: that of one whose errors are its own.
         """
-        row, misread = self._rows[m.landmark_id], chi2_bound(self._gate, len(w))
+        row = self._rows[m.landmark_id]
+        misread = chi2_bound(self._gate, len(w)) if misread is None else misread
         cost, moved, cov = explain(w, G, self._moved, self._cov)
         if own is not None:
             cost[row], moved[row], cov[row] = own[0][0], own[1][0], own[2][0]

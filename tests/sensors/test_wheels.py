@@ -251,7 +251,7 @@ def test_auto_prefers_odometry_and_says_so(drive):
     steps = run(stepper(), events)
     pose, _, wheels = total(steps, WheelsConfig())
     assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=2e-3)
-    assert wheels.notes == ("the odometry's twist is used; it agrees with its pose",)
+    assert wheels.notes == ("differences of the odometry's pose are used; its twist agrees",)
 
 
 def test_auto_takes_commands_where_nothing_else_speaks():

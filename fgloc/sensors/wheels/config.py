@@ -16,8 +16,8 @@ class WheelsConfig(Section):
     source: Literal["auto", "twist", "pose", "ticks", "command", "none"] = Field(
         "auto",
         description="twist or pose differences of the odometry, wheel angles of the joints, or (no encoder) the "
-        "commands; auto: ticks if the wheels' geometry is given, else twist unless it is zero while the pose moves, "
-        "else pose, else command",
+        "commands; auto: ticks if the wheels' geometry is given, else pose unless it does not move or its heading is "
+        "not that of its motion, else twist, else command",
     )
     left_joint: str | None = None
     right_joint: str | None = None

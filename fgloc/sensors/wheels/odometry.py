@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 
 from fgloc import se2
@@ -15,6 +16,8 @@ from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, Track, m
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 _CHECK_TURN, _CHECK_PATH = 0.5, 5.0  # rad or m of motion after which twist and pose are compared
+_CHECK_HEADING = 0.5  # m of motion after which the pose's heading is held against the direction of its motion
+_HEADING_RAD = 0.03  # of a pose's heading off its motion's direction: no offset of two clocks or axles makes more
 _STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
 _SLACK_M, _SLACK_RAD = 0.03, 0.1
 _DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
@@ -24,8 +27,10 @@ class OdometryTrack(Track):
     """Between two messages, the mean of their twists or the exact motion between their poses.
 
     Either stands in where the other cannot be used (the gate marks that with NaN). With source "auto" pose differences
-    are used until the robot has moved enough to compare the two; then twists, unless they are zero while the pose
-    moves, or in degrees. A pose that jumps (odometry set to zero) is re-based: only differences count.
+    are used, which the driver has summed up from every reading of its encoders, whatever the rate and the stamps of its
+    messages; twists instead if the pose does not move, or if its heading is not that of its motion by the twists (a
+    heading from elsewhere, or set by hand). A pose that jumps (odometry set to zero) is re-based: only differences
+    count.
     """
 
     kind = "odometry"
@@ -37,6 +42,7 @@ class OdometryTrack(Track):
         self._mode: str = config.source if config.source in ("twist", "pose") else "auto"
         self._compared = self._mode == "pose"
         self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
+        self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
 
     def _forget(self) -> None:
         self._pose: Pose | None = None
@@ -105,36 +111,42 @@ class OdometryTrack(Track):
         """
         for k, value in enumerate((math.hypot(*moved[:2]), moved[2], math.hypot(*mean[:2]), mean[2])):
             self._paths[k] += abs(value) * seconds
+        self._along += complex(*moved[:2]) * complex(*mean[:2]).conjugate() * seconds**2
         pose_path, pose_turn, twist_path, twist_turn = self._paths
         pose_still = pose_path <= _STILL * twist_path and pose_turn <= _STILL * twist_turn
         twist_still = twist_path <= _STILL * pose_path and twist_turn <= _STILL * pose_turn
         moved_enough = pose_turn > _CHECK_TURN or pose_path > _CHECK_PATH
         if not moved_enough and not (pose_still and (twist_turn > _CHECK_TURN or twist_path > _CHECK_PATH)):
             return
-        self._compared = True
+        self._compared = pose_still or pose_path > _CHECK_HEADING
         insists = self._config.source == "twist"
-        ratio = twist_turn / max(pose_turn, 1e-9)
-        mode = "twist"
+        ratio, heading = twist_turn / max(pose_turn, 1e-9), cmath.phase(self._along)
+        mode = "pose"
         if pose_still:
-            text = "the odometry's pose does not move: its twist is used"
+            mode, text = "twist", "the odometry's pose does not move: its twist is used"
         elif twist_still:
-            mode = "pose"
-            text = "the odometry's twist is zero while its pose moves: " + (
-                "set wheels.source to pose" if insists else "pose differences are used"
-            )
+            text = "the odometry's twist is zero while its pose moves: "
+            text += "set wheels.source to pose" if insists else "pose differences are used"
         elif pose_turn > _CHECK_TURN and _DEGREES[0] < ratio < _DEGREES[1]:
-            mode = "pose"
             text = f"the odometry's yaw rate is {ratio:.1f} times the rotation of its pose: degrees, not radians"
             if insists:
                 raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
             text += ": pose differences are used"
+        elif abs(heading) > _HEADING_RAD:
+            mode, text = (
+                "twist",
+                (
+                    f"the odometry's twist is used: the heading of its pose is {math.degrees(-heading):+.1f}° off the "
+                    "direction in which the pose moves"
+                ),
+            )
         elif _differ(twist_path, pose_path) or _differ(twist_turn, pose_turn):
             text = (
-                f"the odometry's twist is used, though it disagrees with its pose: {twist_path:.2f} m and "
+                f"differences of the odometry's pose are used; its twist disagrees: {twist_path:.2f} m and "
                 f"{twist_turn:.2f} rad against {pose_path:.2f} m and {pose_turn:.2f} rad; see wheels.source"
             )
         else:
-            text = "the odometry's twist is used; it agrees with its pose"
+            text = "differences of the odometry's pose are used; its twist agrees"
         self._mode = "twist" if insists else mode
         self.notes["source"] = text
 
