@@ -13,6 +13,8 @@ from fgloc.errors import TrajectoryError
 from fgloc.types import FloatArray, IntArray, Trajectory
 
 FEWEST = 2  # matched poses; one cannot be aligned, and is no trajectory
+_TRUTH = np.diag([0.005, 0.005, 0.01]) ** 2  # m², rad²: no positioning system, brought to other stamps, knows better
+_ROUNDS = 10  # of Gauss-Newton; the problem is linear but for one angle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +97,31 @@ def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:
     yaw = math.atan2(float(np.sum(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])), float(np.sum(s * t)))
     turned = se2.compose((0.0, 0.0, yaw), (*center_s, 0.0))
     return np.array([*(center_t - turned[:2]), yaw])
+
+
+def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
+    """Errors ``(n, 3)`` and their covariances ``(n, 3, 3)`` where the truth's frame is fitted.
+
+    Without a map the covariance is relative to the first pose, which is the origin, while a frame that is fitted to all
+    positions alike spreads the drift over the whole path. So the frame is fitted by the covariances: weighted least
+    squares over its rigid motion, the truth's own noise added.
+    """
+    assert matched.covs is not None
+    covs = matched.covs + _TRUTH
+    weights, truth = np.linalg.inv(covs), matched.truth
+    errors = matched.errors
+    for _ in range(_ROUNDS):
+        J = np.zeros((len(truth), 3, 3))  # of the moved truth by x, y and yaw of the frame
+        J[:] = np.eye(3)
+        J[:, 0, 2], J[:, 1, 2] = -truth[:, 1], truth[:, 0]
+        H, b = np.einsum("nij,nik,nkl->jl", J, weights, J), np.einsum("nij,nik,nk->j", J, weights, errors)
+        step = np.linalg.lstsq(H, b, rcond=None)[0]
+        truth = transform(step, truth)
+        errors = matched.estimate - truth
+        errors[:, 2] = se2.wrap_array(errors[:, 2])
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    return errors, covs
 
 
 def transform(T: FloatArray, poses: FloatArray) -> FloatArray:

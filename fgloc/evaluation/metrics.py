@@ -1,7 +1,8 @@
 """How far an estimated trajectory is from the truth, and whether its covariance is right.
 
 Errors live in the map frame. Where the truth's frame is another one (``truth.align: se2``), the truth is moved into the
-map by the rigid motion that fits the positions best; the estimate and its covariance stay as they are.
+map by the rigid motion that fits the positions best; the estimate and its covariance stay as they are. The NEES then
+takes the frame that fits best by the covariances (`in_own_gauge`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.evaluation.consistency import coverage, nees
 from fgloc.evaluation.judgements import Judgement, judgements
-from fgloc.evaluation.matching import FEWEST, Matched, match, matchable
+from fgloc.evaluation.matching import FEWEST, Matched, in_own_gauge, match, matchable
 from fgloc.evaluation.warnings import all_findings
 from fgloc.types import Finding, FloatArray, RunResult
 
@@ -200,7 +201,8 @@ def compute_metrics(result: RunResult, config: Config) -> Metrics:
 
     honest: tuple[float | None, dict[str, float] | None] = (None, None)
     if matched is not None and matched.covs is not None:
-        errors, covs = matched.errors, matched.covs
+        fitted = config.truth.align == "se2"
+        errors, covs = in_own_gauge(matched) if fitted else (matched.errors, matched.covs)
         honest = (float(np.mean(nees(errors, covs))) / 3.0, {str(k): coverage(errors, covs, k) for k in (1, 2, 3)})
     return Metrics(
         duration_s=duration,

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation import consistency, metrics
-from fgloc.evaluation.matching import Matched, align_se2, match, transform
+from fgloc.evaluation.matching import Matched, align_se2, in_own_gauge, match, transform
 from fgloc.evaluation.metrics import relative_error
 from fgloc.frames import yaw_quaternion
 from fgloc.rounding import rounded
@@ -213,3 +213,26 @@ def rng():
 def test_a_figure_has_the_decimals_of_its_sigma(value, sigma, shown):
     assert " ± ".join(rounded(value, sigma)) == shown
     assert rounded(abs(value), sigma, "+")[0].startswith("+")
+
+
+def test_honest_dead_reckoning_is_called_honest_where_the_truths_frame_is_fitted(rng):
+    """Drift from a first pose that is known exactly; the truth lives in another frame, and has its own noise."""
+    values = []
+    for _ in range(20):
+        steps = np.tile([0.05, 0.0, 0.01], (300, 1))
+        sigma = np.array([0.004, 0.002, 0.004])
+        true, guess, cov = [np.zeros(3)], [np.zeros(3)], [1e-8 * np.eye(3)]
+        for step in steps:
+            true.append(se2.compose(true[-1], step))
+            guess.append(se2.compose(guess[-1], step + rng.normal(0.0, sigma)))
+            c, s = np.cos(guess[-2][2]), np.sin(guess[-2][2])
+            F, R = np.eye(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            F[:2, 2] = [-s * step[0], c * step[0]]
+            cov.append(F @ cov[-1] @ F.T + R @ np.diag(sigma**2) @ R.T)
+        stamps = np.arange(len(true)) * 100_000_000
+        moved = transform(np.array([2.0, -1.0, 0.7]), np.array(true)) + rng.normal(0.0, [0.003, 0.003, 0.005], (301, 3))
+        matched = match(Trajectory(stamps, np.array(guess), np.array(cov)), Trajectory(stamps, moved), "se2")
+        values.append(np.mean(consistency.nees(*in_own_gauge(matched))) / 3.0)
+    assert 0.5 < np.mean(values) < 1.5
+    plain = np.mean(consistency.nees(matched.errors, matched.covs)) / 3.0
+    assert plain > 10.0 * values[-1]

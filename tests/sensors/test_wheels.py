@@ -275,6 +275,31 @@ def test_a_disagreement_of_twist_and_pose_is_said():
     assert any("disagrees" in note for note in wheels.notes)
 
 
+def test_the_pose_bridges_a_gap_of_the_odometry_however_long(drive):
+    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 20, 20) if not 6.0 < t < 15.0]
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.02)
+    assert not wheels.rejections
+
+
+def test_an_odometry_that_begins_anew_after_a_long_gap_is_not_connected_with_what_was():
+    before = [odometry(t, (2.0 + 0.3 * t, 0.0, 0.0), (0.3, 0.0)) for t in times(0.1, 6, 20)]
+    after = [odometry(t, (0.3 * (t - 15.0), 0.0, 0.0), (0.3, 0.0)) for t in times(15.0, 20, 20)]
+    steps = run(stepper(), before + after)
+    pose, _, _ = total(steps, WheelsConfig())
+    assert pose[0] == pytest.approx(0.3 * (6.0 + 5.0), abs=0.4)
+
+
+def test_the_twist_is_used_where_the_poses_heading_is_not_that_of_its_motion(drive):
+    turned = (0.0, 0.0, 0.1)
+    events = [odometry(t, se2.compose(drive.pose(t), turned), drive.twist(t)) for t in times(0.1, 18, 20)]
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.1)
+    assert any("5.7°" in note for note in wheels.notes)
+
+
 def test_a_later_better_source_takes_over(drive):
     events = in_order_of_receipt(
         [command(t, *drive.twist(t)) for t in times(0.1, 18, 20)],

@@ -19,6 +19,7 @@ _CHECK_TURN, _CHECK_PATH = 0.5, 5.0  # rad or m of motion after which twist and 
 _CHECK_HEADING = 0.5  # m of motion after which the pose's heading is held against the direction of its motion
 _HEADING_RAD = 0.03  # of a pose's heading off its motion's direction: no offset of two clocks or axles makes more
 _STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
+_BEGINS_M = 0.5  # from its origin: there an odometry is that was started just now
 _SLACK_M, _SLACK_RAD = 0.03, 0.1
 _DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
 
@@ -81,8 +82,10 @@ class OdometryTrack(Track):
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
         """The constant twist from the last pose to this one; None if that cannot be known."""
-        if pose is None or self._pose is None or seconds > MAX_GAP_S:
+        if pose is None or self._pose is None:
             return None
+        if seconds > MAX_GAP_S and math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*self._pose[:2]):
+            return None  # it may have been restarted meanwhile
         dx, dy, dyaw = _difference(self._pose, pose)
         # Less than the slack is no jump, however short the time: stamps of receipt come in bursts.
         speed = max(math.hypot(dx, dy) - _SLACK_M, 0.0) / seconds
