@@ -39,6 +39,7 @@ from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
+_SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
@@ -542,7 +543,7 @@ def _by_map(found: Conventions, path: Path, seen: Sightings, m: Mounting, landma
         return m
     by_map, found.noise = fitted
     long = by_map.too_long_m
-    if long.off(0.0, _BIAS_M, 4.0):
+    if long.off(0.0, _BIAS_M, 3.0):
         found.add(
             "sightings.range",
             f"Ranges are {long.value:+.3f} ± {long.sigma:.3f} m too long at {by_map.distance_m:.1f} m, by the map",
@@ -572,8 +573,10 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmar
             if fit.mirrored:
                 text = "The map is a mirror image of what is seen: change the sign of all its y"
                 found.add("map.mirrored", text, {}, None, Severity.ERROR)
-            on_map = fit.scale  # distances on the map over those in the wheels' metres
-            ranges = Figure(by_wheels.value * on_map.value, by_wheels.value * on_map.sigma)  # map over reported range
+            # distances on the map over reported ranges, which one view tells; over the wheels', by way of the ranges
+            ranges = Figure(by_wheels.value * fit.scale.value, by_wheels.value * fit.scale.sigma)
+            relative = math.hypot(fit.scale.sigma / fit.scale.value, by_wheels.sigma / by_wheels.value)
+            on_map = Figure(fit.scale.value, fit.scale.value * relative)
             if on_map.off(1.0, _SCALE):
                 _three(found, by_wheels, on_map, ranges)
                 return
@@ -601,6 +604,8 @@ def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure
     """Name the one of map, ranges and wheels that the other two contradict."""
     unit = unit_of(1.0 / on_map.value)
     if not by_wheels.off(1.0, _SCALE):
+        if unit is None and abs(math.log(on_map.value)) < _SURVEYED:
+            return
         factor = 1.0 / on_map.value if unit is None else unit[0]
         named = f" (it is in {unit[1]})" if unit is not None else ""
         found.add(

@@ -28,7 +28,8 @@ MOST_LAG_S = 1.5  # a clock that is further off shows in the receive times
 _LAG_STEP_S = 0.05
 _PAIR_S = (0.4, 6.0)  # between two sightings of one landmark: the wheels err little over seconds
 _MOST_PAIRS = 4000
-_BLOCKS = 8  # of time, of the jackknife
+_BLOCKS = 8  # of time, or of landmarks, of the jackknife
+_FEWEST_TRACKS = 5  # landmarks times _TRACK_S: the errors of one track are alike, and fewer are no sample
 _MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _RATE_HALF_S = 0.15  # yaw rates are means over twice this
@@ -205,8 +206,9 @@ def _refined(
     everything = np.ones(len(z), dtype=bool)
     x, typical = solve(everything, start)
     blocks = np.minimum(((times - times[0]) / max(times[-1] - times[0], 1e-9) * _BLOCKS).astype(int), _BLOCKS - 1)
-    left_out = [solve(blocks != b, x)[0] for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(blocks)]
-    sigmas = jackknife(np.array(left_out)) if len(left_out) > 2 else np.full(5, np.inf)
+    sigmas = np.full(5, np.inf)
+    if len(np.unique(tracks)) >= _FEWEST_TRACKS:
+        sigmas = _jackknifed(lambda use: solve(use, x)[0], blocks, _by_landmark(ids))
     scale, yaw, bx, by, late = x.tolist()
     if abs(late) >= MOST_LAG_S or abs(scale) > _MOST_LOG_SCALE:  # it ran to where nothing tells
         sigmas = np.full(5, np.inf)
@@ -228,6 +230,21 @@ def jackknife(left_out: FloatArray) -> FloatArray:
     """Standard deviations ``(p,)`` of estimates, from those ``(b, p)`` with one block of data left out."""
     b = len(left_out)
     return np.asarray(np.sqrt((b - 1) / b * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)))
+
+
+def _jackknifed(estimate: Callable[[NDArray[np.bool_]], FloatArray], *partitions: IntArray) -> FloatArray:
+    """Standard deviations ``(p,)``: the larger of those by several partitions into blocks; infinite: too few blocks."""
+    sigmas = []
+    for blocks in partitions:
+        left_out = [estimate(blocks != b) for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(blocks)]
+        if len(left_out) > 2:
+            sigmas.append(jackknife(np.array(left_out)))
+    return np.asarray(np.max(sigmas, axis=0) if sigmas else np.inf * np.ones_like(estimate(blocks >= 0)))
+
+
+def _by_landmark(ids: IntArray) -> IntArray:
+    """Block of the jackknife of each sighting, by its landmark: the errors of one landmark are alike at all times."""
+    return np.asarray(np.unique(ids, return_inverse=True)[1] % _BLOCKS, dtype=np.int64)
 
 
 def _tracks(times: FloatArray, ids: IntArray) -> IntArray:
@@ -520,7 +537,7 @@ class MapFit:
     """Map against the places of landmarks by wheels and sightings.
 
     Attributes:
-        scale: distances on the map over those seen, in the wheels' unit.
+        scale: distances on the map over those seen at the same time, ranges taken as the mounting has them.
         mirrored: whether the map is a mirror image.
         shift: by how much the ids of the map are higher than those seen; 0 if they agree.
         misfit: robust residual over the spread of the landmarks: small if the map fits.
@@ -554,30 +571,43 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
             ids, places_seen = seen.ids[use], q[use]
             of_each = {int(i): places_seen[ids == i] for i in np.unique(ids)}
             windows.append({i: complex(np.median(own.real), np.median(own.imag)) for i, own in of_each.items()})
-    shifts = (0, 1, -1)
     best: tuple[float, bool, int, list[float]] | None = None
-    for shift in shifts:
+    for shift in (0, 1, -1):
         for mirrored in (False, True):
-            misfits, scales = [], []
-            for window in windows:
-                common = [i for i in window if i + shift in places]
-                if len(common) < 3:
-                    continue
-                a = np.array([window[i] for i in common])
-                b = np.array([complex(*places[i + shift]) for i in common])
-                fitted = _point_similarity(a, b.conj() if mirrored else b)
-                if fitted is not None:
-                    scales.append(fitted[0])
-                    misfits.append(fitted[1])
-            if len(misfits) >= 3:
-                typical = float(np.median(misfits))
-                if best is None or typical < 0.5 * best[0]:
-                    best = (typical, mirrored, shift, scales)
+            scales, misfits = _laid_on(windows, places, shift, mirrored)
+            if len(misfits) >= 3 and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
+                best = (float(np.median(misfits)), mirrored, shift, scales)
     if best is None:
         return None
     misfit, mirrored, shift, scales = best
-    spread = _MAD * float(np.median(np.abs(np.array(scales) - np.median(scales)))) / math.sqrt(len(scales))
-    return MapFit(Figure(float(np.median(scales)), 1.5 * spread + 1e-3), mirrored, shift, misfit, len(scales))
+    scale = float(np.median(scales))
+    # landmarks are off on the map all the time, so that only other landmarks are another sample
+    ids = np.unique(np.concatenate([list(window) for window in windows]))
+    left_out = []
+    for b in range(min(_BLOCKS, len(ids))):
+        kept = [{i: q for i, q in w.items() if i not in ids[b::_BLOCKS]} for w in windows]
+        part, _ = _laid_on(kept, places, shift, mirrored)
+        if len(part) >= 3:
+            left_out.append([float(np.median(part))])
+    sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else math.inf
+    return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
+
+
+def _laid_on(
+    windows: list[dict[int, complex]], places: dict[int, FloatArray], shift: int, mirrored: bool
+) -> tuple[list[float], list[float]]:
+    """Scale and relative misfit of the map in each window that has three of its landmarks."""
+    fits = []
+    for window in windows:
+        common = [i for i in window if i + shift in places]
+        if len(common) < 3:
+            continue
+        a = np.array([window[i] for i in common])
+        b = np.array([complex(*places[i + shift]) for i in common])
+        fitted = _point_similarity(a, b.conj() if mirrored else b)
+        if fitted is not None:
+            fits.append(fitted)
+    return [s for s, _ in fits], [m for _, m in fits]
 
 
 def _point_similarity(a: ComplexArray, b: ComplexArray) -> tuple[float, float] | None:
@@ -736,18 +766,25 @@ def fit_on_map(
         on_map.sigma_m = max(_MAD * float(np.median(np.abs(along))), 0.005)
         on_map.sigma_rad = max(_MAD * float(np.median(np.abs(across))), 0.001)
     blocks = (on_map.window * _BLOCKS) // (int(on_map.window.max()) + 1)
-    used = [b for b in range(_BLOCKS) if 0 < (blocks == b).sum() < len(on_map)]
-    left_out = np.array([on_map.take(blocks != b).solve(x) for b in used])
-    s = jackknife(left_out).tolist()
-    values = [math.exp(x[0]), *x[1:].tolist()]
-    figures = [Figure(v, sigma) for v, sigma in zip(values, [values[0] * s[0], *s[1:]], strict=True)]
     typical = float(np.median(np.abs(on_map.z)))
-    long = [typical - math.exp(one[0]) * (typical - one[1]) for one in (x, *left_out)]
-    too_long = Figure(long[0], float(jackknife(np.array(long[1:])[:, None])[0]))
+
+    def values(x: FloatArray) -> FloatArray:
+        scale = math.exp(x[0])
+        return np.array([scale, *x[1:], typical - scale * (typical - x[1])])
+
+    def sigmas(groups: IntArray) -> FloatArray:
+        return _jackknifed(lambda use: values(on_map.take(use).solve(x)), groups)
+
+    by_time = sigmas(blocks)
     along, across, _ = on_map.errors(x)
-    scale, bias_m, yaw, place_x, place_y, late_s = figures
-    found = Calibration(scale, bias_m, yaw, place_x, place_y, late_s, too_long, typical)
-    return found, _noise(on_map, x, along, across)
+    noise = _noise(on_map, x, along, across)
+    s = np.maximum(by_time, sigmas(_by_landmark(on_map.ids)))
+    # of the one figure that every landmark tells by itself, their errors are known: they average out
+    s[-1] = math.hypot(by_time[-1], (noise.map_m or 0.0) / math.sqrt(len(np.unique(on_map.ids))))
+    scale, bias, yaw, at_x, at_y, late, too_long = (
+        Figure(float(v), float(sigma)) for v, sigma in zip(values(x), s, strict=True)
+    )
+    return Calibration(scale, bias, yaw, at_x, at_y, late, too_long, typical), noise
 
 
 def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray) -> Noise:
