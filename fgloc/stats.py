@@ -28,15 +28,24 @@ def chi2_bound(probability: float, dof: int) -> float:
     return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
-def alarm_bound(seconds: float, tests: int, dof: int) -> float:
+def alarm_bound(seconds: float, tests: int, dof: int, samples: float = math.inf) -> float:
     """χ² quantile that raises at most one false alarm a day (Bonferroni).
 
     Args:
         seconds: after which it is tested again.
         tests: how many statistics are held against it each time.
         dof: of each of them.
+        samples: that the standard deviation was estimated from: of few it is the square of Student's t; one dof only.
     """
-    return chi2_bound(1.0 - seconds / (tests * _ALARM_EVERY_S), dof)
+    probability = 1.0 - seconds / (tests * _ALARM_EVERY_S)
+    return chi2_bound(probability, dof) if math.isinf(samples) else _t_bound(probability, max(int(samples), 1))
+
+
+@lru_cache
+def _t_bound(probability: float, samples: int) -> float:
+    from scipy.special import stdtrit  # as above
+
+    return float(stdtrit(samples, 0.5 + 0.5 * probability) ** 2)
 
 
 def evidence_bound(probability: float, hypotheses: int) -> float:

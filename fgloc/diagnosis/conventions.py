@@ -8,7 +8,7 @@ what is found, every other command names them first.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ import yaml
 
 from fgloc import se2
 from fgloc.config import Config, config_of
+from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
     BodyFit,
@@ -35,6 +36,7 @@ from fgloc.diagnosis.pairs import (
 from fgloc.diagnosis.pose_text import sensor_pose
 from fgloc.diagnosis.signals import Path, Sightings, Signals
 from fgloc.frames import rotation_of
+from fgloc.sensors import registry
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
@@ -50,6 +52,10 @@ _ALIKE = 1.25  # times the best misfit within which the more usual axes are take
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
 _GRAVITY = 5.0  # m/s²: less is no accelerometer
 _TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
+_GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
+_GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
+_APART_RAD, _WINDOWS, _SAMPLES = 0.05, 6, 4  # rad in half a second, for so many of them with so many messages
+_SAME_TURN = 0.3  # share of the difference of wheels and gyro beyond which an odometry's yaw is not the gyro's
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # share by which a scale may miss a unit's
 
@@ -63,6 +69,7 @@ class Conventions:
         config: with those lines.
         compared: sentences on the pairs that were compared and agree, for `init`'s comments.
         noise: of the sensor of landmarks, where its axes are right; no finding, but a better start than the defaults.
+        handling: when a person had the robot in hand; nothing is compared there.
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
     """
 
@@ -70,6 +77,7 @@ class Conventions:
     findings: list[Finding] = field(default_factory=list)
     compared: list[str] = field(default_factory=list)
     noise: Noise | None = None
+    handling: Handling = field(default_factory=Handling)
     opposite: bool = False
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
@@ -100,11 +108,13 @@ def conventions(
     """
     found = Conventions(config)
     _odometry(found, signals)
+    _yaw_of_gyro(found, signals, imu_up)
     path = signals.path(found.config)
     if path is None or path.length_m < 0.05:
         if (rates := signals.rates()) is not None:
             _gravity(found, rates[2], _unit(imu_up))
         return found
+    signals, path = _by_hand(found, signals, path, imu_up)
     gyro = _gyro(found, signals, path, imu_up)
     seen = signals.sightings()
     if found.opposite and _opposite(found, signals, path, seen, T_base_sensor):
@@ -245,6 +255,88 @@ def _complex_slope(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> complex:
         spread = 1.5 * float(np.median(residual)) + 0.05 * float(np.quantile(np.abs(y), 0.9)) + 1e-12
         weights = 1.0 / (1.0 + (residual / (2.4 * spread)) ** 2)
     return slope
+
+
+# --- one measurement twice, and hands ---------------------------------------------------------------------------------
+
+
+def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None) -> None:
+    """Name an odometry whose yaw is the gyro's: it goes with the gyro where the angles of the wheels turn otherwise."""
+    rates, rows = signals.rates(), np.array(signals.odometry)
+    if rates is None or len(rows) < 50:
+        return
+    _, first = np.unique(rows[:, 0], return_index=True)
+    rows = rows[first]
+    times, omega, _ = rates
+    turned = np.append(0.0, np.cumsum(0.5 * ((omega[1:] + omega[:-1]) @ _unit(imu_up)) * np.diff(times)))
+    at = np.arange(max(times[0], rows[0, 0]), min(times[-1], rows[-1, 0]) - 0.5, 0.5)
+    if len(at) < 20:
+        return
+    by_gyro = np.diff(np.interp(at, times, turned))
+    yaw = np.diff(np.interp(at, rows[:, 0], np.unwrap(rows[:, 3])))
+    given = registry.odometer().by_angles(signals.motion)
+    if given is None:  # without the wheels' own turn, a yaw that is the gyro's and a good odometry look alike
+        return
+    lines = {f"wheels.{key}": value for key, value in given.items()}
+    with_angles = found.config
+    for key, value in lines.items():
+        with_angles = with_line(with_angles, key, value)
+    angles = signals.path(with_angles)
+    if angles is None:
+        return
+    by_wheels = np.diff(np.interp(at, angles.times, angles.poses[:, 2]))
+    known = angles.known(at[:-1], at[1:]) & (np.diff(np.interp(at, times, np.arange(len(times)))) > _SAMPLES)
+    apart = known & (np.abs(by_gyro - by_wheels) > _APART_RAD)
+    if apart.sum() < _WINDOWS:
+        return
+    share = float(np.median(np.abs(yaw - by_gyro)[apart] / np.abs(by_wheels - by_gyro)[apart]))
+    if share > _SAME_TURN:
+        return
+    text = (
+        "The odometry's yaw is the gyro's, not the wheels': the two are one measurement (where the wheels turn "
+        f"otherwise they differ by {100.0 * share:.0f} % of that)"
+    )
+    if found.config.wheels.source in ("auto", "ticks") and found.config.wheels.track is not None:
+        lines = {}
+    else:
+        text += ". Yaw of the wheels is in their joints' angles"
+    found.add("odometry.yaw_is_gyro", text, lines, None, Severity.NOTE)
+
+
+def _by_hand(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> tuple[Signals, Path]:
+    """Name when the robot was held, lifted or turned by hand; the signals without that time."""
+    trial = Conventions(found.config)
+    _gyro(trial, signals, path, imu_up)
+    if any(f.code in ("imu.axes", "imu.gravity") for f in trial.findings):
+        return signals, path  # what turns is not what tilts
+    up = _unit(imu_up) * abs(trial.config.gyro.scale)
+    found.handling = by_hand = handling(signals, trial.config, path, up)
+    for code, what, spans in (
+        (
+            "motion.held",
+            "The robot was held, or its wheels spun: they turn more than the gyro from ",
+            by_hand.held,
+        ),
+        ("motion.lifted", "The robot was lifted or turned by hand, by gyro and accelerometer, from ", by_hand.lifted),
+    ):
+        if spans:
+            start = Figure(spans[0][0], 1.0)
+            found.add(code, f"{what}{_spans(spans)}", {}, start, Severity.WARNING)
+    size = by_hand.gravity
+    if size is not None and _GRAVITY_OFF < abs(size / _GRAVITY_SIZE - 1.0) < _OTHER_UNIT:
+        text = (
+            f"The specific force at rest is {size:.2f} m/s², {abs(100.0 * (size / _GRAVITY_SIZE - 1.0)):.1f} % "
+            f"{'more' if size > _GRAVITY_SIZE else 'less'} than gravity: scale or bias of the accelerometer is off, "
+            "and tilts by it are as much in doubt"
+        )
+        found.add("imu.gravity_scale", text, {}, Figure(size, 0.05), Severity.NOTE)
+    if not by_hand.spans:
+        return signals, path
+    return outside(signals, by_hand), cut(path, by_hand)
+
+
+def _spans(spans: Sequence[Span]) -> str:
+    return ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in spans)
 
 
 # --- the gyro and the wheels ------------------------------------------------------------------------------------------

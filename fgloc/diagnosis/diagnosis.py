@@ -83,15 +83,18 @@ class Diagnosis:
         self._tried = 0
         self._started: FloatArray | None = None  # where the sightings put the run's first pose
 
-    def observe(self, step: Step, wheels: MotionMeasurement | None) -> None:
+    def observe(self, step: Step, wheels: MotionMeasurement | None, by_hand: bool = False) -> None:
         """Take in a step.
 
         Args:
             step: as the localizer got it.
             wheels: their motion over the step; None without a measurement.
+            by_hand: a person has the robot in hand: its wheels do not measure where it goes.
         """
         if self._floor is not None:
-            self._floor.observe(step)
+            self._floor.observe(step, by_hand)
+        if by_hand:
+            wheels = None
         self._cutter.begin(step)
         for event in step.sightings:
             at_s = self._cutter.seconds(event.stamp_ns)

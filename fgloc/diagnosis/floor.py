@@ -1,7 +1,9 @@
 """Whether the floor is flat, where the configuration says so: by the direction of gravity, or by markers in images.
 
 Both tell which way is up in the base's axes. On a flat floor that is always the same way, whatever the mountings are
-off by: what counts is how far it moves from its median.
+off by: what counts is how far it moves from its median. What an accelerometer says has to be what the gyro says too: a
+robot that tilts turns about x and y, and one that only seems to, as its speed, a scale or a clock is off, does not. Nor
+does what was seen while it was in a person's hands tell of the floor.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import math
 
 import numpy as np
 
+from fgloc.frames import rotation_of
 from fgloc.sensors.equipment import AttitudeSensor, Odometer
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.pnp import up_in_base
@@ -21,6 +24,7 @@ _TILTED_RAD = math.radians(2.0)  # by the accelerometer; flat floors with stop a
 _TILTED_IN_IMAGE_RAD = math.radians(4.0)  # two markers with a surveyed place tell it to a degree or two
 _LEAST = 4  # windows, or images, that are tilted ...
 _SHARE = 0.02  # ... and share of all
+_CONFIRMED = 0.5  # share of the changes of gravity's direction that the gyro's turns explain
 _EXTREME = 0.99  # quantile that is told: one wild reading is none
 _MOST = 20_000  # readings that are kept
 
@@ -46,24 +50,52 @@ class FloorWatch:
         self._attitude, self._wheels = attitude, wheels
         self._landmarks, self._map = landmarks, landmark_map
         self._ups: list[FloatArray] = []
-        self._force, self._seconds = np.zeros(3), 0.0
+        self._turned: list[FloatArray] = []  # (5,) by the gyro [rad], time [s] and stretch: means over windows
+        self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
+        self._total = np.zeros(5)
         self._by_force = False
         self._looked_ns = 0
 
-    def observe(self, step: Step) -> None:
-        """Take in a step."""
+    def observe(self, step: Step, by_hand: bool = False) -> None:
+        """Take in a step; ``by_hand``: a person has the robot in hand, also a moment before that showed."""
+        if by_hand:
+            if self._seconds > 0.0 and self._ups and self._by_force:
+                del self._ups[-1], self._turned[-1]
+            self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
+            self._total[4] += 1.0
+            return
         if len(self._ups) >= _MOST:
             return
         reading = None if self._attitude is None else self._attitude.measure(step, self._wheels.twist)
-        if reading is not None and reading.force is not None:
+        if self._attitude is not None and reading is not None and reading.force is not None:
             self._by_force = True
+            yaw = float(self._attitude.rates_at(step.inertial, step.stamp_ns)[2]) * step.dt
+            turn = np.array([*reading.turn, yaw, step.dt, 0.0])
             self._force += reading.force * step.dt
+            self._sum += (self._total + 0.5 * turn) * step.dt
+            self._total += turn
             self._seconds += step.dt
             if self._seconds >= _WINDOW_S:
                 self._ups.append(self._force / np.linalg.norm(self._force))
-                self._force, self._seconds = np.zeros(3), 0.0
+                self._turned.append(self._sum / self._seconds)
+                self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
         elif not self._by_force and self._map is not None:
             self._look(step, self._map)
+
+    @property
+    def _confirmed(self) -> bool:
+        """Whether the gyro turns as gravity does in the base's axes, from window to window."""
+        ups, turned = np.array(self._ups), np.diff(np.array(self._turned), axis=0)
+        usual = np.median(ups, axis=0)
+        true = ups - usual + [0.0, 0.0, 1.0]  # what is always there is the mounting's
+        joined = turned[:, 4] == 0.0
+        if joined.sum() < _LEAST:
+            return False
+        bias = np.median(turned[joined, :2] / turned[joined, 3:4], axis=0)
+        turns = turned[:, :3] - np.outer(turned[:, 3], [*bias, 0.0])
+        by_gyro = np.array([rotation_of(-turn) @ up for turn, up in zip(turns, true[:-1], strict=True)])[joined, :2]
+        seen, expected = np.diff(true, axis=0)[joined, :2], by_gyro - true[:-1][joined, :2]
+        return float(((seen - expected) ** 2).sum()) < (1.0 - _CONFIRMED) * float((seen**2).sum())
 
     def _look(self, step: Step, landmark_map: LandmarkMap) -> None:
         for event in step.sightings:
@@ -85,7 +117,7 @@ class FloorWatch:
         bound = _TILTED_RAD if self._by_force else _TILTED_IN_IMAGE_RAD
         usual = np.median(ups, axis=0)
         off = np.arccos(np.clip(ups @ (usual / np.linalg.norm(usual)), -1.0, 1.0))
-        if (off > bound).sum() < max(_LEAST, _SHARE * len(ups)):
+        if (off > bound).sum() < max(_LEAST, _SHARE * len(ups)) or (self._by_force and not self._confirmed):
             return None
         roll, pitch = np.arctan2(ups[:, 1], ups[:, 2]), np.arctan2(-ups[:, 0], ups[:, 2])
         most = [math.degrees(np.quantile(np.abs(a - np.median(a)), _EXTREME)) for a in (pitch, roll)]

@@ -179,13 +179,16 @@ class Sanity:
         self._segment, self._last_seen_ns = -1, -_SPARSE_NS
         self.watch = Watch(landmark_map is not None, config)
 
-    def observe(self, step: Step, estimate: Estimate | None, keep: bool = True) -> Estimate | None:
+    def observe(
+        self, step: Step, estimate: Estimate | None, keep: bool = True, by_hand: bool = False
+    ) -> Estimate | None:
         """Keep the odometry and the sightings of a step, and hold its estimate against them.
 
         Args:
             step: as the localizer got it.
             estimate: what came of it; None: no pose is known yet.
             keep: for `judge`; else memory is bounded.
+            by_hand: a person has the robot in hand: its wheels do not measure where it goes.
 
         Returns:
             The estimate, or what is to be given in its place while it fails: the odometry from the last sane pose on.
@@ -194,7 +197,7 @@ class Sanity:
         if measured is None:
             return estimate
         turn = None if self._gyro is None else self._gyro.measure(step, measured.motion)
-        joined = step.segment == self._segment
+        joined = step.segment == self._segment and not by_hand
         self._segment = step.segment
         seen = list(self._sightings(step))
         if keep:

@@ -18,6 +18,7 @@ from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
 _SLIP = 0.1  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
+_REST_PER_SQRT_S = 3e-5  # m/√s, rad/√s of a robot whose wheels and gyro rest: 2 mm in an hour, by its floor and tyres
 # What a motion's covariance may be off by: squared errors of the learned motion over 1 s of a slip are 2 to 5 times it.
 COVARIANCE_FACTOR = 4.0
 
@@ -72,6 +73,7 @@ class NoiseBudget:
     def combine(self, readings: MotionReadings, rules: FusionRules) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other; none where no source that is left measured the distance.
 
+        A robot at rest stays where it is, to within a tick of its encoders: one measurement, whoever else agrees.
         Rejected wheels are left out or, if nothing else knows the distance, kept with room for a slip.
 
         Args:
@@ -80,6 +82,9 @@ class NoiseBudget:
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
         scales, names = self.scales, registry.motion_names()
+        if readings.at_rest and wheels is not None and names.odometer not in self.rejected:
+            cov = np.eye(3) * _REST_PER_SQRT_S**2 * (wheels.stamp_ns - wheels.start_ns) * 1e-9
+            return [self.overruled(replace(wheels, cov=cov, inertial=readings.inertial))]
         if wheels is not None:
             wheels = _scaled(wheels, scales.get(names.odometer, 1.0))
         learned = None if learned is None or names.model in self.rejected else _scaled(learned, scales[names.model])

@@ -133,7 +133,8 @@ class OnlineRun:
             if belief is not None:
                 parts.localizer.restart_at(belief)
         self._reset = self._resumed = None
-        estimate = parts.sanity.observe(step, parts.localizer.update(step), keep=False)
+        estimate = parts.localizer.update(step)
+        estimate = parts.sanity.observe(step, estimate, keep=False, by_hand=parts.localizer.motion.is_carried)
         self.keyframes += 1
         self._last_step = step
         if estimate is not None:
@@ -143,7 +144,8 @@ class OnlineRun:
     def _diagnose(self, step: Step) -> None:
         """After the estimate was handed out: whoever waits for it does not wait for this."""
         assert self.parts is not None
-        self.parts.diagnosis.observe(step, self.parts.wheels.measure(step))
+        parts = self.parts
+        parts.diagnosis.observe(step, parts.wheels.measure(step), parts.localizer.motion.is_carried)
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
         """To propagate the newest estimate from; ask before the next event is used."""

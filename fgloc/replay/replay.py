@@ -67,10 +67,11 @@ class Replay:
         for step in self.steps(self._events(events)):
             start = time.perf_counter()
             estimate = self._parts.localizer.update(step)
-            checked = self._parts.sanity.observe(step, estimate)
+            by_hand = self._parts.localizer.motion.is_carried
+            checked = self._parts.sanity.observe(step, estimate, by_hand=by_hand)
             estimate = checked if self._causal else estimate
             self.record(step, estimate, (time.perf_counter() - start) * 1e3)
-            self._parts.diagnosis.observe(step, self._parts.wheels.measure(step))
+            self._parts.diagnosis.observe(step, self._parts.wheels.measure(step), by_hand)
             if self._on_step is not None:
                 self._on_step(step, estimate)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -101,11 +103,11 @@ class MotionFaultMonitor:
         rejected = self._known_failures(step)
         if registry.motion_names().odometer in rejected:  # nothing to be found out
             self.reset()
-        readings = replace(readings, **dict.fromkeys(rejected))
+        readings = _without(readings, rejected)
         left_out = {registry.motion_names().model} if self._model_wrong_s > 0.0 else set()
         difference = None
         if self._config.adaptive:
-            difference = source_difference(replace(readings, **dict.fromkeys(left_out)), self._sources)
+            difference = source_difference(_without(readings, left_out), self._sources)
         verdict = GlrResult(False, 0, math.nan, math.nan)
         if difference is not None:
             verdict = self._glr.judge(
@@ -207,3 +209,9 @@ class MotionFaultMonitor:
         """How far the left and the right wheel went [m]."""
         forward, turn = float(motion[0]), 0.5 * (self._track_m or 0.0) * float(motion[2])
         return abs(forward - turn), abs(forward + turn)
+
+
+def _without(readings: MotionReadings, sources: Iterable[str]) -> MotionReadings:
+    """The readings of the other sources."""
+    gone: dict[str, Any] = dict.fromkeys(sources)
+    return replace(readings, **gone)

@@ -70,7 +70,7 @@ class MotionJudge:
         self._estimator = estimator
         attribution = FaultAttribution(config, estimator) if self.sources.learned_is_independent else None
         self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m, attribution)
-        self._lift = LiftMonitor(config.estimator.lag_s)
+        self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:

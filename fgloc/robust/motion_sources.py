@@ -40,6 +40,8 @@ class MotionSources:
         # Sigma of a speed that is not measured, as a share of the gate's bound: the bound is the quantile of GATE
         self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
         self.factors = LandmarkFactors(None) if factors is None else factors
+        # m²/s of wheels that stand, with the way of encoders that jitter; of silent ones it is hundreds of times more
+        self._known_rest = 10.0 * registry.odometer().errors(config).noise.xy_per_sqrt_s ** 2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
@@ -94,10 +96,16 @@ class MotionSources:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
         learned = self._with_drift(self._measure_learned(step))
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
-        readings = MotionReadings(wheels, learned, gyro, inertial)
+        readings = MotionReadings(wheels, learned, gyro, inertial, self._at_rest(step, reported))
         if readings.wheels is not None or readings.learned is not None:
             self._silent_s = 0.0
         return readings
+
+    def _at_rest(self, step: Step, wheels: MotionMeasurement | None) -> bool:
+        """Whether the wheels stand, as far as encoders tell, no command moves them, and the gyro agrees."""
+        if self.gyro is None or not self.gyro.at_rest or wheels is None or self._wheels.from_commands:
+            return False
+        return bool(wheels.cov[0, 0] <= self._known_rest * step.dt + 1e-11)
 
     def _by_fused_turn(
         self, step: Step, reported: MotionMeasurement, turn: Turn, known: Mapping[str, tuple[FloatArray, float]]

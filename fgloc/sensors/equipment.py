@@ -72,6 +72,16 @@ class RateSensor(Protocol):
     bias_variance: float
     rejections: Counter[str]
 
+    @property
+    def up(self) -> FloatArray:
+        """The base's z axis ``(3,)`` in the sensor's frame, times the scale of its rates."""
+        ...
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether over the last step, and for a while, it has shown nothing but its bias beside wheels that stand."""
+        ...
+
     def measure(self, step: Step, wheels: ArrayLike | None, since_fix_s: float = 0.0) -> Turn | None:
         """Turn over the step."""
         ...

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+
+import numpy as np
 
 from fgloc.types import FloatArray, Step
 
 _COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
 _QUANTIZATION = 1e-3  # m, rad: of encoders, in a second; less is no motion
+_WINDOW_S = 1.0  # in which encoders that jitter by a tick come back to where they were ...
+_JITTER = 2e-3  # ... to within a tick of each wheel [rad]
 _LEAST_S = 0.1  # a shorter step has as large a quantization
 
 
@@ -15,6 +20,33 @@ def is_standing(motion: FloatArray, seconds: float) -> bool:
     """Whether a motion ``(3,)`` that wheels measured over a step of this length is none."""
     x, y, yaw = motion
     return bool(max(math.hypot(x, y), abs(yaw)) < _QUANTIZATION * max(seconds, _LEAST_S))
+
+
+class Standing:
+    """Whether wheels have stood, step by step or, as encoders jitter between two ticks, over a second."""
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[float, FloatArray]] = deque()
+
+    def fork(self) -> Standing:
+        """A copy that may go on without changing this one."""
+        forked = Standing()
+        forked._steps.extend(self._steps)
+        return forked
+
+    def observe(self, motion: FloatArray | None, seconds: float) -> bool:
+        """Take in the wheels' motion ``(3,)`` over the next step; None: it is not known, or they are to move."""
+        if motion is None:
+            self._steps.clear()
+            return False
+        self._steps.append((seconds, motion))
+        while sum(s for s, _ in self._steps) - self._steps[0][0] >= _WINDOW_S:
+            self._steps.popleft()
+        if is_standing(motion, seconds):
+            return True
+        x, y, yaw = np.sum([m for _, m in self._steps], axis=0)
+        whole = sum(s for s, _ in self._steps) >= _WINDOW_S
+        return bool(whole and math.hypot(x, y) < _QUANTIZATION and abs(yaw) < _JITTER)
 
 
 def commanded_to_move(step: Step) -> bool | None:

@@ -5,14 +5,14 @@ There is one sensor for each role. Other modules ask the registry for the role, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from fgloc.sensors.base import MotionInstallation, MotionRole, RawMistake
 from fgloc.sensors.noise_density import NoiseDensity
-from fgloc.types import FloatArray, LandmarkMap
+from fgloc.types import Event, FloatArray, LandmarkMap
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -83,6 +83,8 @@ class OdometerRole:
             several are to be tried, those for control inputs in its place.
         distance_gain: the setting that sightings determine wherever the robot moves.
         correct: the sentence and the values that undo a mistake.
+        by_angles: keys of ``wheels`` with their values, with which the wheels' angles among these events are used;
+            None: the events do not determine them.
     """
 
     kind: ClassVar[MotionRole] = MotionRole.ODOMETER
@@ -92,6 +94,7 @@ class OdometerRole:
     freed: Callable[[Config], tuple[Config, ...]]
     distance_gain: str
     correct: Callable[[SetupMistake, Config], RawMistake]
+    by_angles: Callable[[Sequence[Event]], dict[str, Any] | None]
 
 
 class AttitudeNames(NamedTuple):

@@ -50,6 +50,7 @@ class MotionReadings:
     learned: MotionMeasurement | None = None
     gyro: MotionMeasurement | None = None  # only its yaw means anything
     inertial: InertialReading | None = None  # on uneven ground
+    at_rest: bool = False  # wheels report no motion, and the gyro none but its bias
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,14 +18,16 @@ FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Leaning:
-    """An accelerometer, whose mounting is 3 degrees off, on a floor with this pitch by the time [s]."""
+    """An IMU, whose mounting is 3 degrees off, on a floor with this pitch by the time [s]; or its gyro is level."""
 
-    def __init__(self, pitch) -> None:
-        self._pitch = pitch
+    def __init__(self, pitch, turns=True) -> None:
+        self._pitch, self._turns = pitch, turns
 
     def measure(self, step: Step, twist) -> InertialReading:
-        R = rpy_matrix(0.0, self._pitch(step.stamp_ns / SECOND), 0.0) @ rpy_matrix(0.05, 0.0, 0.0)
-        return InertialReading(np.zeros(2), 1e-6, R.T @ np.array([0.0, 0.0, GRAVITY]), 0.04, step.dt)
+        before, now = (self._pitch(stamp / SECOND) for stamp in (step.start_ns, step.stamp_ns))
+        R = rpy_matrix(0.0, now, 0.0) @ rpy_matrix(0.05, 0.0, 0.0)
+        turn = np.array([0.0, self._turns * (now - before)])
+        return InertialReading(turn, 1e-6, R.T @ np.array([0.0, 0.0, GRAVITY]), 0.04, step.dt)
 
     def rates_at(self, events, at_ns: int) -> np.ndarray:
         return np.zeros(3)
@@ -36,10 +38,10 @@ class Wheels:
         return np.zeros(3)
 
 
-def sentence(pitch) -> str | None:
-    watch = FloorWatch(Leaning(pitch), Wheels(), None, None)  # type: ignore[arg-type]
+def sentence(pitch, turns=True, by_hand=lambda t: False) -> str | None:
+    watch = FloorWatch(Leaning(pitch, turns), Wheels(), None, None)  # type: ignore[arg-type]
     for i in range(300):
-        watch.observe(Step(i, 0, i * SECOND // 5, (i + 1) * SECOND // 5))
+        watch.observe(Step(i, 0, i * SECOND // 5, (i + 1) * SECOND // 5), by_hand(i / 5))
     return watch.sentence
 
 
@@ -48,6 +50,21 @@ def test_a_ramp_is_named_with_its_slope() -> None:
     assert found == (
         "the floor is not flat: pitch up to 9°, roll up to 0°, by the accelerometer; set estimator.ground: uneven"
     )
+
+
+def test_what_the_gyro_does_not_confirm_is_no_ramp() -> None:
+    """A speed or clock that is off tilts the force of a robot that drives on a flat floor."""
+    assert sentence(lambda t: -np.radians(9.0) if 10.0 < t < 15.0 else 0.0, turns=False) is None
+
+
+def test_what_hands_do_is_no_ramp() -> None:
+    """They are noticed half a second later."""
+
+    def tilts(t: float) -> float:
+        return -np.radians(9.0) * np.sin(2.0 * t) if 10.0 < t < 25.0 else 0.0
+
+    assert sentence(tilts) is not None
+    assert sentence(tilts, by_hand=lambda t: 10.6 < t < 25.6) is None
 
 
 def test_a_flat_floor_is_not_named_however_the_imu_is_mounted() -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from fgloc.sensors.base import Turn
 from fgloc.sensors.gyro import installation
 from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.rest import is_standing
+from fgloc.sensors.rest import Standing
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, InertialEvent, Step
 
@@ -45,15 +45,27 @@ class Gyro:
         self._config = config
         self._up = np.asarray(up, dtype=float)
         self._standing_s = 0.0
+        self._wheels = Standing()
         self._anchor: tuple[float, float] | None = None  # yaw and variance of the last fix ...
         self._turned = self._turned_s = 0.0  # ... and what was turned since
         self._received = False
         self.forget_fix()
 
+    @property
+    def up(self) -> FloatArray:
+        """The base's z axis ``(3,)`` in the IMU's frame, times the scale of its rates."""
+        return self._up
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether over the last step, and for a while, it has shown nothing but its bias beside wheels that stand."""
+        return self._standing_s > _AT_REST_S
+
     def fork(self) -> Gyro:
         """A copy that may integrate beyond the newest step without changing this one."""
         forked = copy.copy(self)
         forked.rejections = Counter()
+        forked._wheels = self._wheels.fork()
         return forked
 
     def resume(self, bias: float, bias_variance: float) -> None:
@@ -125,7 +137,7 @@ class Gyro:
         self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
 
     def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
-        stands = wheels is not None and is_standing(np.asarray(wheels, dtype=float), dt)
+        stands = self._wheels.observe(None if wheels is None else np.asarray(wheels, dtype=float), dt)
         variance = self._config.yaw_per_sqrt_s**2 / dt
         still = (rate - self.bias) ** 2 < chi2_bound(GATE, 1) * (self.bias_variance + variance)  # or turned by hand
         self._standing_s = self._standing_s + dt if stands and still else 0.0

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from fgloc.sensors.first_settings import FirstLook, FirstSection, FirstSettings
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
-from fgloc.sensors.wheels.geometry import WheelGeometry, WheelPair, fit_geometry, wheel_pair
-
-_NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
+from fgloc.sensors.wheels.geometry import NAMED_BY, WheelGeometry, WheelPair, fit_geometry, wheel_pair
+from fgloc.types import ControlEvent
 
 
 def section(look: FirstLook) -> FirstSection:
     """Joints, radii and track, as far as the recording shows them."""
     joints = [event for event in look.events[JointsEvent] if isinstance(event, JointsEvent)]
     odometry = [event for event in look.events[OdometryEvent] if isinstance(event, OdometryEvent)]
-    names = tuple(dict.fromkeys(name for event in joints[:_NAMED_BY] for name in event.names))
+    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
     if not names:
         return FirstSection()
     pair = wheel_pair(names)
-    geometry = None if pair is None or not odometry else fit_geometry(pair, joints, odometry)
+    commands = [event for event in look.events[ControlEvent] if isinstance(event, ControlEvent)]
+    geometry = None if pair is None or not odometry else fit_geometry(pair, joints, odometry, commands)
     head = f"# Joints in the recording: {', '.join(names)}."
     if pair is not None and geometry is not None:
         return FirstSection((head, *_found(pair, geometry)))
@@ -32,8 +32,9 @@ def section(look: FirstLook) -> FirstSection:
 
 
 def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
+    track = "the track that with which it obeys commands" if geometry.by_commands else "likewise the track"
     return (
-        "# Radius and track are those with which the driver made its odometry; measure them all the same.",
+        f"# The radius is that with which the driver made its odometry, {track}; measure them all the same.",
         "wheels:",
         "  source: ticks",
         f"  left_joint: {pair.left}",
@@ -58,4 +59,4 @@ def _to_fill_in(pair: WheelPair | None) -> tuple[str, ...]:
     )
 
 
-FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent), section)
+FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), section)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from fgloc.sensors.base import RawMistake
 from fgloc.sensors.roles import OdometerErrors, OdometerRole, SetupMistake, with_values
 from fgloc.sensors.wheels.installation import INSTALLATION
+from fgloc.types import Event
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -44,6 +46,12 @@ def _correct(mistake: SetupMistake, config: Config) -> RawMistake:
     return correct(mistake, config)
 
 
+def _by_angles(events: Sequence[Event]) -> dict[str, Any] | None:
+    from fgloc.sensors.wheels.geometry import settings_of
+
+    return settings_of(events)
+
+
 ROLE = OdometerRole(
     installation=INSTALLATION,
     build=_build,
@@ -51,4 +59,5 @@ ROLE = OdometerRole(
     freed=_freed,
     distance_gain="wheels.scale_v",
     correct=_correct,
+    by_angles=_by_angles,
 )
