@@ -125,7 +125,7 @@ SHEET: tuple[Trap, ...] = (
             *((Trap(f"turtlebot3_{name}", "held", r"robot\.held|motion\.held", rf"held.*?{_NUMBER}", held, 3.0),) if held else ()),
             Trap(f"turtlebot3_{name}", "turned by hand", r"robot\.(lifted|by_hand|turned)|motion\.lifted",
                  rf"(lifted|by hand|pushed).*?{_NUMBER}", hand, 3.0),
-            Trap(f"turtlebot3_{name}", "|a| 10.25 m/s² at rest", r"imu\.gravity_size", r"10\.[23]\d? ?m/s"),
+            Trap(f"turtlebot3_{name}", "|a| 10.25 m/s² at rest", r"imu\.gravity_(size|scale)", r"10\.[23]\d? ?m/s"),
             Trap(f"turtlebot3_{name}", "header stamps 0.2 s ahead", r"clock\.ahead|clock\.offset",
                  r"stamps?.*(ahead|future)|received before"),
         )
