@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgloc.config import Config, Role
+from fgloc.config import Config
 from fgloc.diagnosis.diagnosis import Diagnosis
 from fgloc.diagnosis.floor import FloorWatch
 from fgloc.diagnosis.sanity import Sanity
@@ -110,7 +110,6 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)  # what it refuses does not count
     floor = FloorWatch(attitude, wheels, seen, landmark_map) if flat else None
-    seen_by: Role = "sightings" if setup.detector is None else "image"
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     streams = [stream for sensor in sensors for stream in sensor.streams]
     return Assembly(
@@ -126,7 +125,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
         learned=learned,
         sensors=sensors,
         localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
-        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, seen_by, setup.imu_up, floor),
+        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, setup.imu_up, floor),
         sanity=Sanity(config, landmark_map, camera, setup.T_base_sensor, wheels, watched_gyro),
         notes=setup.notes,
     )

@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
-from fgloc.calibration.clock_trials import clock_findings, clock_trials
 from fgloc.calibration.contradictions import contradiction_findings, contradictions
 from fgloc.calibration.found import found_values
 from fgloc.calibration.settings import installation_found
@@ -78,12 +76,7 @@ def run(
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, outcome.roles, installed)
     contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction
-    of_constants = contradiction_findings(found, contradiction, config) or contradictions(found)
-    if check and not wrong.grave and options.get("on_step") is None:
-        asked = found if contradiction is None else installation_found(parts, outcome.roles, contradiction.asked)
-        trials = clock_trials(asked, parts.diagnosis.clock_offsets(parts.wheels.source), config)
-        again = partial(_tried, recording_path, map_path, options.get("detections"))
-        of_constants = clock_findings(trials, config, again, contradiction is not None) or of_constants
+    of_constants = contradiction_findings(found, contradiction, config) or contradictions(found, config)
     findings = _findings(outcome, smoothed, left_out, of_constants, sane.findings)
     result = _result(parts, replay, outcome, sane.simpler or estimates, smoothed)
     wall_s = time.perf_counter() - began
@@ -184,10 +177,6 @@ def _result(
 def _left_out(poses: int) -> Iterator[str]:
     if poses:
         yield f"The clock jumped back: {poses} poses whose times came again are left out."
-
-
-def _tried(recording: Path, map_path: Path | None, detections: Path | None, config: Config) -> RunResult:
-    return run(recording, map_path, config, "batch", detections=detections, check=False)
 
 
 def last_pass(estimates: list[Estimate]) -> list[Estimate]:

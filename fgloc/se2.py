@@ -125,3 +125,25 @@ def interpolate(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: NDArray[
     return np.column_stack(
         [np.interp(asked, known, poses[:, 0]), np.interp(asked, known, poses[:, 1]), wrap_array(yaw)]
     )
+
+
+def rigid(source: FloatArray, target: FloatArray, weights: FloatArray, spread_m: float = 0.4) -> FloatArray | None:
+    """Pose ``(3,)`` that takes points ``(n, 2)`` to others, by least squares.
+
+    Returns:
+        None where the targets' standard deviation is below ``spread_m``: they do not determine a direction.
+
+    Source: Arun, Huang, Blostein, "Least-squares fitting of two 3-D point sets", PAMI 9(5), 1987, in the plane.
+    """
+    share = weights / weights.sum()
+    a, b = source - share @ source, target - share @ target
+    if float(share @ (b**2).sum(axis=1)) < spread_m**2:
+        return None
+    yaw = math.atan2(share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), share @ (a * b).sum(axis=1))
+    return np.append(share @ target - turned(share @ source, yaw), yaw)
+
+
+def turned(points: FloatArray, yaw: FloatArray | float) -> FloatArray:
+    """Points ``(..., 2)`` turned by angles ``(...)`` [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1]], axis=-1)

@@ -21,18 +21,20 @@ from fgloc.types import Finding, FloatArray, InstallationFound, Setting, Severit
 
 _SURE_2 = 11.8  # χ² of two degrees of freedom, as rare as three sigmas of one
 CODES = ("installation.contradiction", "installation.off", "map.moved")
+_WHEELS = ("joints", "odometry")  # a robot follows its commands late: that is no clock's fault
+_LATE_S = 0.03  # less is within what drivers mean by a stamp
 _MOST_NAMED = 5  # landmarks
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _NOT_COMPARED = "; `fgloc smooth` compares what explains it."
 _UNEXPLAINED = ". No constant alone explains it: look for a wrong axis, sign, unit or clock."
 
 
-def contradictions(found: InstallationFound) -> list[Finding]:
-    """One finding for every given value that is contradicted, one for all landmarks; clocks: `clock_trials`.
+def contradictions(found: InstallationFound, config: Config) -> list[Finding]:
+    """One finding for every given value that is contradicted, one for all landmarks.
 
     What was found is used, as it is within the gate of its prior; what is not: `contradiction_findings`.
     """
-    off = [s for s in found.settings if not s.name.startswith("stamp_offset_s.") and contradicted(s)]
+    off = [s for s in found.settings if contradicted(s)]
     findings = [
         Finding(
             CODES[1],
@@ -43,8 +45,26 @@ def contradictions(found: InstallationFound) -> list[Finding]:
             s.sigma,
         )
         for s in off
+        if not _is_clock(s)
     ]
-    return [*findings, *note(CODES[2], _landmarks(found), Severity.WARNING)]
+    clocks = [s for s in off if _is_clock(s) and abs(s.unpulled) > _LATE_S] if found.wheels in _WHEELS else []
+    return [*findings, *_clocks(clocks, config), *note(CODES[2], _landmarks(found), Severity.WARNING)]
+
+
+def _clocks(off: Sequence[Setting], config: Config) -> Iterator[Finding]:
+    """Clocks that are late or early; all of them to one side: the gyro's, which they are compared to."""
+    late = {s.name.split(".")[1]: (s.given, -s.unpulled, s.sigma) for s in off}
+    if len(off) > 1 and len({s.unpulled > 0.0 for s in off}) == 1:
+        mean = sum(s.unpulled for s in off) / len(off)
+        given = {str(r): offset for r, offset in config.recording.stamp_offset_s.items()}.get("imu", 0.0)
+        late = {"imu": (given, mean, max(s.sigma for s in off))}
+    for role, (given, late_s, sigma) in late.items():
+        text = (
+            f"The stamps of {role} are {abs(late_s):.3f} ± {sigma:.3f} s {'late' if late_s > 0.0 else 'early'} against "
+            f"the others: set recording.stamp_offset_s: {{{role}: {given - late_s:.3f}}}, or correct the others."
+        )
+        lines = {"recording.stamp_offset_s": f"{{{role}: {given - late_s:.3f}}}"}
+        yield Finding(f"clock.{role}", text, Severity.WARNING, lines, late_s, sigma)
 
 
 def contradiction_findings(
@@ -143,6 +163,10 @@ def _landmarks(found: InstallationFound) -> Iterator[str]:
         named = ", ".join(f"{i} ({1e3 * m:.0f} mm)" for m, i in sorted(off, reverse=True)[:_MOST_NAMED])
         more = f" and {len(off) - _MOST_NAMED} more" if len(off) > _MOST_NAMED else ""
         yield f"Landmarks do not stand where the map has them: {named}{more}; take the run's map.yaml or survey them."
+
+
+def _is_clock(s: Setting) -> bool:
+    return s.name.startswith("stamp_offset_s.")
 
 
 def _line(s: Setting) -> str:

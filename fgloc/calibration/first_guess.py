@@ -16,6 +16,7 @@ _AGREE_M, _AGREE_PER_M, _AGREE_RAD = 0.15, 0.08, 0.6  # views of one marker that
 _VOTERS = 40  # views of a marker that propose where it is
 _LEAST_SHARE = 0.5  # of the views that have to agree
 _ALIGNED_M, _ALIGNED_RAD = 0.4, 0.5  # a marker in two surveys
+_SPREAD_M = 0.25  # standard deviation of places that determine a direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,17 +134,8 @@ def _fits(pose: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _from_points(a: FloatArray, b: FloatArray) -> FloatArray | None:
-    """Least squares over the places alone; None where they are nearly one point.
-
-    Source: Umeyama, IEEE PAMI 13(4), 1991, in the plane and without scale.
-    """
-    if len(a) < 2 or np.ptp(a[:, :2, 3], axis=0).max() < 0.5:
-        return None
-    to, start = a[:, :2, 3] - a[:, :2, 3].mean(axis=0), b[:, :2, 3] - b[:, :2, 3].mean(axis=0)
-    yaw = np.arctan2((start[:, 0] * to[:, 1] - start[:, 1] * to[:, 0]).sum(), (start * to).sum())
-    c, s = np.cos(yaw), np.sin(yaw)
-    place = a[:, :2, 3].mean(axis=0) - np.array([[c, -s], [s, c]]) @ b[:, :2, 3].mean(axis=0)
-    return np.array([*place, yaw])
+    """Least squares over the places alone; None where they are nearly one point."""
+    return se2.rigid(b[:, :2, 3], a[:, :2, 3], np.ones(len(a)), _SPREAD_M) if len(a) > 1 else None
 
 
 def _planar(T: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Cuts the steps of a run into windows, in bounded memory."""
+"""Sightings of any kind as places in the sensor's own axes, with their noise."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.window import RelativeSightings, Window
 from fgloc.sensors import registry
 from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import FloatArray, FrameMeasurement, LandmarkMap, PixelMeasurement, SightingsEvent, Step
+from fgloc.types import FloatArray, FrameMeasurement, LandmarkMap, PixelMeasurement, SightingsEvent
 
-SPAN_S = 8.0  # sightings of a window
-MARGIN_S = 1.2  # wheel motion before and after them, for clocks that differ
-_MOST_SIGHTINGS = 150
-_SPARSE_S = 0.09  # events closer than this to the one before add little information
 _FLOOR_RAD, _FLOOR_M, _FLOOR_SHARE = 0.01, 0.02, 0.01  # what wheels err over a window, whatever the sensor's noise
 
 
@@ -80,73 +74,3 @@ class SightingCollector:
         """A place given in the base's plane, taken to be at the sensor's own height."""
         arm = np.array([x - self._place[0, 3], y - self._place[1, 3], 0.0])
         return np.asarray(self._place[:3, :3].T @ arm)
-
-
-class WindowCutter:
-    """Collects motion and sightings; gives a window whenever one is complete."""
-
-    def __init__(self) -> None:
-        self._segment = -1
-        self._times: list[float] = []
-        self._motions: list[FloatArray] = []
-        self._sightings: list[RelativeSighting] = []
-        self._last_sighting_s = -math.inf
-        self._origin_ns: int | None = None
-        self.travelled: FloatArray = np.zeros(3)  # from the segment's first step to the oldest pose kept
-
-    def seconds(self, stamp_ns: int) -> float:
-        """Time since the first step [s]."""
-        return (stamp_ns - (self._origin_ns or 0)) * 1e-9
-
-    def begin(self, step: Step) -> None:
-        """Take the step's time; a new segment forgets what was kept."""
-        if self._origin_ns is None:
-            self._origin_ns = step.start_ns
-        if step.segment != self._segment:
-            self._segment = step.segment
-            self._forget(self.seconds(step.stamp_ns))
-
-    def wants(self, at_s: float) -> bool:
-        """Whether a sightings event at this time would add something."""
-        return abs(at_s - self._last_sighting_s) >= _SPARSE_S and len(self._sightings) < 2 * _MOST_SIGHTINGS
-
-    def add_sighting(self, sighting: RelativeSighting) -> None:
-        """Keep a sighting."""
-        self._sightings.append(sighting)
-        self._last_sighting_s = sighting.at_s
-
-    def move(self, step: Step, motion: FloatArray | None) -> Window | None:
-        """Take in the step's motion; None: it is not known, and what was kept is of no use any more."""
-        if step.dt <= 0.0:
-            return None
-        end = self.seconds(step.stamp_ns)
-        if motion is None or not self._times:
-            self._forget(end)
-            return None
-        self._times.append(end)
-        self._motions.append(motion)
-        if end - self._times[0] < SPAN_S + 2.0 * MARGIN_S:
-            return None
-        window = self._window()
-        keep = next(i for i, t in enumerate(self._times) if t >= end - 2.0 * MARGIN_S)
-        for passed in self._motions[:keep]:
-            self.travelled = se2.compose(self.travelled, passed)
-        del self._times[:keep], self._motions[:keep]
-        self._sightings = [s for s in self._sightings if s.at_s >= end - MARGIN_S]
-        return window
-
-    def _window(self) -> Window:
-        start = self._times[0]
-        inside = [s for s in self._sightings if start + MARGIN_S <= s.at_s < self._times[-1] - MARGIN_S]
-        inside = inside[:: max(1, -(-len(inside) // _MOST_SIGHTINGS))]
-        sightings = RelativeSightings(
-            np.array([s.at_s - start for s in inside]),
-            np.array([s.landmark_id for s in inside], dtype=np.int64),
-            np.array([s.point for s in inside]).reshape(-1, 3),
-            np.array([(s.sigma_rad, s.sigma_m) for s in inside]).reshape(-1, 2),
-        )
-        return Window(start, np.array(self._times) - start, np.array(self._motions), sightings)
-
-    def _forget(self, at_s: float) -> None:
-        self._times, self._motions, self._sightings = [at_s], [], []
-        self.travelled = np.zeros(3)

@@ -17,6 +17,7 @@ import yaml
 
 from fgloc import se2
 from fgloc.config import Config, config_of
+from fgloc.diagnosis.frame_checks import first_pose_sentence
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
@@ -42,6 +43,8 @@ from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
+_UNSURE = 0.1  # share of a scale by which it is not known
+_VARIED = 0.05  # rad/s, m/s: standard deviation of a motion that tells one time from another
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
@@ -50,12 +53,16 @@ _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
+_FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
+_NO_MAP = 0.5  # residual over the spread of the landmarks: they stand elsewhere
 _GRAVITY = 5.0  # m/s²: less is no accelerometer
 _TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
 _GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
 _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
 _APART_RAD, _WINDOWS, _SAMPLES = 0.05, 6, 4  # rad in half a second, for so many of them with so many messages
 _SAME_TURN = 0.3  # share of the difference of wheels and gyro beyond which an odometry's yaw is not the gyro's
+_WHEELS = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
+_DRIFTED_S, _DRIFT_SIGMAS = 0.06, 3.5  # of the lag's change from half to half; a drift widens the sigmas of both
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # share by which a scale may miss a unit's
 
@@ -120,7 +127,9 @@ def conventions(
     if found.opposite and _opposite(found, signals, path, seen, T_base_sensor):
         path = signals.path(found.config) or path
     sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
-    _clocks(found, signals, gyro, sensor)
+    drifting = _drifts(found, signals, path, imu_up, T_base_sensor)
+    _clocks(found, signals, path, None if "imu" in drifting else gyro, None if "sightings" in drifting else sensor)
+    _first_pose(found, path, seen, T_base_sensor, landmark_map)
     _truth(found, signals, path)
     return found
 
@@ -353,7 +362,7 @@ def _gyro(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray |
     if rates is None:
         return None
     times, omega, force = rates
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (omega[1:] + omega[:-1]) * np.diff(times)[:, None], 0)])
+    turned = np.column_stack([turn_by(times, rate) for rate in omega.T])
     given = found.config.gyro.scale
     sign = math.copysign(1.0, given)
     up = _unit(imu_up) * (sign if imu_up is None else 1.0)  # a mounting has the sign of the scale in it
@@ -509,13 +518,7 @@ def _sensor(
 ) -> Mounting | None:
     """Axes, mirror, scale and place of the sensor of landmarks; None: the wheels do not tell."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
-    section = found.config.landmarks
-    distance = np.maximum(np.linalg.norm(seen.points, axis=1, keepdims=True), 1e-9)
-    ranged = section.range_scale * np.maximum(1.0 - section.range_bias_m / distance, 1e-3) * seen.points
-    turned = ranged @ T[:3, :3].T
-    c, s = math.cos(section.bearing_bias_rad), math.sin(section.bearing_bias_rad)
-    turned[:, :2] = turned[:, :2] @ np.array([[c, -s], [s, c]])
-    as_given = Sightings(seen.times, seen.ids, turned, seen.spatial)
+    as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
     fits = fit_sightings(path, as_given)
     if not fits:
         return None
@@ -557,6 +560,17 @@ def _sensor(
     return chosen
 
 
+def _as_configured(config: Config, seen: Sightings, T_base_sensor: FloatArray | None) -> tuple[Sightings, FloatArray]:
+    """Sightings in the base's axes about the sensor, with what is configured of it; the points in its own axes."""
+    section = config.landmarks
+    distance = np.maximum(np.linalg.norm(seen.points, axis=1, keepdims=True), 1e-9)
+    ranged = section.range_scale * np.maximum(1.0 - section.range_bias_m / distance, 1e-3) * seen.points
+    turned = ranged if T_base_sensor is None else ranged @ T_base_sensor[:3, :3].T
+    c, s = math.cos(section.bearing_bias_rad), math.sin(section.bearing_bias_rad)
+    level = np.column_stack([turned[:, :2] @ np.array([[c, -s], [s, c]]), turned[:, 2:]])
+    return Sightings(seen.times, seen.ids, level, seen.spatial), ranged
+
+
 def _best(fits: Mapping[str, Mounting]) -> Mounting:
     """The fit of the least misfit; of those about alike the most usual axes."""
     least = min(m.misfit for m in fits.values())
@@ -595,7 +609,7 @@ def _constants(
         m, scaled = _by_map(found, path, seen, m, landmark_map), False
     place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], _PLACED_M) and f.sigma < 0.5 * _PLACED_M]
     turned = m.yaw.off(0.0, _TURNED_RAD)
-    if place or turned:
+    if (place or turned) and _varied(path):
         moved = T.copy()
         c, s = math.cos(m.yaw.value), math.sin(m.yaw.value)
         if turned:
@@ -659,7 +673,14 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmar
     if landmark_map is not None and len(landmark_map) > 2:
         places = {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
         fit = fit_map(path, seen, m, places)
-        if fit is not None and fit.misfit < 0.5:
+        if fit is not None and fit.misfit >= _NO_MAP:
+            text = (
+                "The map contradicts wheels and sightings, which agree, and neither a mirror image nor a scale of it "
+                "fits: check that it is the map of this place, and its ids and positions"
+            )
+            found.add("map.contradiction", text, {}, None, Severity.ERROR)
+            return
+        if fit is not None:
             if fit.shift:
                 found.add("map.ids", f"The map's ids are {fit.shift:+d} against those seen", {}, None, Severity.ERROR)
             if fit.mirrored:
@@ -669,6 +690,8 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmar
             ranges = Figure(by_wheels.value * fit.scale.value, by_wheels.value * fit.scale.sigma)
             relative = math.hypot(fit.scale.sigma / fit.scale.value, by_wheels.sigma / by_wheels.value)
             on_map = Figure(fit.scale.value, fit.scale.value * relative)
+            if by_wheels.sigma > _UNSURE * by_wheels.value:
+                return  # the wheels do not tell distances, as on one circle
             if on_map.off(1.0, _SCALE):
                 _three(found, by_wheels, on_map, ranges)
                 return
@@ -730,20 +753,57 @@ def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
 
-def _clocks(found: Conventions, signals: Signals, gyro: RateFit | None, sensor: Mounting | None) -> None:
+def _drifts(
+    found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None, T_base_sensor: FloatArray | None
+) -> list[str]:
+    """Name the roles whose lag is another one in the second half of the time than in the first."""
+    fits: dict[str, list[Figure]] = {}
+    if signals.source not in _WHEELS or not _varied(path):
+        return []
+    rates, seen, middle = signals.rates(), signals.sightings(), len(path.times) // 2
+    if seen is not None:
+        seen, _ = _as_configured(found.config, seen, T_base_sensor)
+    for part in (slice(None, middle), slice(middle, None)):
+        half = Path(path.times[part], path.poses[part], path.gaps[part])
+        if rates is not None and (fit := fit_rate(half, rates[0], turn_by(rates[0], rates[1] @ _unit(imu_up)))):
+            fits.setdefault("imu", []).extend([fit.late_s] if fit.share > _TELLS else [])
+        if seen is not None and (fitted := fit_sightings(half, seen, ["body"])):
+            fits.setdefault("sightings", []).append(fitted["body"].late_s)
+    seconds = 0.5 * float(path.times[-1] - path.times[0])
+    drifting = []
+    for role, lags in fits.items():
+        if len(lags) < 2 or max(lag.sigma for lag in lags) > _LATE_S:
+            continue
+        drift = Figure((lags[1].value - lags[0].value) / seconds, math.hypot(lags[0].sigma, lags[1].sigma) / seconds)
+        if drift.off(0.0, _DRIFTED_S / seconds, _DRIFT_SIGMAS):
+            drifting.append(role)
+            text = (
+                f"The clock of {role} drifts against the wheels' by {1e3 * drift.value:+.2f} ± {1e3 * drift.sigma:.2f} "
+                f"ms/s: synchronize the clocks, or list {role} in recording.received_stamps"
+            )
+            found.add("clock.drift", text, {}, drift, Severity.WARNING)
+    return drifting
+
+
+def turn_by(times: FloatArray, rate: FloatArray) -> FloatArray:
+    """Integral ``(n,)`` of a rate over times."""
+    return np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(times)))
+
+
+def _clocks(found: Conventions, signals: Signals, path: Path, gyro: RateFit | None, sensor: Mounting | None) -> None:
     """Whose stamps are late, by the lags of gyro and landmarks against the wheels."""
     late: dict[str, Figure] = {}
     if gyro is not None and gyro.share > _TELLS:
         late["imu"] = gyro.late_s
-    if sensor is not None and sensor.late_s.sigma < _LATE_S:
+    if sensor is not None and sensor.late_s.sigma < _LATE_S and _varied(path):
         late["sightings"] = sensor.late_s
     off = {role: lag for role, lag in late.items() if lag.off(0.0, _LATE_S)}
     if not off:
         found.compared += [f"{role}: {lag.value:+.3f} ± {lag.sigma:.3f} s late" for role, lag in late.items()]
         return
-    wheels = "joints" if found.config.wheels.track is not None and "joints" in signals.delays else "odometry"
-    if wheels not in signals.delays:
+    if signals.source not in _WHEELS:
         return  # commands: a robot follows them late, which is no clock's fault
+    wheels = _WHEELS[signals.source]
     same = len(off) == 2 and abs(np.diff([lag.value for lag in off.values()])[0]) < 0.5 * _LATE_S + 3.0 * max(
         lag.sigma for lag in off.values()
     )
@@ -754,6 +814,13 @@ def _clocks(found: Conventions, signals: Signals, gyro: RateFit | None, sensor: 
     for role, lag in off.items():
         others = [wheels, *(other for other in late if other not in off)]
         _late(found, role, lag, " and ".join(others), len(others) == 1)
+
+
+def _varied(path: Path) -> bool:
+    """Whether speed or yaw rate vary: otherwise a lag and a turn of the sensor are the same."""
+    at = np.arange(path.times[0] + 0.5, path.times[-1] - 0.5, 0.5)
+    speed = np.hypot(*(path.at(at + 0.5) - path.at(at - 0.5))[:, :2].T)
+    return max(float(np.std(path.yaw_rate(at, 0.5))), float(np.nanstd(speed))) > _VARIED
 
 
 def _unpunctual(signals: Signals, role: str, other: str) -> bool:
@@ -773,6 +840,34 @@ def _late(found: Conventions, role: str, lag: Figure, against: str, either: bool
         lag,
         Severity.ERROR,
     )
+
+
+# --- the first pose ---------------------------------------------------------------------------------------------------
+
+
+def _first_pose(
+    found: Conventions,
+    path: Path,
+    seen: Sightings | None,
+    T_base_sensor: FloatArray | None,
+    landmark_map: LandmarkMap | None,
+) -> None:
+    """Name a first pose that was given and is not where the first sightings put it: one of two frames is shifted."""
+    given = found.config.estimator.initial_pose
+    if given is None or seen is None or landmark_map is None or any(f.severity for f in found.findings):
+        return
+    as_given, _ = _as_configured(found.config, seen, T_base_sensor)
+    use = np.array([int(i) in landmark_map.landmarks for i in seen.ids]) & (seen.times < seen.times[0] + _FIRST_S)
+    use &= path.known(np.full(len(seen.times), path.times[0]), seen.times)
+    place = np.zeros(2) if T_base_sensor is None else T_base_sensor[:2, 3]
+    at = path.at(seen.times[use])
+    points = at[:, :2] + se2.turned(as_given.points[use, :2] + place, at[:, 2])
+    places = np.array([landmark_map.landmarks[int(i)].position[:2] for i in seen.ids[use]]).reshape(-1, 2)
+    started = se2.rigid(points, places, np.ones(len(points))) if len(points) > 3 else None
+    sentence = None if started is None else first_pose_sentence(found.config, started)
+    if sentence is not None:
+        found.findings.append(Finding("frame.first_pose", sentence, Severity.ERROR))
+        found.config = with_line(found.config, "estimator.initial_pose", None)
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------

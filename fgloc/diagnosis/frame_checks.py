@@ -9,7 +9,6 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.window import rigid
 from fgloc.frames import quaternion_yaw
 from fgloc.types import FloatArray, IntArray, TruthEvent
 
@@ -63,11 +62,10 @@ def truth_sentence(config: Config, truth: Sequence[TruthEvent], stamps_ns: IntAr
     path = np.column_stack([np.interp(t, (at - at[0]) * 1e-9, known[:, k]) for k in (0, 1)])
     here = poses[there, :2]
     apart = float(np.hypot(*(path - here).T).mean())
-    T = rigid(path, here, np.ones(len(here)))
+    T = se2.rigid(path, here, np.ones(len(here)))
     if apart < _FRAME_M or T is None:
         return None
-    c, s = math.cos(T[2]), math.sin(T[2])
-    left = float(np.hypot(*(path @ np.array([[c, s], [-s, c]]) + T[:2] - here).T).mean())
+    left = float(np.hypot(*(se2.turned(path, T[2]) + T[:2] - here).T).mean())
     if left > _ALIGNED * apart:
         return None
     return (

@@ -39,12 +39,14 @@ class Mistakes:
         config: with the mistakes undone.
         landmark_map: likewise; None: the file is taken as it is.
         undone: whether ``config`` and ``landmark_map`` are not as they were given.
+        checked: whether anything was looked for.
     """
 
     findings: tuple[Finding, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
     undone: bool = False
+    checked: bool = False
 
     @property
     def grave(self) -> bool:
@@ -69,7 +71,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     findings = found.findings
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
         findings += note("setup.corrected", ["This run was made with that corrected; correct it, too."])
-    return Mistakes(tuple(findings), found.config, found.landmark_map, undone)
+    return Mistakes(tuple(findings), found.config, found.landmark_map, undone, checked=True)
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:

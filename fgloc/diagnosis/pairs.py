@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ ComplexArray = NDArray[np.complex128]
 
 MOST_LAG_S = 1.5  # a clock that is further off shows in the receive times
 _LAG_STEP_S = 0.05
+_NUDGE_S = 1e-3
 _PAIR_S = (0.4, 6.0)  # between two sightings of one landmark: the wheels err little over seconds
 _MOST_PAIRS = 4000
 _BLOCKS = 8  # of time, or of landmarks, of the jackknife
@@ -110,17 +111,18 @@ def _wander(heights: FloatArray, tracks: IntArray) -> float:
     return _MAD * float(np.median(np.abs(heights - mean[number])))
 
 
-def fit_sightings(path: Path, seen: Sightings) -> dict[str, Mounting]:
+def fit_sightings(path: Path, seen: Sightings, names: Sequence[str] | None = None) -> dict[str, Mounting]:
     """Mounting for each hypothesis of the sensor's axes that the sightings determine, by name.
 
     Args:
         path: motion of the wheels.
         seen: landmarks in the sensor's axes.
+        names: of the hypotheses; None: all that such a sensor can have.
     """
     first, last = _pairs(seen, path)
     if len(first) < 60:
         return {}
-    names = list(AXES) if seen.spatial else ["body", "body, upside down"]
+    names = names or (list(AXES) if seen.spatial else ["body", "body, upside down"])
     lags = np.arange(-MOST_LAG_S, MOST_LAG_S + 1e-9, _LAG_STEP_S)
     found = {}
     for name in names:
@@ -197,6 +199,7 @@ def _refined(
     tracks = _tracks(times, ids)
     start = np.array([math.log(abs(alpha)), math.atan2(alpha.imag, alpha.real), beta.real, beta.imag, late])
     start[2:4] = np.clip(start[2:4], -2.0, 2.0)
+    start[4] += _NUDGE_S  # a step of derivatives is a share of the value: at 0 there is none
 
     def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float]:
         part = _Places(path, times[use], z[use], tracks[use])

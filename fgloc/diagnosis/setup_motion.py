@@ -9,7 +9,6 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.excerpt import GRID_S, Stretch
-from fgloc.diagnosis.window import rigid
 from fgloc.sensors import registry
 from fgloc.types import FloatArray, IntArray
 
@@ -165,18 +164,16 @@ def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
 
 def laid(path: FloatArray, seen: FloatArray, places: FloatArray) -> FloatArray | None:
     """Pose ``(3,)`` of a path's start that brings what was seen from it onto the map; without the worst third."""
-    c, s = np.cos(path[:, 2]), np.sin(path[:, 2])
-    points = path[:, :2] + np.column_stack([c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] + c * seen[:, 1]])
+    points = path[:, :2] + se2.turned(seen, path[:, 2])
     weights = 1.0 / np.maximum((seen**2).sum(axis=1), 0.01)
     place: FloatArray | None = None
     for _ in range(3):
         if len(points) < _FEWEST_POINTS:
             return None
-        place = rigid(points, places, weights)
+        place = se2.rigid(points, places, weights)
         if place is None:
             return None
-        c0, s0 = np.cos(place[2]), np.sin(place[2])
-        off = points @ np.array([[c0, s0], [-s0, c0]]) + place[:2] - places
+        off = se2.turned(points, place[2]) + place[:2] - places
         distance = np.hypot(off[:, 0], off[:, 1])
         near = distance <= max(float(np.quantile(distance, _KEPT)), 0.05)
         points, places, weights = points[near], places[near], weights[near]

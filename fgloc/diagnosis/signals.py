@@ -97,6 +97,7 @@ class Signals:
         images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
         delays: received minus stamped [s], by role.
+        source: of the motion, as the odometer has it: "ticks", "odometry", "command"; "": no path was asked for.
     """
 
     origin_ns: int = 0
@@ -109,6 +110,7 @@ class Signals:
     widest: float = 0.0
     images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
+    source: str = ""
 
     def sightings(self) -> Sightings | None:
         """Sightings in order of time; None: there are none."""
@@ -141,7 +143,8 @@ class Signals:
             yaw += float(motion[2])
             poses.append(np.array([pose[0], pose[1], yaw]))
             gaps.append(gap)
-        if not wheels.source:
+        self.source = wheels.source
+        if not self.source:
             return None
         return Path((grid - self.origin_ns) * 1e-9, np.array(poses), np.array(gaps, dtype=np.int64))
 

@@ -110,6 +110,7 @@ class OnlineRun:
             event = passed
         if isinstance(event, MotionEvent) and event.odometer is not None:
             self._odometry = event
+        self.parts.diagnosis.add(event)
         for step in self.parts.stepper.push(event):
             self.reordering_s = (self.parts.stepper.newest_ns - step.stamp_ns) * 1e-9
             yield step, self._update(step)
@@ -144,8 +145,7 @@ class OnlineRun:
     def _diagnose(self, step: Step) -> None:
         """After the estimate was handed out: whoever waits for it does not wait for this."""
         assert self.parts is not None
-        parts = self.parts
-        parts.diagnosis.observe(step, parts.wheels.measure(step), parts.localizer.motion.is_carried)
+        self.parts.diagnosis.observe(step, self.parts.localizer.motion.is_carried)
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
         """To propagate the newest estimate from; ask before the next event is used."""
@@ -209,7 +209,7 @@ class OnlineRun:
         if now - self._told_s > _TOLD_EVERY_S:
             diagnosis = self.parts.diagnosis
             watched = self.parts.sanity.watch.sentence
-            told = (*diagnosis.mistakes, *diagnosis.notes(self.parts.wheels.source))
+            told = (*diagnosis.mistakes, *(f.text for f in diagnosis.findings(ended=False)))
             self._told, self._told_s = (told if watched is None else (watched, *told)), now
         return (*self._notes, *self._told, *self.parts.sentences)
 

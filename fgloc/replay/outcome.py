@@ -27,48 +27,49 @@ class Outcome:
         roles: topics by role.
         rejections: everything rejected anywhere, by reason.
         findings: what is wrong with the set-up, what does not fit together, and what the user should know.
-        untried: what seems to be wrong with the clocks, and was not tried.
     """
 
     roles: Mapping[Role, str]
     rejections: Counter[str]
     findings: tuple[Finding, ...]
-    untried: tuple[str, ...]
 
     @classmethod
     def of(cls, recording: Recording, parts: Assembly, replay: Replay, wrong: Mistakes) -> Outcome:
         """Collect it from the parts of a run."""
-        hints, untried = _hints(recording, parts, replay)
+        hints = _hints(recording, parts, replay)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
         unused = unused_sightings(rejections, recording.roles, seen)
+        known = {finding.code for finding in wrong.findings}
+        # All but images was compared before the run
+        seen_in_images = parts.diagnosis.findings() if wrong.checked and parts.camera is not None else ()
         findings = [
             *wrong.findings,
             *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),
-            *note("setup.contradiction", map(sentence, hints), Severity.WARNING),
+            *note("setup.unseen", map(sentence, hints), Severity.WARNING),
+            *(f for f in seen_in_images if f.code not in known),
             *_graded("recording", recording.notes),
             *_graded("clock", replay.clocks.notes),
             *_graded("run", parts.sentences),
         ]
-        return cls(recording.roles, rejections, tuple(findings), tuple(untried))
+        return cls(recording.roles, rejections, tuple(findings))
 
     def failed(self, why: str) -> str:
         """Message of a run that failed: what is wrong with the set-up, why it failed, what may be the cause."""
         mistakes = [f.text for f in self.findings if f.severity is Severity.ERROR]
         hints = [f.text for f in self.findings if f.severity is Severity.WARNING]
-        return " ".join([*mistakes, sentence(why) if mistakes else why, *hints, *self.untried])
+        return " ".join([*mistakes, sentence(why) if mistakes else why, *hints])
 
 
-def _hints(recording: Recording, parts: Assembly, replay: Replay) -> tuple[list[str], list[str]]:
-    """What does not fit together: surely, and what of the clocks is still to be tried."""
-    hints = [*parts.diagnosis.notes(parts.wheels.source, offsets=False), *replay.activity.missing()]
-    untried = [note for note in parts.diagnosis.notes(parts.wheels.source) if note not in hints]
+def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
+    """Why nothing was received, or no marker was found."""
+    hints = [*replay.activity.missing()]
     if parts.detector is not None and not any(parts.localizer.counts[kind] for kind in registry.detected_kinds()):
         hints = [*parts.detector.hints(recording)[0], *hints]
-    return hints, untried
+    return hints
 
 
 def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:

@@ -59,6 +59,7 @@ class Replay:
             gated = self._regated(self._sightings(found))
         for event in gated:
             self.activity.record(event.topic, event.stamp_ns)
+            self._parts.diagnosis.add(event)
             yield from self._parts.stepper.push(event)
         yield from self._parts.stepper.flush()
 
@@ -71,7 +72,7 @@ class Replay:
             checked = self._parts.sanity.observe(step, estimate, by_hand=by_hand)
             estimate = checked if self._causal else estimate
             self.record(step, estimate, (time.perf_counter() - start) * 1e3)
-            self._parts.diagnosis.observe(step, self._parts.wheels.measure(step), by_hand)
+            self._parts.diagnosis.observe(step, by_hand)
             if self._on_step is not None:
                 self._on_step(step, estimate)
 

@@ -10,14 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli
-from fgloc.calibration.clock_trials import clock_findings, clock_trials
 from fgloc.calibration.contradictions import contradicted, contradictions
 from fgloc.calibration.multi_run import pooled
 from fgloc.calibration.settings import settings_found, with_settings
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
-from fgloc.types import Camera, InstallationFound, RunResult, Setting, Severity
+from fgloc.types import Camera, Finding, InstallationFound, Setting
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "installed_run"
 
@@ -93,7 +92,7 @@ def test_only_what_is_surely_beyond_the_prior_is_said():
     assert pulled.off == pytest.approx(3.9, abs=0.1)
     assert pulled.unpulled == pytest.approx(0.083, abs=0.001)
     state = found({"gyro.scale": (0.03, 0.0005, 0.005)})
-    (finding,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)))
+    (finding,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)), Config())
     assert finding.lines == {"gyro.scale": "1.03"}
 
 
@@ -105,46 +104,26 @@ def test_pooling_counts_the_prior_once():
     assert setting.found == pytest.approx(1.0 + 0.75 * 0.02)
 
 
-def test_a_clock_is_named_only_if_its_correction_fits_better():
-    config = Config()
-    state = found({"sightings.time_offset_s": (0.08, 0.002, 0.012)})
-    state = InstallationFound(**_fields(state), settings=settings_found(state, config))
-    trials = clock_trials(state, {"sightings": -0.17}, config)  # another estimate: twice the delay
-    assert [round(t.offset_s, 2) for t in trials] == [-0.17, -0.08]
+def clocks(odometer: str = "odometry", **off: tuple[float, float, float]) -> list[Finding]:
+    """What is said of clocks that are off: mean, sigma and sigma of the prior."""
+    state = found({f"{name}.time_offset_s": values for name, values in off.items()}, wheels=odometer)
+    state = InstallationFound(**_fields(state), settings=settings_found(state, Config()))
+    return contradictions(state, Config())
 
-    def again(best_s: float):
-        def run(tried: Config) -> RunResult:
-            offset = tried.recording.stamp_offset_s.get("sightings", 0.0)
-            cost = 100.0 + 1e4 * (offset - best_s) ** 2
-            left = found({"sightings.time_offset_s": (offset - best_s, 0.002, 0.012)})
-            known = InstallationFound(**_fields(left), settings=settings_found(left, tried))
-            empty = (None, (), (), {}, {}, (), np.zeros(0), 0.0)
-            return RunResult(*empty, found=known, cost=cost)
 
-        return run
-
-    (told,) = clock_findings(trials, config, again(-0.085), beyond=False)
-    assert told.value == pytest.approx(0.085)
-    assert told.lines == {"recording.stamp_offset_s": "{sightings: -0.085}"}
-    assert told.severity is Severity.WARNING
-    (told,) = clock_findings(trials, config, again(-0.085), beyond=True)
-    assert told.severity is Severity.ERROR
-    assert clock_findings(trials, config, again(0.0), beyond=True) == []
-    assert clock_findings((), config, again(0.0), beyond=True) == []
+def test_a_late_clock_is_named_with_its_line():
+    (told,) = clocks(sightings=(0.08, 0.002, 0.012))
+    assert told.code == "clock.sightings"
+    assert told.value == pytest.approx(0.082, abs=0.001)
+    assert told.lines == {"recording.stamp_offset_s": "{sightings: -0.082}"}
+    assert clocks(sightings=(0.02, 0.002, 0.004)) == []
+    assert clocks("command", sightings=(0.08, 0.002, 0.012)) == []
 
 
 def test_all_clocks_against_the_gyros_accuse_the_gyros():
-    config = Config()
-    state = found(
-        {"sightings.time_offset_s": (0.08, 0.002, 0.012), "wheels.time_offset_s": (0.08, 0.002, 0.01)}, wheels="joints"
-    )
-    state = InstallationFound(**_fields(state), settings=settings_found(state, config))
-    trials = clock_trials(state, {}, config)
-    assert {t.role for t in trials} == {"sightings", "joints", "imu"}
-    imu = next(t for t in trials if t.role == "imu")
-    assert imu.offset_s == pytest.approx(0.08, abs=0.005)
-    commanded = found({"sightings.time_offset_s": (0.08, 0.002, 0.012)}, wheels="command")
-    assert clock_trials(commanded, {}, config) == ()
+    (told,) = clocks("joints", sightings=(0.08, 0.002, 0.012), wheels=(0.08, 0.002, 0.01))
+    assert told.code == "clock.imu"
+    assert told.value == pytest.approx(-0.08, abs=0.005)
 
 
 def test_a_configuration_written_is_read(tmp_path):
