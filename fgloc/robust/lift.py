@@ -25,6 +25,7 @@ from fgloc.stats import alarm_bound
 from fgloc.types import Decision, FloatArray, MotionReadings, Step
 
 _WINDOW_S = 1.0  # of vertical velocity: lifting takes about as long
+_STEEP = 0.3  # m/s of rising for each m/s of driving: slopes of 17 degrees
 _LEAST_RISE = 0.2  # m/s: a kerb, a ramp of 10 degrees and humps of 3 cm give a driving robot less
 _OVERLAPPING = 1.5  # degrees of freedom that sums over overlapping windows have more than those over separate ones
 _MEMORY_S = 60.0  # over which level and standard deviation of the specific force are averaged
@@ -70,11 +71,13 @@ class LiftMonitor:
         self._quiet_s += step.dt
         self._rest_s = self._rest_s + step.dt if readings.at_rest else 0.0
         moving = readings.wheels is None or _shakes(readings.wheels.motion, step.dt)
-        rise = self._rise[moving].test(step, self.carried)
+        speed = 0.0 if readings.wheels is None else float(np.hypot(*readings.wheels.motion[:2])) / max(step.dt, 1e-3)
+        least = _LEAST_RISE + _STEEP * speed
+        rise = self._rise[moving].test(step, self.carried, least)
         if moving or self._rise[False].known:
             self._rise[not moving].skip(step)
         else:  # a robot that stands shakes no more than one that drives
-            rise = self._rise[True].test(step, carried=True)
+            rise = self._rise[True].test(step, True, least)
         signs = [
             ("vertical_velocity", *rise),
             ("tilted_at_rest", *self._tilt.test(step, readings)),
@@ -143,7 +146,7 @@ class _RiseTest:
         self._samples.clear()
         self._length_s, self._newest_ns = 0.0, step.stamp_ns
 
-    def test(self, step: Step, carried: bool) -> tuple[float, float]:
+    def test(self, step: Step, carried: bool, least: float) -> tuple[float, float]:
         """Squared ratio of rise and standard deviation of the least likely window, and its bound."""
         new = [e for e in step.inertial if max(self._newest_ns, step.start_ns) < e.stamp_ns <= step.stamp_ns]
         forces = [float(np.linalg.norm(e.linear_acceleration)) for e in new]
@@ -156,16 +159,16 @@ class _RiseTest:
             self._length_s += each
         while self._length_s - self._samples[0][0] > _WINDOW_S:
             self._length_s -= self._samples.popleft()[0]
-        return self._judge(step.dt, float(np.mean(forces)), carried)
+        return self._judge(step.dt, float(np.mean(forces)), carried, least)
 
-    def _judge(self, dt: float, mean: float, carried: bool) -> tuple[float, float]:
+    def _judge(self, dt: float, mean: float, carried: bool, least: float) -> tuple[float, float]:
         seconds, forces = np.array(self._samples).T
         if math.isnan(self._level):
             self._level = mean
         rises = np.cumsum(((forces - self._level) * seconds)[::-1])
         spans = np.cumsum(seconds[::-1])
         bound = alarm_bound(dt, len(spans), 1, _OVERLAPPING * self._learned_s / _WINDOW_S)
-        nis = rises**2 / np.maximum(self._variance * spans / _WINDOW_S, _LEAST_RISE**2 / bound)
+        nis = rises**2 / np.maximum(self._variance * spans / _WINDOW_S, least**2 / bound)
         if not carried and nis.max() <= bound:
             self._learned_s += dt
             share = dt / min(self._learned_s, _MEMORY_S)
