@@ -100,9 +100,8 @@ def test_the_message_of_a_failed_run_is_in_sentences():
         Counter(),
         (
             Finding("setup", "No marker is seen.", Severity.ERROR),
-            Finding("setup.contradiction", "Map and sightings contradict each other.", Severity.WARNING),
+            Finding("map.contradiction", "Map and sightings contradict each other.", Severity.WARNING),
         ),
-        (),
     )
     assert found.failed("the first pose was never found.") == (
         "No marker is seen. The first pose was never found. Map and sightings contradict each other."
