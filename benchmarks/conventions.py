@@ -176,6 +176,14 @@ MISTAKES: dict[str, Mistake] = {
 def found_in(bag: Path, config: Config, mistake: Mistake | None) -> tuple[Finding, ...]:
     """Findings on a recording with one convention broken; none broken: as it is."""
     with Recording(bag, config.recording) as recording:
+        T_base_sensor = imu_up = landmark_map = None
+        R = np.eye(3)
+        try:
+            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)[1]
+            T_base_sensor, imu_up, landmark_map = setup.T_base_sensor, setup.imu_up, setup.landmark_map
+            R = R if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
+        except FglocError:
+            pass
         collector = SignalCollector(config)
         collector.found.images = "image" in recording.roles
         role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
@@ -183,15 +191,15 @@ def found_in(bag: Path, config: Config, mistake: Mistake | None) -> tuple[Findin
             for event in recording.decode(message, role_of[message[0]]):
                 broken = mistake is not None and isinstance(event, mistake.of)
                 collector.found.delays[role_of[message[0]]].append((event.received_ns - event.stamp_ns) * 1e-9)
-                collector.add(mistake.change(event) if broken and mistake is not None else event)
-        T_base_sensor = imu_up = landmark_map = None
-        try:
-            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)[1]
-            T_base_sensor, imu_up, landmark_map = setup.T_base_sensor, setup.imu_up, setup.landmark_map
-        except FglocError:
-            pass
+                if broken and mistake is not None:  # an IMU on its side has the robot's axes broken, not its own
+                    event = _turned_imu(R.T, mistake.change(_turned_imu(R, event)))
+                collector.add(event)
         found = conventions(collector.found, config, T_base_sensor, imu_up, landmark_map)
     return tuple(sorted(found.findings, key=lambda f: -f.severity))
+
+
+def _turned_imu(R: Any, event: Event) -> Event:
+    return _imu(R)(event) if isinstance(event, InertialEvent) else event
 
 
 def has(bag: Path, config: Config, kind: type[Event]) -> bool:
@@ -211,7 +219,7 @@ def named(mistake: Mistake, found: tuple[Finding, ...]) -> bool:
     if value is None:
         return False
     if found[0].code.startswith("clock."):
-        return abs(abs(value) - mistake.value) < mistake.tolerance
+        return abs(abs(value) - mistake.value) < max(mistake.tolerance, 3.0 * (found[0].sigma or 0.0))
     return min(abs(math.log(abs(value) / mistake.value)), abs(math.log(abs(value) * mistake.value))) < mistake.tolerance
 
 

@@ -12,7 +12,7 @@ from fgloc.diagnosis.floor import FloorWatch
 from fgloc.diagnosis.sanity import Sanity
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.stream_facts import StreamFacts
-from fgloc.intake.validation import EventValidator
+from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
@@ -115,9 +115,9 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     return Assembly(
         config=config,
         landmark_map=landmark_map,
-        gate=EventValidator(config.gate, known_ids, streams),
+        gate=EventValidator(reported_bounds(config), known_ids, streams),
         detector=setup.detector,
-        detections=EventValidator(config.gate, known_ids),
+        detections=EventValidator(reported_bounds(config), known_ids),
         stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams),
         wheels=wheels,
         landmarks=landmarks,

@@ -132,6 +132,7 @@ class MapConfig(Section):
     """How well the landmarks of the map were surveyed, where the map does not give it of each."""
 
     scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the map's positions")
+    size_scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the sizes that the map gives")
     position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
     rotation_sigma_rad: float = Field(
         0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"

@@ -18,7 +18,7 @@ from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.detection import SensorDetector
 from fgloc.sensors.equipment import MotionPredictor
-from fgloc.sensors.maps import load_map
+from fgloc.sensors.maps import configured_map
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -84,7 +84,7 @@ def recorded_setup(
     facts = RecordingFacts(recording)
     _need_motion(facts)
     if landmark_map is None and map_path is not None:
-        landmark_map = load_map(map_path, registry.raw_landmarks().size(config))
+        landmark_map = configured_map(map_path, config)
     return facts, sensor_setup(facts, landmark_map, config)
 
 

@@ -35,7 +35,7 @@ from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors import registry
 from fgloc.sensors.detection import DetectionError
-from fgloc.sensors.maps import load_map, write_map
+from fgloc.sensors.maps import configured_map, write_map
 from fgloc.types import Mode, RawEvent, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
@@ -205,7 +205,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
-    landmark_map = load_map(cell.map, registry.raw_landmarks().size(config)) if cell.map is not None else None
+    landmark_map = configured_map(cell.map, config) if cell.map is not None else None
     ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
     if cell.start == "truth":
@@ -220,6 +220,8 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
             if corrupted is not landmark_map:
                 map_file = Path(folder) / "map.yaml"
                 write_map(corrupted, map_file)
+                metres = config.map.model_copy(update={"scale": 1.0, "size_scale": 1.0})
+                config = config.model_copy(update={"map": metres})
         result = run(
             cell.bag,
             map_file,

@@ -63,11 +63,10 @@ def live(
     # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
     from fgloc.live.wire.node import Node
     from fgloc.live.wire.participant import Participant
-    from fgloc.sensors import registry
-    from fgloc.sensors.maps import load_map
+    from fgloc.sensors.maps import configured_map
 
     settings = _with_initial_pose(configured(None, config, model), initial_pose)
-    landmarks = None if map_file is None else load_map(map_file, registry.raw_landmarks().size(settings))
+    landmarks = None if map_file is None else configured_map(map_file, settings)
     began = time.monotonic()
     sys.setswitchinterval(_SWITCH_S)
     with _interrupted() as stop, Participant(domain, network) as participant:

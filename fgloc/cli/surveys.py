@@ -48,12 +48,11 @@ def make_map(
     """
     from fgloc.calibration.drives import sees_corners
     from fgloc.calibration.survey import survey
-    from fgloc.sensors import registry
-    from fgloc.sensors.maps import load_map, write_map
+    from fgloc.sensors.maps import configured_map, write_map
 
     check_out(out, folder=False)
     settings = configured(bags[0], config, model)
-    given = None if anchor is None else load_map(anchor, size or registry.raw_landmarks().size(settings))
+    given = None if anchor is None else configured_map(anchor, settings, size)
     settings = _with_markers(settings, dictionary, size, given)
     if not sees_corners(bags[0], settings):
         if len(bags) > 1 or anchor is not None or distance:

@@ -50,7 +50,10 @@ _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
 _BIAS_M = 0.03  # of a range
 _TELLS = 0.7  # share of a turn that another explains: two that tell the same
+_FOLLOWS = 0.5  # likewise: enough for a lag with its sigma
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
+_MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
+_SKID = 0.7  # logarithm of a turn over another: a driver may give both of them, by different tracks
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
@@ -174,7 +177,8 @@ def _odometry(found: Conventions, signals: Signals) -> None:
     if whole.sum() < 30:
         return
     middle = 0.5 * (yaw[span:] + yaw[:-span])
-    twists = np.array([np.convolve(rows[:, k], np.ones(span), "valid")[:-1] / span for k in (4, 5, 6)])
+    # medians: drivers that differentiate a pose report spikes where its yaw wraps or its stamps jitter
+    twists = np.median(np.lib.stride_tricks.sliding_window_view(rows[:-1, 4:7], span, axis=0), axis=2).T
     used = found.config.wheels.source in ("auto", "twist") and found.config.wheels.track is None
     grave = Severity.ERROR if used else Severity.NOTE
     _twist_speed(found, (moved / dt)[whole], middle[whole], (twists[0] + 1j * twists[1])[whole], grave)
@@ -242,7 +246,7 @@ def _twist_rate(
     c = float(rate @ clipped / (rate @ rate))
     if float(np.mean((clipped - c * rate) ** 2)) > 0.5 * float(np.mean(clipped**2)) or abs(c) < 1e-9:
         return
-    if c < 0.0 and abs(math.log(-c)) < 0.3:
+    if c < 0.0 and abs(math.log(-c)) < _SKID:
         ahead = [abs(np.mean(np.exp(1j * (np.angle(moved) - s * yaw))[np.abs(moved) > 0.01])) for s in (1.0, -1.0)]
         text = "The odometry's yaw rate has the opposite sign of its pose's yaw"
         if ahead[0] >= ahead[1]:
@@ -527,7 +531,9 @@ def _sensor(
     if best.misfit > _FITS * reach * max(best.scale.value, 1e-9) or best.scale.sigma > 0.3 * best.scale.value:
         return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
     sound = fits.get("body")
-    if best.axes == "body" or (sound is not None and sound.misfit < _WORSE * best.misfit):
+    if best.axes == "body" or (
+        sound is not None and sound.misfit < (_WORSE if seen.spatial else _MIRRORED) * best.misfit
+    ):
         assert sound is not None
         return _constants(found, path, as_given, sound, T, landmark_map)
     raw = Sightings(seen.times, seen.ids, ranged, seen.spatial)
@@ -915,7 +921,7 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
             {"truth.scale": round(section.scale * factor, 6)},
             fit.scale,
         )
-    if fit.late_s.off(0.0, _LATE_S) and fit.share > _TELLS:
+    if fit.late_s.off(0.0, _LATE_S) and fit.share > _FOLLOWS:
         given = {str(r): o for r, o in found.config.recording.stamp_offset_s.items()}.get("truth", 0.0)
         side = "late" if fit.late_s.value > 0 else "early"
         yield (

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
-from fgloc.intake.validation import EventValidator
+from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.detection import DetectionError, Detector
@@ -122,7 +122,7 @@ class ExcerptCollector:
     def __init__(self, recording: Recording, config: Config, detector: Detector | None) -> None:
         """As `read_excerpt`, but nothing is read."""
         self.found = Excerpt()
-        self._gate = EventValidator(config.gate)
+        self._gate = EventValidator(reported_bounds(config))
         self._detector = detector
         self._role_of = {topic: role for role, topic in recording.roles.items()}
         self._first_image: int | None = None

@@ -15,7 +15,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.frames import quaternion_yaw
-from fgloc.intake.validation import EventValidator
+from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.types import (
@@ -32,6 +32,8 @@ from fgloc.types import (
 
 LONGEST_S = 600.0  # of a recording is looked at: enough for any convention, and bounded
 GRID_S = 0.05  # of the wheels' path
+_FARTHEST = 1e9  # of a distance in any unit: more is no measurement
+_SPIKE = 20.0  # times the rate that one of a hundred exceeds: more is no turn
 _SILENT_S = 0.6  # without a message of the wheels their motion is not known
 
 
@@ -89,7 +91,7 @@ class Signals:
 
     Attributes:
         motion: events of the wheels and commands that passed the gate, in order of receipt.
-        imu: rows of time, rates ``(3,)`` and specific forces ``(3,)``.
+        imu: rows of time, rates ``(3,)`` and specific forces ``(3,)`` as the driver reports them, whatever their unit.
         truth: rows of time, position ``(3,)`` and quaternion ``(4,)``.
         seen: rows of time, landmark and point ``(3,)``.
         spatial: whether the points of ``seen`` have three measured coordinates.
@@ -155,6 +157,8 @@ class Signals:
         rows = np.array(self.imu)
         _, first = np.unique(rows[:, 0], return_index=True)
         rows = rows[first]
+        size = np.abs(rows[:, 1:4]).max(axis=1)
+        rows = rows[size <= _SPIKE * max(float(np.quantile(size, 0.99)), 0.1)]
         return rows[:, 0], rows[:, 1:4], rows[:, 4:7]
 
     def true_poses(self) -> FloatArray | None:
@@ -175,9 +179,10 @@ class SignalCollector:
     """Takes signals from the events of a recording, one by one."""
 
     def __init__(self, config: Config) -> None:
-        """``config`` has the bounds of what is plausible."""
+        """``config`` has the bounds of what is plausible; distances may be in any unit."""
         self.found = Signals()
-        self._gate = EventValidator(config.gate)
+        any_unit = {"max_range": _FARTHEST, "max_position": _FARTHEST}
+        self._gate = EventValidator(reported_bounds(config).model_copy(update=any_unit))
         self._first_ns: int | None = None
 
     def add(self, event: Event) -> bool:
@@ -190,13 +195,16 @@ class SignalCollector:
             row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.odometer.pose, *event.odometer.twist)
             if all(map(math.isfinite, row)):
                 self.found.odometry.append(row)
+        elif isinstance(event, InertialEvent):
+            row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.angular_velocity.tolist())
+            if event.stamp_ns > 0 and all(map(math.isfinite, row)):
+                self.found.imu.append((*row, *event.linear_acceleration.tolist()))
+            return True
         passed = self._gate.check(event)
         if passed is None:
             return True
         at_s = (passed.stamp_ns - self.found.origin_ns) * 1e-9
-        if isinstance(passed, InertialEvent):
-            self.found.imu.append((at_s, *passed.angular_velocity.tolist(), *passed.linear_acceleration.tolist()))
-        elif isinstance(passed, MotionEvent):
+        if isinstance(passed, MotionEvent):
             self.found.motion.append(passed)
         elif isinstance(passed, TruthEvent):
             self.found.truth.append((at_s, *passed.position.tolist(), *passed.orientation.tolist()))

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.config import GateConfig
+from fgloc.config import Config, GateConfig
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.field_checks import EMPTIED, Changes, FieldChecks
 from fgloc.types import Event, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
+_LEAST_SCALE = 1e-3  # of a rate: no unit of angle is smaller
 
 
 @dataclass(slots=True)
@@ -28,6 +29,18 @@ class _Topic:
     gaps: int = 0
     longest_gap_ns: int = 0
     back: bool = False  # the last stamp was far behind the newest
+
+
+def reported_bounds(config: Config) -> GateConfig:
+    """Bounds of what sensors report: of what is true, in the units that the settings say they report in."""
+    gate, turn = config.gate, min(abs(config.wheels.scale_omega), abs(config.gyro.scale), 1.0)
+    bounds = {
+        "max_speed": gate.max_speed / min(config.wheels.scale_v, 1.0),
+        "max_yaw_rate": gate.max_yaw_rate / max(turn, _LEAST_SCALE),
+        "max_range": gate.max_range / min(config.landmarks.range_scale, 1.0),
+        "max_position": gate.max_position / min(config.truth.scale, 1.0),
+    }
+    return gate.model_copy(update=bounds)
 
 
 class EventValidator:

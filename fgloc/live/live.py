@@ -22,7 +22,7 @@ from fgloc.live.process import EstimationProcess
 from fgloc.live.reception import Reception
 from fgloc.live.status import LivePose, LiveStatus
 from fgloc.sensors import registry
-from fgloc.sensors.maps import load_map
+from fgloc.sensors.maps import configured_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
 
 
@@ -71,7 +71,7 @@ class Live(EventMaker):
             MapError, ModelError: as their loaders have it.
         """
         if isinstance(landmark_map, Path):
-            landmark_map = load_map(landmark_map, registry.raw_landmarks().size(config))
+            landmark_map = configured_map(landmark_map, config)
         registry.motion_model().build(config, None)  # refuses a file now, not when the robot drives
         self._recording = config.recording
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fgloc.config import Config
 from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
-from fgloc.intake.validation import EventValidator
+from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.live.facts import LiveFacts
 from fgloc.live.facts import role_of as known_role
 from fgloc.live.status import TopicMeter, TopicStatus
@@ -45,7 +45,7 @@ class Reception:
     def __init__(self, config: Config) -> None:
         """Nothing has arrived."""
         self._selection = LiveFacts(config, None, None)
-        self._gate = EventValidator(config.gate)
+        self._gate = EventValidator(reported_bounds(config))
         self.dropped: Counter[str] = Counter()
         self._publishers: dict[Source, _Publisher] = {}
         self._meters: dict[str, TopicMeter] = {}

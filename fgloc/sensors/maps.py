@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgloc.config import Config
 from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
@@ -40,8 +41,9 @@ _WPILIB_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # 
 class _Builder:
     """Collects landmarks; refuses an id given twice, naming both lines."""
 
-    def __init__(self, default_size_m: float | None) -> None:
+    def __init__(self, default_size_m: float | None, scale: float, size_scale: float) -> None:
         self.default_size_m = default_size_m
+        self.scale, self.size_scale = scale, size_scale
         self.landmarks: dict[int, Landmark] = {}
         self._lines: dict[int, int] = {}
 
@@ -66,9 +68,17 @@ class _Builder:
             raise item.fail(f"position {position.tolist()} is out of bounds; expected metres")
         if rotation is None and size is not None:
             raise size.fail(f"landmark {number} has a size but no orientation; give one of {', '.join(_ORIENTATIONS)}")
-        side = 0.0 if rotation is None else _size(size) if size is not None else self.default_size_m or 0.0
+        position = self.scale * position
+        if cov is not None:
+            units = np.append(np.full(min(len(cov), 3), self.scale), np.ones(max(len(cov) - 3, 0)))
+            cov = cov * np.outer(units, units)
+        side = 0.0 if rotation is None else self.size(size) if size is not None else self.default_size_m or 0.0
         self._lines[number] = item.line
         self.landmarks[number] = Landmark(number, position, np.eye(3) if rotation is None else rotation, side, cov)
+
+    def size(self, item: Item) -> float:
+        """Side of a marker [m] that the file gives."""
+        return _size(item, self.size_scale)
 
     def finish(self, path: Path, root: Item, dictionary: str, notes: list[str]) -> LandmarkMap:
         """The checked map."""
@@ -87,19 +97,23 @@ class _Builder:
         return LandmarkMap(self.landmarks, dictionary, str(path), tuple(notes))
 
 
-def load_map(path: Path, default_size_m: float | None = None) -> LandmarkMap:
+def load_map(
+    path: Path, default_size_m: float | None = None, scale: float = 1.0, size_scale: float = 1.0
+) -> LandmarkMap:
     """Read a map in any of the known formats.
 
     Args:
         path: the file.
         default_size_m: side of markers for which the file gives none.
+        scale: metres of one unit of its positions.
+        size_scale: metres of one unit of its sizes.
 
     Raises:
         MapError: the file cannot be read or is in no known format; or an id is given twice (both lines are named) or is
             negative, a number is not finite, a size is not in metres, or a rotation is not one.
     """
     root = read_document(path, MapError)
-    builder = _Builder(default_size_m)
+    builder = _Builder(default_size_m, scale, size_scale)
     if not root.is_mapping:
         raise root.fail("expected keys such as 'landmarks' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib)")
     landmarks, bodies, tags = (root.get(key) for key in ("landmarks", "bodies", "tags"))
@@ -113,6 +127,16 @@ def load_map(path: Path, default_size_m: float | None = None) -> LandmarkMap:
             f"got the keys {', '.join(k for k, _ in root.pairs())}"
         )
     return _columns(path, root, landmarks, builder) if landmarks.is_mapping else _ours(path, root, landmarks, builder)
+
+
+def configured_map(path: Path, config: Config, default_size_m: float | None = None) -> LandmarkMap:
+    """Map of a file in the units that the configuration says it has; ``default_size_m`` takes the place of its own.
+
+    Raises:
+        MapError: as `load_map` has it.
+    """
+    size = default_size_m or registry.raw_landmarks().size(config)
+    return load_map(path, size, config.map.scale, config.map.size_scale)
 
 
 def write_map(landmark_map: LandmarkMap, path: Path) -> None:
@@ -147,7 +171,7 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
         except ConfigError as error:
             raise named.fail(str(error)) from error
     if size is not None:
-        builder.default_size_m = _size(size)
+        builder.default_size_m = builder.size(size)
     for item in landmarks.entries():
         item.only("id", "position", "size", *KEYS, *_ORIENTATIONS)
         position = item.need("position").numbers(2, 3)
@@ -261,8 +285,8 @@ def _xyz(item: Item) -> FloatArray:
     return np.array([item.need(key).number() for key in ("x", "y", "z")])
 
 
-def _size(item: Item) -> float:
-    size = item.number()
+def _size(item: Item, scale: float) -> float:
+    size = scale * item.number()
     if size <= 0.0:
         raise item.fail(f"marker size {size:g} m, expected more than 0")
     if size > _MAX_SIZE_M:

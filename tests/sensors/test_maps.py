@@ -11,10 +11,12 @@ import pytest
 from real_data import real_data
 from scipy.spatial.transform import Rotation
 
-from fgloc.config import Config
+from fgloc.config import Config, load_config
 from fgloc.errors import MapError
 from fgloc.graph.installation import MARKER, installation_of
-from fgloc.sensors.maps import load_map, write_map
+from fgloc.recording.reader import Recording
+from fgloc.sensor_setup import recorded_setup
+from fgloc.sensors.maps import configured_map, load_map, write_map
 from fgloc.types import Landmark, LandmarkMap
 
 OURS = """dictionary: DICT_4X4_50
@@ -300,3 +302,24 @@ def test_missing_file_and_binary_file(tmp_path: Path) -> None:
 def test_ids_that_the_dictionary_lacks_are_noted(tmp_path: Path) -> None:
     [note] = load_map(written(tmp_path, OURS.replace("id: 7", "id: 70"))).notes
     assert "below 50; [70] will never be seen" in note
+
+
+def test_units_of_a_map_are_those_of_the_settings(tmp_path):
+    path = written(tmp_path, OURS)
+    config = Config.model_validate({"map": {"scale": 0.3048, "size_scale": 0.5}})
+    plain, metres = load_map(path), configured_map(path, config)
+    for i, landmark in plain.landmarks.items():
+        assert np.allclose(metres.landmarks[i].position, 0.3048 * landmark.position)
+        assert metres.landmarks[i].size_m == pytest.approx(0.5 * landmark.size_m)
+    assert np.allclose(metres.landmarks[7].cov, 0.3048**2 * plain.landmarks[7].cov)
+
+
+def test_a_run_has_the_map_in_the_units_of_the_settings():
+    sample = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
+    config = load_config(sample / "robot.yaml")
+    config = config.model_copy(update={"map": config.map.model_copy(update={"scale": 2.0})})
+    with Recording(sample / "bag", config.recording) as recording:
+        landmark_map = recorded_setup(recording, sample / "map.yaml", config)[1].landmark_map
+    assert landmark_map is not None
+    for i, landmark in load_map(sample / "map.yaml").landmarks.items():
+        assert np.allclose(landmark_map.landmarks[i].position, 2.0 * landmark.position)
