@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -97,7 +98,8 @@ class Conventions:
         remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
         self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
         for key, given in lines.items():
-            self.config = with_line(self.config, key, given)
+            with suppress(ValueError):  # beyond what a setting may be: it is said, and left as it is
+                self.config = with_line(self.config, key, given)
 
 
 def conventions(
@@ -528,7 +530,7 @@ def _sensor(
         return None
     best = _best(fits)
     reach = float(np.median(np.abs(planar(as_given.points, best.axes))))
-    if best.misfit > _FITS * reach * max(best.scale.value, 1e-9) or best.scale.sigma > 0.3 * best.scale.value:
+    if best.misfit > _FITS * reach or best.scale.sigma > 0.3 * best.scale.value:
         return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
     sound = fits.get("body")
     if best.axes == "body" or (
@@ -540,27 +542,28 @@ def _sensor(
     chosen = best if T_base_sensor is None else _best(fit_sightings(path, raw) or {best.axes: best})
     pose = _pose_of(chosen, T)
     lines: dict[str, Any] = {}
+    off_mm = 1e3 * chosen.scale.value * chosen.misfit
     if chosen.axes == "optical":
         text = (
             "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place while the "
-            f"wheels move, to {1e3 * chosen.misfit:.0f} mm; in the axes as configured they wander"
+            f"wheels move, to {off_mm:.0f} mm; in the axes as configured they wander"
         )
         code, lines["recording.sightings_axes"] = "sightings.axes", "optical"
     elif not seen.spatial:
         text = (
             "Bearings count to the right (or the sensor is upside down): mirrored, landmarks stay in place to "
-            f"{1e3 * chosen.misfit:.0f} mm while the wheels move, as reported they wander"
+            f"{off_mm:.0f} mm while the wheels move, as reported they wander"
         )
         code = "sightings.mirrored"
     else:
         text = (
-            f"Landmarks stay in place, to {1e3 * chosen.misfit:.0f} mm, if the sensor's axes are taken as "
+            f"Landmarks stay in place, to {off_mm:.0f} mm, if the sensor's axes are taken as "
             f"{chosen.axes}; in the axes as configured they wander"
         )
         code, lines["recording.sightings_axes"] = "sightings.axes", "body"
     lines["recording.sightings_pose"] = pose
     found.add(code, text, lines, None, Severity.ERROR)
-    if chosen.scale.off(1.0, _SCALE):
+    if chosen.scale.off(1.0, _SCALE) or landmark_map is not None:
         _scale(found, path, raw, chosen, landmark_map)
     found.noise = track_noise(path, raw, chosen)
     return chosen

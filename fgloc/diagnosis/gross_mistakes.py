@@ -155,7 +155,8 @@ class _Search:
             signals = read_signals(recording, self.config)
             found = conventions(signals, self.config, parts.T_base_sensor, parts.imu_up, parts.landmark_map)
             self._conventions += found.findings
-            changed, self.config = found.config.recording != self.config.recording, found.config
+            read = (self.config.recording, self.config.map)
+            changed, self.config = (found.config.recording, found.config.map) != read, found.config
             if changed:
                 return True
         for mistake in registry.raw_mistakes(excerpt.motion, self.config):

@@ -76,7 +76,7 @@ class Mounting:
         x: place of the sensor in the base frame [m].
         y: likewise.
         late_s: how much later the sensor's stamps are than the wheels'.
-        misfit: robust standard deviation of a landmark's place between two sightings [m].
+        misfit: robust standard deviation of a landmark's place between two sightings, in the sensor's unit of length.
         pairs: number of pairs of sightings.
     """
 

@@ -43,7 +43,7 @@ class LandmarksConfig(Section):
     range_sigma_m: float = Field(0.1, ge=1e-4, le=100)
     range_sigma_per_m: float = Field(0.0, ge=0, le=10, description="added range sigma per metre of range")
     bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2)
-    range_scale: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported range")
+    range_scale: float = Field(1.0, ge=1e-4, le=1e4, description="true over reported range")
     range_along_axis: bool = Field(
         False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
     )

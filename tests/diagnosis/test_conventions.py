@@ -1,0 +1,161 @@
+"""Broken conventions are named by `info` and `init` with the line that undoes them, and none in a sound recording."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fgloc.calibration.first_settings import first_settings
+from fgloc.config import Config, config_of
+from fgloc.datasets.bag import BagWriter
+from fgloc.diagnosis.gross_mistakes import inspect_all
+from fgloc.sensors.maps import write_map
+from fgloc.types import Landmark, LandmarkMap, Severity
+
+START_S, SECONDS, STEP_S = 1_700_000_000.0, 50.0, 0.005
+TIMES = np.arange(0.0, SECONDS, STEP_S)
+SPEED = 0.3 + 0.15 * np.sin(0.9 * TIMES)
+RATE = 0.25 + 0.5 * np.sin(0.6 * TIMES) + 0.2 * np.sin(1.7 * TIMES)
+YAW = np.concatenate([[0.0], np.cumsum(STEP_S * RATE)[:-1]])
+X, Y = (np.concatenate([[0.0], np.cumsum(STEP_S * SPEED * f(YAW))[:-1]]) for f in (np.cos, np.sin))
+_AROUND = np.linspace(0.0, math.tau, 9)[:-1]
+BEACONS = np.column_stack([X.mean() + 3.0 * np.cos(_AROUND) + 0.3 * _AROUND, Y.mean() + 2.5 * np.sin(_AROUND)])
+FOOT = 0.3048
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What is wrong: factors of what is reported, delays [s], and matrices of axes."""
+
+    bearing: float = 1.0
+    range: float = 1.0
+    sightings_late: float = 0.0
+    imu_axes: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    imu_unit: float = 1.0
+    imu_late: float = 0.0
+    speed: float = 1.0
+    yaw_rate: float = 1.0
+    world_twist: bool = False
+    truth: str = ""
+    truth_late: float = 0.0
+    truth_yaw: float = 0.0
+    truth_unit: float = 1.0
+    map: float = 1.0
+    map_mirrored: bool = False
+    shift: int = 0
+
+
+def record(folder: Path, wrong: Broken) -> Path:
+    """A bag of odometry, IMU, ranges with bearings and truth, and the map beside it."""
+    rng = np.random.default_rng(1)
+
+    def at(rate_hz: float, late: float = 0.0):
+        for k in range(0, len(TIMES), round(1.0 / (rate_hz * STEP_S))):
+            yield k, round((START_S + TIMES[k] + late) * 1e9), round((START_S + TIMES[k]) * 1e9)
+
+    messages = []
+    with BagWriter(folder / "bag") as bag:
+        for k, stamp, received in at(20.0):
+            v, turned = wrong.speed * SPEED[k], YAW[k] if wrong.world_twist else 0.0
+            twist = (v * math.cos(turned), v * math.sin(turned), wrong.yaw_rate * RATE[k])
+            pose = (X[k], Y[k], YAW[k])
+            messages.append((received, lambda s=stamp, p=pose, t=twist, r=received: bag.odometry("/odom", s, p, t, r)))
+        M = np.array(wrong.imu_axes, dtype=float)
+        for k, stamp, received in at(50.0, wrong.imu_late):
+            omega = wrong.imu_unit * (M @ [0.0, 0.0, RATE[k]] + rng.normal(0.0, 0.005, 3))
+            force = M @ [0.0, SPEED[k] * RATE[k], 9.81] + rng.normal(0.0, 0.05, 3)
+            messages.append((received, lambda s=stamp, w=omega, f=force, r=received: bag.imu("/imu", s, w, f, r)))
+        for k, stamp, received in at(10.0, wrong.sightings_late):
+            away = BEACONS - [X[k], Y[k]]
+            ranges = np.hypot(*away.T) + rng.normal(0.0, 0.02, len(away))
+            bearings = np.arctan2(away[:, 1], away[:, 0]) - YAW[k] + rng.normal(0.0, 0.01, len(away))
+            bearings = np.arctan2(np.sin(bearings), np.cos(bearings))
+            near = [
+                (i, wrong.range * r, wrong.bearing * b)
+                for i, (r, b) in enumerate(zip(ranges.tolist(), bearings.tolist(), strict=True))
+                if abs(b) < 1.2
+            ]
+            messages.append((received, lambda s=stamp, n=near, r=received: bag.range_bearing("/landmarks", s, n, r)))
+        for k, stamp, received in at(20.0, wrong.truth_late):
+            place, yaw = [X[k], Y[k]], YAW[k] + wrong.truth_yaw
+            if wrong.truth == "ned":
+                place, yaw = place[::-1], 0.5 * math.pi - yaw
+            place = [*(wrong.truth_unit * np.array(place)).tolist(), 0.0]
+            turn = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+            messages.append((received, lambda s=stamp, p=place, q=turn, r=received: bag.truth("/truth", s, p, q, r)))
+        for _, write in sorted(messages, key=lambda m: m[0]):
+            write()
+    side = -1.0 if wrong.map_mirrored else 1.0
+    landmarks = {
+        i + wrong.shift: Landmark(i + wrong.shift, wrong.map * np.array([x, side * y, 0.0]), np.eye(3), 0.0)
+        for i, (x, y) in enumerate(BEACONS.tolist())
+    }
+    write_map(LandmarkMap(landmarks), folder / "map.yaml")
+    return folder / "bag"
+
+
+def conventions_of(bag: Path, config: Config):
+    """Findings of `info` that have a figure or a line, but notes."""
+    found = inspect_all(bag, bag.parent / "map.yaml", config).found
+    return [f for f in found if f.severity is not Severity.NOTE and "." in f.code and not f.code.startswith("setup")]
+
+
+CASES = {
+    "sightings mirrored (F4)": (Broken(bearing=-1.0), "sightings.mirrored", None),
+    "ranges in feet": (Broken(range=1.0 / FOOT), "sightings.scale", FOOT),
+    "ranges in centimetres": (Broken(range=100.0), "sightings.scale", 0.01),
+    "sightings late (F5)": (Broken(sightings_late=0.15), "clock.sightings", 0.15),
+    "IMU z flipped (G1)": (Broken(imu_axes=((1, 0, 0), (0, 1, 0), (0, 0, -1))), "imu.axes", None),
+    "IMU x and z exchanged (G2)": (Broken(imu_axes=((0, 0, 1), (0, 1, 0), (1, 0, 0))), "imu.axes", None),
+    "IMU in degrees (G3)": (Broken(imu_unit=180.0 / math.pi), "imu.unit", math.pi / 180.0),
+    "IMU negated (G4)": (Broken(imu_axes=((-1, 0, 0), (0, -1, 0), (0, 0, -1))), "imu.axes", None),
+    "IMU late (F6)": (Broken(imu_late=0.35), "clock.imu", 0.35),
+    "speeds in mm/s (G8)": (Broken(speed=1000.0), "odometry.twist_unit", 1e-3),
+    "twist in the world (G8)": (Broken(world_twist=True), "odometry.twist_frame", None),
+    "yaw rate in degrees": (Broken(yaw_rate=180.0 / math.pi), "odometry.yaw_unit", math.pi / 180.0),
+    "yaw rate negated": (Broken(yaw_rate=-1.0), "odometry.yaw_sign", None),
+    "truth in NED (G7)": (Broken(truth="ned"), "truth.axes", None),
+    "truth late (G7)": (Broken(truth_late=0.5), "clock.truth", 0.5),
+    "truth turned (F12)": (Broken(truth_yaw=1.0), "truth.mounting", 1.0),
+    "truth in mm": (Broken(truth_unit=1000.0), "truth.scale", 1000.0),
+    "map in feet (G5)": (Broken(map=1.0 / FOOT), "map.unit", FOOT),
+    "map x 0.3048 (G6)": (Broken(map=FOOT), "map.unit", 1.0 / FOOT),
+    "map x 100 (G6)": (Broken(map=100.0), "map.unit", 0.01),
+    "ids off by one (G6)": (Broken(shift=1), "map.ids", None),
+    "map mirrored": (Broken(map_mirrored=True), "map.mirrored", None),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_broken_convention_is_named_first(tmp_path, case):
+    wrong, code, value = CASES[case]
+    found = conventions_of(record(tmp_path, wrong), Config())
+    assert found[0].code == code, [f.text for f in found]
+    assert {f.code for f in found} == {code}
+    if value is not None:
+        assert abs(found[0].value - value) < 0.05 * value + 5.0 * found[0].sigma
+
+
+def test_a_sound_recording_has_none(tmp_path):
+    bag = record(tmp_path, Broken())
+    assert not conventions_of(bag, Config())
+    assert not [f for f in first_settings(bag).found if f.severity is not Severity.NOTE]
+
+
+def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
+    assert not [f for f in conventions_of(record(tmp_path, Broken(map=1.08)), Config()) if f.code.startswith("map.")]
+
+
+WRITTEN = replace(Broken(), bearing=-1.0, imu_unit=180.0 / math.pi, truth="ned", map=1.0 / FOOT)
+
+
+def test_what_init_writes_undoes_what_is_broken(tmp_path):
+    bag = record(tmp_path, WRITTEN)
+    made = first_settings(bag)
+    assert {"sightings.mirrored", "imu.unit", "truth.axes", "map.unit"} <= {f.code for f in made.found}
+    assert not conventions_of(bag, config_of(yaml.safe_load(made.text)))
