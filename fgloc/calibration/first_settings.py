@@ -24,6 +24,7 @@ from fgloc.sensors import registry
 from fgloc.sensors.first_settings import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
+_UNCALIBRATED = {"range_scale_sigma": 0.03, "bearing_bias_sigma_rad": 0.02, "time_offset_sigma_s": 0.05}
 _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
 _OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
@@ -110,6 +111,10 @@ def _noise_lines(noise: Noise) -> dict[str, list[str]]:
     if wide:
         lines += ["  # Noise that the wheels' motion leaves unexplained."]
         lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
+    lines += [
+        "  # Nobody has calibrated this sensor: it may be off by more than a measured installation is (the defaults)."
+    ]
+    lines += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
     blocks = {"landmarks": lines}
     if noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
         about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."

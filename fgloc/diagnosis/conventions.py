@@ -133,9 +133,14 @@ def conventions(
         path = signals.path(found.config) or path
     sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
     drifting = _drifts(found, signals, path, imu_up, T_base_sensor)
-    _clocks(found, signals, path, None if "imu" in drifting else gyro, None if "sightings" in drifting else sensor)
+    truth = _true_body(found, signals, path)
+    gyro, sensor = None if "imu" in drifting else gyro, None if "sightings" in drifting else sensor
+    later_s = _clocks(found, signals, path, gyro, sensor, truth)
     _first_pose(found, path, seen, T_base_sensor, landmark_map)
-    _truth(found, signals, path)
+    if truth is not None:
+        truth = replace(truth, late_s=replace(truth.late_s, value=truth.late_s.value - later_s))
+        for code, text, lines, figure in _truth_lines(found, truth):
+            found.add(code, text, lines, figure, Severity.WARNING)
     return found
 
 
@@ -799,30 +804,65 @@ def turn_by(times: FloatArray, rate: FloatArray) -> FloatArray:
     return np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(times)))
 
 
-def _clocks(found: Conventions, signals: Signals, path: Path, gyro: RateFit | None, sensor: Mounting | None) -> None:
-    """Whose stamps are late, by the lags of gyro and landmarks against the wheels."""
+def _clocks(
+    found: Conventions,
+    signals: Signals,
+    path: Path,
+    gyro: RateFit | None,
+    sensor: Mounting | None,
+    truth: BodyFit | None,
+) -> float:
+    """Name whose stamps are late, by the lags of gyro, landmarks and truth against the wheels.
+
+    Two that are late alike say that it is the wheels' clock. Commands have a lag of another kind: the robot follows
+    them late.
+
+    Returns:
+        How much later the wheels' motion is now taken to be [s].
+    """
     late: dict[str, Figure] = {}
     if gyro is not None and gyro.share > _TELLS:
         late["imu"] = gyro.late_s
-    if sensor is not None and sensor.late_s.sigma < _LATE_S and _varied(path):
+    if sensor is not None and (sensor.late_s.sigma < _LATE_S or _surely_late(sensor.late_s)) and _varied(path):
         late["sightings"] = sensor.late_s
-    off = {role: lag for role, lag in late.items() if lag.off(0.0, _LATE_S)}
+    if truth is not None and truth.share > _TELLS and (truth.late_s.sigma < _LATE_S or _surely_late(truth.late_s)):
+        late["truth"] = truth.late_s
+    off = {role: lag for role, lag in late.items() if _surely_late(lag)}
+    sensors = [role for role in late if role != "truth"]
+    if not off.keys() & set(sensors):
+        found.compared += [f"{r}: {late[r].value:+.3f} ± {late[r].sigma:.3f} s late" for r in sensors]
     if not off:
-        found.compared += [f"{role}: {lag.value:+.3f} ± {lag.sigma:.3f} s late" for role, lag in late.items()]
-        return
+        return 0.0
+    of_all = _weighted(list(off.values()))
+    same = len(off) > 1 and all(abs(lag.value - of_all.value) < 0.5 * _LATE_S + 3.0 * lag.sigma for lag in off.values())
     if signals.source not in _WHEELS:
-        return  # commands: a robot follows them late, which is no clock's fault
+        if of_all.value < 0.0 or not (same or len(late) == 1):
+            return 0.0
+        delay_s = round(found.config.wheels.delay_s + of_all.value, 3)
+        text = f"The robot follows its commands {of_all.value:.3f} ± {of_all.sigma:.3f} s late, by {' and '.join(off)}"
+        found.add("commands.delay", text, {"wheels.delay_s": delay_s}, of_all, Severity.WARNING)
+        return of_all.value
     wheels = _WHEELS[signals.source]
-    same = len(off) == 2 and abs(np.diff([lag.value for lag in off.values()])[0]) < 0.5 * _LATE_S + 3.0 * max(
-        lag.sigma for lag in off.values()
-    )
     if same or (len(late) == 1 and "imu" in off and _unpunctual(signals, wheels, "imu")):
-        lag = next(iter(off.values()))
+        lag = of_all if same else off["imu"]
         _late(found, wheels, Figure(-lag.value, lag.sigma), " and ".join(off), len(late) == 1)
-        return
+        return lag.value
     for role, lag in off.items():
-        others = [wheels, *(other for other in late if other not in off)]
-        _late(found, role, lag, " and ".join(others), len(others) == 1)
+        if role != "truth":
+            others = [wheels, *(other for other in sensors if other not in off)]
+            _late(found, role, lag, " and ".join(others), len(others) == 1)
+    return 0.0
+
+
+def _surely_late(lag: Figure) -> bool:
+    return lag.off(0.0, _LATE_S)
+
+
+def _weighted(lags: Sequence[Figure]) -> Figure:
+    """Mean of lags, weighted by their information."""
+    weights = np.array([lag.sigma for lag in lags]) ** -2.0
+    mean = float(weights @ np.array([lag.value for lag in lags]) / weights.sum())
+    return Figure(mean, float(weights.sum() ** -0.5))
 
 
 def _varied(path: Path) -> bool:
@@ -882,11 +922,11 @@ def _first_pose(
 # --- the truth --------------------------------------------------------------------------------------------------------
 
 
-def _truth(found: Conventions, signals: Signals, path: Path) -> None:
-    """Axes, unit, lag and mounting of a truth; only evaluation reads it, so that poses stay right."""
+def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | None:
+    """Truth against the wheels; None: there is none, or it is of something else. Only evaluation reads a truth."""
     poses = signals.true_poses()
     if poses is None or path.length_m < 0.3:
-        return
+        return None
     section = found.config.truth
     own = poses.copy()
     own[:, 1:3] *= section.scale
@@ -897,12 +937,9 @@ def _truth(found: Conventions, signals: Signals, path: Path) -> None:
     own[:, 1:] += np.column_stack([c * x - s * y, s * x + c * y, np.full(len(own), turned)])
     if float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
         found.add("truth.no_yaw", "The truth has no yaw: only positions are compared", {}, None, Severity.NOTE)
-        return
+        return None
     fit = fit_body(path, own)
-    if fit is None or fit.misfit > 0.25:
-        return
-    for code, text, lines, figure in _truth_lines(found, fit):
-        found.add(code, text, lines, figure, Severity.WARNING)
+    return None if fit is None or fit.misfit > 0.25 else fit
 
 
 def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, dict[str, Any], Figure | None]]:
