@@ -54,6 +54,7 @@ _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _FOLLOWS = 0.5  # likewise: enough for a lag with its sigma
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
+_FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
 _SKID = 0.7  # logarithm of a turn over another: a driver may give both of them, by different tracks
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
@@ -927,6 +928,7 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
     poses = signals.true_poses()
     if poses is None or path.length_m < 0.3:
         return None
+    _frozen(found, signals, path)
     section = found.config.truth
     own = poses.copy()
     own[:, 1:3] *= section.scale
@@ -940,6 +942,19 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
         return None
     fit = fit_body(path, own)
     return None if fit is None or fit.misfit > 0.25 else fit
+
+
+def _frozen(found: Conventions, signals: Signals, path: Path) -> None:
+    """Name a truth that repeats its pose while the wheels move."""
+    rows = np.array(signals.truth)
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    repeated = np.append(False, np.abs(np.diff(rows[:, 1:], axis=0)).max(axis=1) == 0.0)
+    place = path.at(np.column_stack([rows[:, 0] - _FROZEN_S, rows[:, 0]]).ravel())[:, :2].reshape(-1, 2, 2)
+    moving = np.linalg.norm(place[:, 1] - place[:, 0], axis=1) > _FROZEN_S * _MOVES_MPS
+    share = float(repeated[moving].mean()) if moving.any() else 0.0
+    if share > _FROZEN_SHARE:
+        text = f"The truth is frozen in {100.0 * share:.0f} % of its messages while the robot moves: poses are repeated"
+        found.add("truth.frozen", text, {}, Figure(share, 0.0), Severity.NOTE)
 
 
 def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, dict[str, Any], Figure | None]]:

@@ -21,6 +21,13 @@ from fgloc.types import Event, Finding, MotionEvent, Severity, note
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}
 
+_UNREAD = {
+    "Range": "ranges without a bearing",
+    "LaserScan": "laser scans",
+    "MultiEchoLaserScan": "laser scans",
+    "PointCloud2": "point clouds",
+    "NavSatFix": "satellite fixes",
+}  # what tells where a robot is, by type of message
 _NO_PLACE = frozenset(BUILT_IN_ROLES) - {"image", "sightings"}  # roles that do not tell where in the map a robot is
 
 
@@ -91,7 +98,10 @@ def inspect_recording(
         roles=recording.roles,
         marker_ids=dict(sorted(ids.items())),
         problems=recording.problems,
-        found=tuple(note("recording", findings, Severity.WARNING)),
+        found=(
+            *note("recording", findings, Severity.WARNING),
+            *note("recording.unused", _unused(recording), Severity.NOTE),
+        ),
         notes=recording.notes,
     )
 
@@ -149,6 +159,15 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
                 recording, _base_names(config, child_frame), next(filter(None, frames), ""), needs_camera
             )
     return found
+
+
+def _unused(recording: Recording) -> list[str]:
+    """Sentences on topics that tell where the robot is, and that nothing here reads."""
+    return [
+        f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}."
+        for t in recording.topics
+        if t.count and t.role is None and (kind := t.message_type.rpartition("/")[2]) in _UNREAD
+    ]
 
 
 def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: bool) -> list[str]:

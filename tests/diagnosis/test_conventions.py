@@ -82,6 +82,8 @@ def record(folder: Path, wrong: Broken) -> Path:
             ]
             messages.append((received, lambda s=stamp, n=near, r=received: bag.range_bearing("/landmarks", s, n, r)))
         for k, stamp, received in at(20.0, wrong.truth_late):
+            if wrong.truth == "frozen" and TIMES[k] % 5.0 < 2.0:
+                k -= round(TIMES[k] % 5.0 / STEP_S)
             place, yaw = [X[k], Y[k]], YAW[k] + wrong.truth_yaw
             if wrong.truth == "ned":
                 place, yaw = place[::-1], 0.5 * math.pi - yaw
@@ -159,3 +161,16 @@ def test_what_init_writes_undoes_what_is_broken(tmp_path):
     made = first_settings(bag)
     assert {"sightings.mirrored", "imu.unit", "truth.axes", "map.unit"} <= {f.code for f in made.found}
     assert not conventions_of(bag, config_of(yaml.safe_load(made.text)))
+
+
+def test_a_truth_that_freezes_and_topics_that_nothing_reads_are_named(tmp_path):
+    bag = record(tmp_path, Broken(truth="frozen"))
+    with BagWriter(tmp_path / "more") as more:
+        for k in range(5):
+            stamp = round((START_S + k) * 1e9)
+            more.odometry("/odom", stamp, (0.1 * k, 0.0, 0.0), (0.1, 0.0))
+            more.range_reading("/ranges", stamp, 2.0, "radio")
+    frozen = [f for f in inspect_all(bag, tmp_path / "map.yaml", Config()).found if f.code == "truth.frozen"]
+    assert frozen[0].value == pytest.approx(0.4, abs=0.1)
+    unused = [f for f in inspect_all(tmp_path / "more", None, Config()).found if f.code == "recording.unused"]
+    assert [f.severity for f in unused] == [Severity.NOTE]
