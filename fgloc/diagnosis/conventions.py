@@ -331,7 +331,10 @@ def _by_hand(found: Conventions, signals: Signals, path: Path, imu_up: FloatArra
     if any(f.code in ("imu.axes", "imu.gravity") for f in trial.findings):
         return signals, path  # what turns is not what tilts
     up = _unit(imu_up) * abs(trial.config.gyro.scale)
-    found.handling = by_hand = handling(signals, trial.config, path, up)
+    by_hand = handling(signals, trial.config, path, up)
+    if sum(b - a for a, b in by_hand.spans) > 0.5 * (path.times[-1] - path.times[0]):
+        return signals, path  # no robot is in hands for most of a drive: the gyro's unit or axes are wrong
+    found.handling = by_hand
     for code, what, spans in (
         (
             "motion.held",
