@@ -166,12 +166,11 @@ def _localize(
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
     from fgloc.recording.files import find_beside
     from fgloc.runner import run
-    from fgloc.sensor_setup import resolved
 
     check_out(out)
     map_path = map_file or find_beside(bag, "map.yaml")
     with run_bar(mode) as progress:
-        return run(bag, map_path, resolved(config, map_path), mode, progress, pace=pace)
+        return run(bag, map_path, config, mode, progress, pace=pace)
 
 
 def _write(result: RunResult, bag: Path, out: Path, command: str, figures: Sequence[FigureFormat] = ()) -> Metrics:

@@ -80,12 +80,18 @@ class OdometryTrack(Track):
             return mean if both else moved
         return moved if any(moved) else mean
 
+    def _bridges(self, pose: Pose) -> bool:
+        """Whether the pose tells the motion over a long gap: it is used, it moves, and it was not begun anew."""
+        stands = pose == self._pose and self._twist is not None and any(self._twist)
+        restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*(self._pose or pose)[:2])
+        return self._mode != "twist" and not stands and not restarted
+
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
         """The constant twist from the last pose to this one; None if that cannot be known."""
         if pose is None or self._pose is None:
             return None
-        if seconds > MAX_GAP_S and math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*self._pose[:2]):
-            return None  # it may have been restarted meanwhile
+        if seconds > MAX_GAP_S and not self._bridges(pose):
+            return None
         dx, dy, dyaw = _difference(self._pose, pose)
         # Less than the slack is no jump, however short the time: stamps of receipt come in bursts.
         speed = max(math.hypot(dx, dy) - _SLACK_M, 0.0) / seconds
