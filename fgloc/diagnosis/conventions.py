@@ -46,6 +46,8 @@ _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
 _UNSURE = 0.1  # share of a scale by which it is not known
 _VARIED = 0.05  # rad/s, m/s: standard deviation of a motion that tells one time from another
+_WHEELS_OFF = 0.2  # log scale of a truth: wheels may be off by less, and a truth that is no unit is seldom off by more
+_KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
@@ -969,8 +971,16 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
     elif fit.share > 0.5 and fit.turns.value < -0.5:
         yield "truth.yaw_sign", "The truth's yaw counts clockwise although its positions do not", {}, fit.turns
         return
-    if fit.scale.off(1.0, 0.08):
-        unit = unit_of(1.0 / fit.scale.value)
+    unit = unit_of(1.0 / fit.scale.value)
+    if unit is None and abs(math.log(fit.scale.value)) < _WHEELS_OFF:
+        if fit.scale.off(1.0, _SCALE):
+            scale_v = round(found.config.wheels.scale_v * fit.scale.value, 4)
+            text = (
+                f"By the truth the robot moves {fit.scale.value:.3f} ± {fit.scale.sigma:.2g} times as far as its "
+                f"wheels say; if the truth's metres are right, wheels.scale_v is {scale_v:g}"
+            )
+            yield "wheels.scale", text, {}, fit.scale
+    elif fit.scale.off(1.0, 0.08):
         factor = 1.0 / fit.scale.value if unit is None else unit[0]
         named = f" (it is in {unit[1]})" if unit is not None else ""
         yield (
@@ -988,10 +998,10 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
             {"recording.stamp_offset_s": {"truth": round(given - fit.late_s.value, 3)}},
             fit.late_s,
         )
-    if fit.share < 0.3:
+    if fit.share < 0.3 and fit.yaw.sigma > _KNOWN_YAW:
         return
     place = [fit.x.value, fit.y.value]
-    off_place = [f.off(0.0, 0.03) and f.sigma < 0.05 for f in (fit.x, fit.y)]
+    off_place = [f.off(0.0, 0.03) and f.sigma < 0.05 and fit.share >= 0.3 for f in (fit.x, fit.y)]
     turned = fit.yaw.off(0.0, 0.04)
     if not turned and not any(off_place):
         return
