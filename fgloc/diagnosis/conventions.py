@@ -48,6 +48,7 @@ _UNSURE = 0.1  # share of a scale by which it is not known
 _VARIED = 0.05  # rad/s, m/s: standard deviation of a motion that tells one time from another
 _WHEELS_OFF = 0.2  # log scale of a truth: wheels may be off by less, and a truth that is no unit is seldom off by more
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
+_ASIDE = 0.1  # share of the way that is sideways: the lateral part of a turn about a sensor is less
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
@@ -189,10 +190,15 @@ def _odometry(found: Conventions, signals: Signals) -> None:
     middle = 0.5 * (yaw[span:] + yaw[:-span])
     # medians: drivers that differentiate a pose report spikes where its yaw wraps or its stamps jitter
     twists = np.median(np.lib.stride_tricks.sliding_window_view(rows[:-1, 4:7], span, axis=0), axis=2).T
-    used = found.config.wheels.source in ("auto", "twist") and found.config.wheels.track is None
-    grave = Severity.ERROR if used else Severity.NOTE
+    source = found.config.wheels.source
+    grave = Severity.ERROR if source == "twist" else Severity.WARNING if source == "auto" else Severity.NOTE
     _twist_speed(found, (moved / dt)[whole], middle[whole], (twists[0] + 1j * twists[1])[whole], grave)
     _twist_rate(found, (turned / dt)[whole], twists[2][whole], moved[whole], middle[whole], grave)
+    body = (moved * np.exp(-1j * middle) / dt)[whole]
+    aside, most = float(np.abs(body.imag).sum()), float(np.abs(body).sum())
+    if aside > _ASIDE * most and np.ptp(twists[1]) > 0.0 and np.corrcoef(body.imag, twists[1][whole])[0, 1] > _TELLS:
+        text = f"The robot moves sideways too ({100.0 * aside / most:.0f} % of its way): mecanum or omni wheels"
+        found.add("odometry.sideways", text, {}, None, Severity.NOTE)
 
 
 def _twist_speed(
@@ -234,7 +240,7 @@ def _twist_speed(
         text, lines = "The odometry's twist is turned against its pose's motion", {"wheels.source": "pose"}
     elif unit is not None:
         text = f"The odometry's speeds are in {unit[1]}: they are {abs(c):.4g} times the change of its pose"
-        lines = {"wheels.scale_v": round(unit[0] * found.config.wheels.scale_v, 7)}
+        lines = _of_twist(found, {"wheels.scale_v": round(unit[0] * found.config.wheels.scale_v, 7)})
     else:
         text = f"The odometry's speeds are {abs(c):.3g} times the change of its pose"
         lines = {"wheels.source": "pose"}
@@ -264,9 +270,14 @@ def _twist_rate(
         else:
             found.add("odometry.yaw_sign", f"{text}, whose own path contradicts that yaw", {}, Figure(c, 0.0), grave)
     elif abs(math.log(abs(c) * math.pi / 180.0)) < 0.2:
-        lines = {"wheels.scale_omega": round(math.pi / 180.0 * found.config.wheels.scale_omega, 7)}
+        lines = _of_twist(found, {"wheels.scale_omega": round(math.pi / 180.0 * found.config.wheels.scale_omega, 7)})
         text = f"The odometry's yaw rate is in degrees: it is {c:.3g} times the change of its pose's yaw"
         found.add("odometry.yaw_unit", text, lines, Figure(1.0 / c, 0.0), grave)
+
+
+def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
+    """Lines that undo what is wrong with the twist alone: those given if the twist has to be used, else the pose is."""
+    return lines if found.config.wheels.source == "twist" else {"wheels.source": "pose"}
 
 
 def _complex_slope(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> complex:

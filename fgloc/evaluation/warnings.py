@@ -62,9 +62,11 @@ def _dropped(result: RunResult, rejections: Mapping[str, int], keyframes: int) -
         received = keyframes if sensor in ("image", "sightings") else most
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
             reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
+            too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
+            unit = " Angles that change so fast are ticks or degrees, not radians." if 2 * too_fast > count else ""
             yield Finding(
                 f"{sensor}.dropped",
-                f"{count} messages of {sensor} were dropped ({reasons}); look at {_SETTINGS[sensor]}.",
+                f"{count} messages of {sensor} were dropped ({reasons}); look at {_SETTINGS[sensor]}.{unit}",
                 Severity.WARNING,
                 value=float(count),
             )
