@@ -17,7 +17,7 @@ import typer
 from fgloc.cli.extras import need
 from fgloc.cli.options import Bag, ModelOption, configured
 from fgloc.cli.progress import run_bar
-from fgloc.cli.terminal import columns, say
+from fgloc.cli.terminal import EXIT_LOST, columns, say, say_remark
 from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def live(
         finally:
             node.close()
         say(_summary(node, time.monotonic() - began))
+        _exit_if_wrong(node)
 
 
 def play(
@@ -200,6 +201,19 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
         raise ConfigError(f"--initial-pose {text}: expected x, y [m] and yaw [rad], such as 1.5,-0.2,3.14") from None
     estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
     return config.model_copy(update={"estimator": estimator})
+
+
+def _exit_if_wrong(node: Node) -> None:
+    """Say again what makes the poses wrong, and end with the code of a run that is not to be trusted."""
+    from fgloc.types import Severity
+
+    findings = () if node.live is None else node.live.status().findings
+    wrong = [f.text for f in findings if f.severity is Severity.ERROR]
+    for text in wrong:
+        say_remark("error", text, err=True)
+    if wrong:
+        say("not to be trusted, for the reason that is named first", err=True)
+        raise typer.Exit(EXIT_LOST)
 
 
 def _summary(node: Node, seconds: float) -> str:

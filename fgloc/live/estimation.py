@@ -20,6 +20,7 @@ from fgloc.live.status import LiveStatus
 from fgloc.types import Camera, Event, LandmarkMap
 
 _SAVE_EVERY_S = 1.0
+_COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +53,7 @@ class Estimation:
         self._saver = threading.Thread(target=self._save_regularly, name="fgloc-state", daemon=True)
         if self._state is not None:
             self._saver.start()
+        threading.Thread(target=self._compare_regularly, name="fgloc-diagnosis", daemon=True).start()
 
     def put(self, events: Iterable[Event]) -> None:
         """Queue events.
@@ -78,7 +80,7 @@ class Estimation:
         """How it fares, but for what is known of topics where they are received."""
         run, engine = self.run, self._engine
         with engine.busy:
-            newest, rejections, notes = run.newest, run.rejections, run.notes()
+            newest, rejections, findings = run.newest, run.rejections, run.findings()
             keyframes, running, waiting = run.keyframes, run.parts is not None, run.facts.waiting_for()
             reordering_s = run.reordering_s
         with engine.changed:
@@ -97,7 +99,8 @@ class Estimation:
                 dropped=dict(engine.dropped + Counter({"image": worker.dropped})),
                 rejections=dict(sorted(rejections.items())),
                 waiting_for=waiting,
-                notes=tuple(dict.fromkeys((*engine.notes, *notes))),
+                notes=tuple(dict.fromkeys((*engine.notes, *(f.text for f in findings)))),
+                findings=findings,
             )
 
     def save(self, path: Path) -> bool:
@@ -117,6 +120,14 @@ class Estimation:
     def _note(self, text: str) -> None:
         with self._engine.changed:
             self._engine.notes.setdefault(text)
+
+    def _compare_regularly(self) -> None:
+        """Compare signals beside the estimation, which goes on meanwhile."""
+        while self._engine.pause(_COMPARE_EVERY_S):
+            with self._engine.busy:
+                comparison = self.run.comparison()
+            if comparison is not None:
+                comparison()
 
     def _save_regularly(self) -> None:
         while self._engine.pause(_SAVE_EVERY_S):

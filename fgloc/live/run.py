@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -24,9 +24,20 @@ from fgloc.live.state import (
     matrix3,
     row3,
 )
-from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Mode, MotionEvent, SightingsEvent, Step
-
-_TOLD_EVERY_S = 5.0  # the diagnosis is asked no more often: what it pools changes slowly
+from fgloc.types import (
+    Estimate,
+    Event,
+    Finding,
+    FloatArray,
+    LandmarkMap,
+    Mode,
+    MotionEvent,
+    Severity,
+    SightingsEvent,
+    Step,
+    note,
+    ordered,
+)
 
 
 class OnlineRun:
@@ -71,8 +82,6 @@ class OnlineRun:
         self._fastest = (0.0, 0.0)
         self._past_rejections: Counter[str] = Counter()
         self._notes: list[str] = []
-        self._told: tuple[str, ...] = ()
-        self._told_s = -np.inf
 
     def build(self) -> Assembly:
         """Build the parts, or build them again with what is known now.
@@ -98,7 +107,12 @@ class OnlineRun:
     def check(self, event: Event) -> Event | None:
         """Through the gate: the event, a repaired copy, or None."""
         assert self.parts is not None
-        return self.parts.gate.check(event)
+        passed = self.parts.gate.check(event)
+        in_pixels = isinstance(event, SightingsEvent) and event.in_pixels
+        seen = passed if in_pixels else event
+        if seen is not None:
+            self.parts.diagnosis.add(seen)
+        return passed
 
     def use(self, event: Event, detected: bool = False) -> Iterator[tuple[Step, Estimate | None]]:
         """Take the next event in order; ``detected``: markers found in an image that has passed the gate."""
@@ -108,9 +122,9 @@ class OnlineRun:
             if passed is None:
                 return
             event = passed
+            self.parts.diagnosis.add(event)
         if isinstance(event, MotionEvent) and event.odometer is not None:
             self._odometry = event
-        self.parts.diagnosis.add(event)
         for step in self.parts.stepper.push(event):
             self.reordering_s = (self.parts.stepper.newest_ns - step.stamp_ns) * 1e-9
             yield step, self._update(step)
@@ -145,7 +159,9 @@ class OnlineRun:
     def _diagnose(self, step: Step) -> None:
         """After the estimate was handed out: whoever waits for it does not wait for this."""
         assert self.parts is not None
-        self.parts.diagnosis.observe(step, self.parts.localizer.motion.is_carried)
+        measured = self.parts.wheels.measure(step)
+        motion = None if measured is None else measured.motion
+        self.parts.diagnosis.observe(step, self.parts.localizer.motion.is_carried, motion)
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
         """To propagate the newest estimate from; ask before the next event is used."""
@@ -201,17 +217,24 @@ class OnlineRun:
         """Everything refused so far, by reason."""
         return self._past_rejections + (Counter() if self.parts is None else self.parts.rejections)
 
-    def notes(self) -> tuple[str, ...]:
-        """What is wrong, in the sentences of the reports."""
+    def comparison(self) -> Callable[[], None] | None:
+        """A comparison of the signals so far, which takes a second or two and any thread may make; None: not due."""
+        return None if self.parts is None else self.parts.diagnosis.comparison()
+
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong, the gravest first; those without a code of their own are sentences of the parts."""
         if self.parts is None:
-            return tuple(self._notes)
-        now = time.monotonic()
-        if now - self._told_s > _TOLD_EVERY_S:
-            diagnosis = self.parts.diagnosis
-            watched = self.parts.sanity.watch.sentence
-            told = (*diagnosis.mistakes, *(f.text for f in diagnosis.findings(ended=False)))
-            self._told, self._told_s = (told if watched is None else (watched, *told)), now
-        return (*self._notes, *self._told, *self.parts.sentences)
+            return tuple(note("run", self._notes))
+        diagnosis = self.parts.diagnosis
+        return ordered(
+            [
+                *note("run", self._notes),
+                *self.parts.sanity.watch.findings(),
+                *note("floor.uneven", diagnosis.mistakes, Severity.ERROR),
+                *diagnosis.found,
+                *note("run", self.parts.sentences),
+            ]
+        )
 
 
 def _body_cov(estimate: Estimate) -> FloatArray:

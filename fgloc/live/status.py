@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fgloc.types import FloatArray, Ground, Mode
+from fgloc.types import Finding, FloatArray, Ground, Mode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +48,7 @@ class LiveStatus:
     rejections: Mapping[str, int] = field(default_factory=dict)  # by "sensor.reason", as in reports
     waiting_for: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # what is wrong, one sentence each
+    findings: tuple[Finding, ...] = ()  # of sensors, settings and estimate; their sentences are notes too
 
 
 class TopicMeter:

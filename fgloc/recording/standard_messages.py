@@ -80,10 +80,12 @@ def path(stamps_ns: Iterable[int], poses: Iterable[FloatArray], stamp_ns: int) -
     return {"header": header(stamp_ns, MAP_FRAME), "poses": stamped}
 
 
-def diagnostics(stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str]) -> Message:
-    """diagnostic_msgs/DiagnosticArray; ``mode`` None: there is no pose yet."""
+def diagnostics(
+    stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool = False
+) -> Message:
+    """diagnostic_msgs/DiagnosticArray; ``mode`` None: there is no pose yet; ``wrong``: it is not to be trusted."""
     status = {
-        "level": STALE if mode is None else _LEVEL[mode],
+        "level": _LEVEL[Mode.LOST] if wrong else STALE if mode is None else _LEVEL[mode],
         "name": "fgloc: localization",
         "message": message,
         "hardware_id": "fgloc",

@@ -23,7 +23,7 @@ from fgloc.live.wire.participant import Participant, Sample
 from fgloc.live.wire.recent import RecentPoses
 from fgloc.live.wire.teller import Teller
 from fgloc.recording.standard_messages import MAP_FRAME
-from fgloc.types import Estimate, Event, LandmarkMap
+from fgloc.types import Estimate, Event, LandmarkMap, Severity
 
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
 _ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most of the work; between, the speed is held
@@ -219,7 +219,8 @@ class Node:
     def _diagnose(self, status: LiveStatus | None) -> None:
         mode = None if status is None else status.mode
         message, values = described(status)
-        self._outputs.diagnostics(self._clock.now_ns(), mode, message, values)
+        wrong = status is not None and any(f.severity is Severity.ERROR for f in status.findings)
+        self._outputs.diagnostics(self._clock.now_ns(), mode, message, values, wrong)
         self.published["diagnostics"] += 1
 
 
@@ -235,6 +236,7 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
         values[f"{of.role} delay [s]"] = f"{of.delay_s:z.3f}"
     values |= {f"dropped {role}": str(n) for role, n in status.dropped.items()}
     values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
+    values |= {f"{f.severity.name.lower()} {f.code}": f.text for f in status.findings if f.severity > Severity.NOTE}
     values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}
     if status.mode is not None:
         return str(status.mode), values

@@ -62,9 +62,11 @@ class Outputs:
         """Publish ``T_map_child (3,)`` on /tf."""
         self._write("/tf", standard.transform(stamp_ns, T_map_child, child_frame))
 
-    def diagnostics(self, stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str]) -> None:
-        """Publish the state; ``mode`` None: there is no pose yet."""
-        self._write("/diagnostics", standard.diagnostics(stamp_ns, mode, message, values))
+    def diagnostics(
+        self, stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool
+    ) -> None:
+        """Publish the state; arguments as `standard_messages.diagnostics` has them."""
+        self._write("/diagnostics", standard.diagnostics(stamp_ns, mode, message, values, wrong))
 
     def map(self, landmarks: LandmarkMap) -> None:
         """Publish the map, once: late subscribers get it too."""

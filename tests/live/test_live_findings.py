@@ -1,0 +1,141 @@
+"""What a live run says of its sensors and of its own estimate while it goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import typer
+from live_feed import ROLES, feed
+from robot_world import SIGMA_BEARING, SIGMA_RANGE, START_NS, World, beacons, config, polar
+
+from fgloc import se2
+from fgloc.cli.live import _exit_if_wrong
+from fgloc.cli.terminal import EXIT_LOST
+from fgloc.diagnosis.diagnosis import Diagnosis
+from fgloc.frames import yaw_quaternion
+from fgloc.live import Live
+from fgloc.live.status import LiveStatus
+from fgloc.live.wire.node import described
+from fgloc.localizer import Localizer
+from fgloc.recording.standard_messages import diagnostics
+from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Finding, Mode, Severity, SightingsEvent, Step
+
+PATIENCE_S = 30.0
+
+
+def swerving(stands_s: float = 0.0, seconds: float = 18.0):
+    """Odometry at 20 Hz and sightings at 10 Hz of a robot that stands, then drives, turning either way."""
+    rng, pose, made = np.random.default_rng(2), np.zeros(3), []
+    for tick in range(round((stands_s + seconds) * 20)):
+        t = 0.05 * tick - stands_s
+        v, omega = (0.0, 0.0) if t < 0.0 else (0.3 + 0.2 * np.sin(0.9 * t), 0.25 + 0.5 * np.sin(0.6 * t))
+        stamp = START_NS + tick * 50_000_000
+        twist = np.array([v, 0.0, 0.0]), np.array([0.0, 0.0, omega])
+        place = np.append(pose[:2], 0.0), yaw_quaternion(pose[2]), np.zeros((6, 6))
+        made.append(OdometryEvent(stamp, stamp, "/odom", "odom", "base_link", *place, *twist, np.zeros((6, 6))))
+        if tick % 2 == 0:
+            seen = [(i, *polar(pose, landmark)) for i, landmark in beacons().landmarks.items()]
+            noise = rng.normal(0.0, (SIGMA_RANGE, SIGMA_BEARING), (len(seen), 2))
+            found = [RangeBearing(i, r + n, se2.wrap(b + m)) for (i, r, b), (n, m) in zip(seen, noise, strict=True)]
+            made.append(RangeBearingEvent(stamp, stamp, "/landmarks", "base_link", tuple(found)))
+        pose = se2.compose(pose, se2.exp((0.05 * v, 0.0, 0.05 * omega)))
+    return made
+
+
+def mirrored(event):
+    """Bearings that count to the right."""
+    if not isinstance(event, SightingsEvent):
+        return event
+    seen = tuple(dataclasses.replace(s, bearing_rad=-s.bearing_rad) for s in event.sightings)
+    return dataclasses.replace(event, sightings=seen)
+
+
+def named(live, code: str) -> Finding | None:
+    """A finding of a live run, waited for."""
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        for finding in live.status().findings:
+            if finding.code == code:
+                return finding
+        time.sleep(0.1)
+    return None
+
+
+def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most():
+    stands_s = 21.0  # a comparison while it stands tells nothing, and the next by time alone comes after 40 s
+    diagnosis = Diagnosis(config(), beacons(), None, None, None)
+    made = swerving(stands_s, 16.0)
+    for k, event in enumerate(map(mirrored, made)):
+        diagnosis.add(event)
+        if isinstance(event, OdometryEvent):
+            step = Step(k, 0, event.stamp_ns - 50_000_000, event.stamp_ns)
+            motion = 0.05 * np.array([event.linear[0], 0.0, event.angular[2]])
+            diagnosis.observe(step, motion=motion)
+            if diagnosis.findings(ended=False):
+                break
+    assert [f.code for f in diagnosis.found] == ["sightings.mirrored"]
+    assert stands_s < (event.stamp_ns - START_NS) * 1e-9 < stands_s + 20.0
+
+
+def test_a_mirrored_sensor_is_named_live():
+    with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
+        made = [mirrored(event) for event in swerving()]
+        feed(live, made[: len(made) // 2])
+        time.sleep(4.0)  # it is compared meanwhile; what little motion says has to be said twice
+        feed(live, made[len(made) // 2 :])
+        finding = named(live, "sightings.mirrored")
+        status = live.status()
+    assert finding is not None
+    assert finding.severity is Severity.ERROR
+    assert finding.lines
+    assert status.findings[0].severity is Severity.ERROR
+    assert finding.text in status.notes
+
+
+def test_a_sound_live_run_has_nothing_to_say():
+    with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
+        feed(live, swerving())
+        time.sleep(3.0)
+        findings = live.status().findings
+    assert not [f for f in findings if f.severity is not Severity.NOTE]
+
+
+def test_a_live_estimate_that_runs_away_is_replaced_by_odometry_and_named(monkeypatch):
+    update = Localizer.update
+
+    def broken(self, step):
+        estimate = update(self, step)
+        late = estimate is not None and step.stamp_ns > START_NS + 8_000_000_000
+        return dataclasses.replace(estimate, pose=estimate.pose + np.array([1e6, 0.0, 0.0])) if late else estimate
+
+    monkeypatch.setattr(Localizer, "update", broken)
+    world = World(beacons(), seconds=15.0)
+    with Live(config(), None, roles=ROLES) as live:
+        made = feed(live, world.events())
+        findings = live.status().findings
+    assert "sanity.odometry" in {f.code for f in findings}
+    assert made[-1].mode is Mode.DEAD_RECKONING
+    assert np.hypot(*made[-1].pose[:2]) < 10.0
+
+
+@pytest.mark.parametrize("severity", list(Severity))
+def test_an_error_is_in_the_level_of_the_diagnostics_and_in_the_exit_code(severity):
+    status = LiveStatus(mode=Mode.OK, findings=(Finding("sightings.mirrored", "It is mirrored.", severity),))
+    _, values = described(status)
+    assert any("sightings.mirrored" in key for key in values) == (severity is not Severity.NOTE)
+    node = SimpleNamespace(live=SimpleNamespace(status=lambda: status))
+    if severity is Severity.ERROR:
+        with pytest.raises(typer.Exit) as ended:
+            _exit_if_wrong(node)
+        assert ended.value.exit_code == EXIT_LOST
+    else:
+        _exit_if_wrong(node)
+    wrong = severity is Severity.ERROR
+    levels = [diagnostics(0, Mode.OK, "", {}, w)["status"][0]["level"] for w in (False, wrong)]
+    assert (levels[0] != levels[1]) == wrong
