@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +34,18 @@ from fgloc.types import (
 _OPTICAL_TO_BODY = np.array(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 )  # optical axes in body axes (REP 103)
+
+_ESTIMATED = {  # uncertainties of what is estimated of a sensor of landmarks on a known map
+    "landmarks": ("range_scale_sigma", "bearing_bias_sigma_rad", "time_offset_sigma_s"),
+    "camera": (
+        "position_sigma_m",
+        "rotation_sigma_rad",
+        "focal_sigma",
+        "principal_sigma_px",
+        "distortion_sigma",
+        "time_offset_sigma_s",
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +116,7 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     if sensors and landmark_map is None:
         landmark_map = _no_landmarks(facts, sensors)
     if landmark_map is None and {"image", "sightings"} & set(facts.roles):
+        notes += _without_effect(config, "landmarks" if camera is None else "camera")
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
@@ -118,6 +131,19 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     return SensorSetup(
         config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, T_base_imu, sensors, tuple(notes)
     )
+
+
+def _without_effect(config: Config, section: str) -> Iterator[str]:
+    """A sentence on the uncertainties of a sensor of landmarks that were given, where there is no map."""
+    part = getattr(config, section)
+    given = [key for key in _ESTIMATED[section] if key in part.model_fields_set and getattr(part, key) > 0.0]
+    if given:
+        keys = ", ".join(f"{section}.{key}" for key in given)
+        yield (
+            f"Without a map {keys} has no effect: the sensor's constants are taken as they are configured, because "
+            "landmarks that are estimated with them could be off alike. Build a map with `fgloc map`, then they are "
+            "estimated."
+        )
 
 
 def _need_motion(facts: StreamFacts) -> None:

@@ -273,6 +273,16 @@ def test_a_sound_run_has_the_figures_of_odometry_alone_and_no_finding(tmp_path):
     assert compute_metrics(result, config).odometry.ate_rmse_m < 0.05
 
 
+@pytest.mark.parametrize("key", ["range_scale_sigma", "bearing_bias_sigma_rad", "time_offset_sigma_s"])
+def test_an_uncertainty_without_effect_is_said(tmp_path, key):
+    path, said = bag(tmp_path, 100), {}
+    for given in (0.2, 0.0, None):
+        config = Config.model_validate({} if given is None else {"landmarks": {key: given}})
+        result = run(path, None, config, "online", check=False)
+        said[given] = any(f"landmarks.{key}" in f.text for f in result.findings)
+    assert said == {0.2: True, 0.0: False, None: False}
+
+
 # --- bad input: a sentence or figures that mean something, never others ---
 
 
