@@ -142,7 +142,8 @@ def conventions(
     later_s = _clocks(found, signals, path, gyro, sensor, truth)
     _first_pose(found, path, seen, T_base_sensor, landmark_map)
     if truth is not None:
-        truth = replace(truth, late_s=replace(truth.late_s, value=truth.late_s.value - later_s))
+        late_s = replace(truth.late_s, value=truth.late_s.value - later_s)
+        truth = replace(truth, late_s=late_s if _varied(path) else Figure(0.0, math.inf))
         for code, text, lines, figure in _truth_lines(found, truth):
             found.add(code, text, lines, figure, Severity.WARNING)
     return found
@@ -842,7 +843,12 @@ def _clocks(
         late["imu"] = gyro.late_s
     if sensor is not None and (sensor.late_s.sigma < _LATE_S or _surely_late(sensor.late_s)) and _varied(path):
         late["sightings"] = sensor.late_s
-    if truth is not None and truth.share > _TELLS and (truth.late_s.sigma < _LATE_S or _surely_late(truth.late_s)):
+    if (
+        truth is not None
+        and truth.share > _TELLS
+        and _varied(path)
+        and (truth.late_s.sigma < _LATE_S or _surely_late(truth.late_s))
+    ):
         late["truth"] = truth.late_s
     off = {role: lag for role, lag in late.items() if _surely_late(lag)}
     sensors = [role for role in late if role != "truth"]
@@ -885,6 +891,9 @@ def _weighted(lags: Sequence[Figure]) -> Figure:
 def _varied(path: Path) -> bool:
     """Whether speed or yaw rate vary: otherwise a lag and a turn of the sensor are the same."""
     at = np.arange(path.times[0] + 0.5, path.times[-1] - 0.5, 0.5)
+    at = at[path.known(at - 0.5, at + 0.5)]
+    if len(at) < 2:
+        return False
     speed = np.hypot(*(path.at(at + 0.5) - path.at(at - 0.5))[:, :2].T)
     return max(float(np.std(path.yaw_rate(at, 0.5))), float(np.nanstd(speed))) > _VARIED
 

@@ -175,7 +175,9 @@ def test_fault_19_commands_are_followed_late_and_that_is_no_clock():
         else e
         for e in events(beacons(), late=DELTA)
     ]
-    assert not diagnose(made, beacons(), settings=config(wheels={"source": "command"}))
+    found = diagnose(made, beacons(), settings=config(wheels={"source": "command"}))
+    assert set(found) == {"commands.delay"}
+    assert found["commands.delay"].value == pytest.approx(DELTA, abs=0.03)  # a command holds until the next one
 
 
 @pytest.mark.parametrize("kind", ["corners", "beacons"])

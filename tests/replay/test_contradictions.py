@@ -101,5 +101,4 @@ def test_a_batch_without_a_map_never_runs_away():
     result = run(real_data("pioneer_aruco", "duarte.bag"), None, settings, "batch", check=False)
     assert np.hypot(*result.trajectory.poses[:, :2].T).max() < 30.0
     assert not beyond(result)
-    (finding,) = contradictions(result)
-    assert not finding.lines
+    assert not any(finding.lines for finding in contradictions(result))

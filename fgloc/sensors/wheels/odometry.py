@@ -19,6 +19,7 @@ _CHECK_TURN, _CHECK_PATH = 0.5, 5.0  # rad or m of motion after which twist and 
 _CHECK_HEADING = 0.5  # m of motion after which the pose's heading is held against the direction of its motion
 _HEADING_RAD = 0.03  # of a pose's heading off its motion's direction: no offset of two clocks or axles makes more
 _STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
+_BRIDGED_M, _BRIDGED_RAD = 0.5, 0.5  # over a long gap a motion of less is told by its ends
 _BEGINS_M = 0.5  # from its origin: there an odometry is that was started just now
 _SLACK_M, _SLACK_RAD = 0.03, 0.1
 _DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
@@ -81,10 +82,16 @@ class OdometryTrack(Track):
         return moved if any(moved) else mean
 
     def _bridges(self, pose: Pose) -> bool:
-        """Whether the pose tells the motion over a long gap: it is used, it moves, and it was not begun anew."""
-        stands = pose == self._pose and self._twist is not None and any(self._twist)
-        restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*(self._pose or pose)[:2])
-        return self._mode != "twist" and not stands and not restarted
+        """Whether the pose tells the motion over a long gap: it is used, it moves little, and it was not begun anew.
+
+        Where it moved far only the end is known, and what is seen meanwhile would contradict a way made up between.
+        """
+        before = self._pose or pose
+        stands = pose == before and self._twist is not None and any(self._twist)
+        restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
+        dx, dy, dyaw = _difference(before, pose)
+        little = math.hypot(dx, dy) < _BRIDGED_M and abs(dyaw) < _BRIDGED_RAD
+        return self._mode != "twist" and little and not stands and not restarted
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
         """The constant twist from the last pose to this one; None if that cannot be known."""
