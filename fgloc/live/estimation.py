@@ -53,7 +53,8 @@ class Estimation:
         self._saver = threading.Thread(target=self._save_regularly, name="fgloc-state", daemon=True)
         if self._state is not None:
             self._saver.start()
-        threading.Thread(target=self._compare_regularly, name="fgloc-diagnosis", daemon=True).start()
+        self._comparer = threading.Thread(target=self._compare_regularly, name="fgloc-diagnosis", daemon=True)
+        self._comparer.start()
 
     def put(self, events: Iterable[Event]) -> None:
         """Queue events.
@@ -113,7 +114,10 @@ class Estimation:
 
     def close(self) -> None:
         """As `Live.close`."""
-        if self._engine.close() and self._state is not None:
+        if not self._engine.close():
+            return
+        self._comparer.join()
+        if self._state is not None:
             self._saver.join()
             self.save(self._state)
 
