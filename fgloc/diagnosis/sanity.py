@@ -213,6 +213,10 @@ class Sanity:
         away = [] if estimate is None else list(self._away(step, estimate, seen))
         return self.watch.checked(step, measured, joined, estimate, away)
 
+    def begin_anew(self) -> None:
+        """Take the next pose as it is: it was given, and the odometry does not lead there."""
+        self._segment = -1
+
     def _sightings(self, step: Step) -> Iterator[tuple[int, int, FloatArray, float]]:
         """Stamp, landmark, place in the base frame and sigma [m] of the sightings that are compared."""
         for event in step.sightings:

@@ -142,6 +142,7 @@ class OnlineRun:
         assert parts is not None
         if self._reset is not None:
             parts.localizer.restart_at(self._reset)
+            parts.sanity.begin_anew()
         elif self._resumed is not None:
             belief, note = carried_over(self._resumed, step, self._config, time.time_ns())
             self._notes = [note]
