@@ -111,10 +111,9 @@ def _noise_lines(noise: Noise) -> dict[str, list[str]]:
     if wide:
         lines += ["  # Noise that the wheels' motion leaves unexplained."]
         lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
-    lines += [
-        "  # Nobody has calibrated this sensor: it may be off by more than a measured installation is (the defaults)."
-    ]
-    lines += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
+    if noise.map_m is not None:  # without a map these constants are not estimated
+        lines += ["  # Nobody has calibrated this sensor: it may be off by more than a measured one (the defaults)."]
+        lines += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
     blocks = {"landmarks": lines}
     if noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
         about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."
