@@ -40,11 +40,11 @@ def compose(a: Triple, b: Triple) -> FloatArray:
 
 
 def compose_array(a: FloatArray, b: FloatArray) -> FloatArray:
-    """`compose` of poses ``(n, 3)`` with others."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    x = a[:, 0] + c * b[:, 0] - s * b[:, 1]
-    y = a[:, 1] + s * b[:, 0] + c * b[:, 1]
-    return np.stack([x, y, wrap_array(a[:, 2] + b[:, 2])], axis=1)
+    """`compose` of poses ``(n, 3)`` with others; either may be one pose ``(3,)``."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap_array(a[..., 2] + b[..., 2])], axis=-1)
 
 
 def inverse(a: Triple) -> FloatArray:
@@ -57,6 +57,12 @@ def inverse(a: Triple) -> FloatArray:
 def between(a: Triple, b: Triple) -> FloatArray:
     """``T_a⁻¹ ∘ T_b``: b seen from a."""
     return compose(inverse(a), b)
+
+
+def between_array(a: FloatArray, b: FloatArray) -> FloatArray:
+    """`between` of poses ``(n, 3)`` and others."""
+    moved = turned(b[:, :2] - a[:, :2], -a[:, 2])
+    return np.column_stack([moved, wrap_array(b[:, 2] - a[:, 2])])
 
 
 def exp(twist: Triple) -> FloatArray:
@@ -127,20 +133,30 @@ def interpolate(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: NDArray[
     )
 
 
-def rigid(source: FloatArray, target: FloatArray, weights: FloatArray, spread_m: float = 0.4) -> FloatArray | None:
-    """Pose ``(3,)`` that takes points ``(n, 2)`` to others, by least squares.
+def rigid(source: FloatArray, target: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """Pose ``(3,)`` that takes points ``(n, 2)`` to others, by weighted least squares.
 
-    Returns:
-        None where the targets' standard deviation is below ``spread_m``: they do not determine a direction.
-
-    Source: Arun, Huang, Blostein, "Least-squares fitting of two 3-D point sets", PAMI 9(5), 1987, in the plane.
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without
+    scale; in the plane the rotation has a closed form.
     """
-    share = weights / weights.sum()
+    share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     a, b = source - share @ source, target - share @ target
-    if float(share @ (b**2).sum(axis=1)) < spread_m**2:
-        return None
     yaw = math.atan2(share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), share @ (a * b).sum(axis=1))
     return np.append(share @ target - turned(share @ source, yaw), yaw)
+
+
+def rigid_if_spread(
+    source: FloatArray, target: FloatArray, weights: FloatArray | None = None, spread_m: float = 0.4
+) -> FloatArray | None:
+    """`rigid`; None where the targets' standard deviation is below ``spread_m``: they do not determine a direction."""
+    if len(target) < 2 or float(target.var(axis=0).sum()) < spread_m**2:
+        return None
+    return rigid(source, target, weights)
+
+
+def placed(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Points ``(n, 2)`` of the bodies' frames in the frame of their poses ``(n, 3)`` or ``(3,)``."""
+    return np.asarray(poses[..., :2] + turned(points, poses[..., 2]))
 
 
 def turned(points: FloatArray, yaw: FloatArray | float) -> FloatArray:

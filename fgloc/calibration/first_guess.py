@@ -135,7 +135,7 @@ def _fits(pose: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _from_points(a: FloatArray, b: FloatArray) -> FloatArray | None:
     """Least squares over the places alone; None where they are nearly one point."""
-    return se2.rigid(b[:, :2, 3], a[:, :2, 3], np.ones(len(a)), _SPREAD_M) if len(a) > 1 else None
+    return se2.rigid_if_spread(b[:, :2, 3], a[:, :2, 3], spread_m=_SPREAD_M)
 
 
 def _planar(T: FloatArray) -> FloatArray:

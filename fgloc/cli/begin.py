@@ -20,7 +20,10 @@ def init(
     ] = Path("robot.yaml"),
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning."""
+    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning.
+
+    Exit code 1: no topic of it measures motion.
+    """
     check_out(out, folder=False)
     if out.exists() and not force:
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
@@ -40,6 +43,8 @@ def init(
         warn(sentence)
     say(f"configuration: {out}")
     next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
+    if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
+        raise typer.Exit(1)  # no run is possible
     if not {"image", "sightings"} & found.roles.keys():
         return  # nothing to survey, or to calibrate on
     beside = find_beside(bag, "map.yaml")

@@ -936,9 +936,9 @@ def _first_pose(
     use &= path.known(np.full(len(seen.times), path.times[0]), seen.times)
     place = np.zeros(2) if T_base_sensor is None else T_base_sensor[:2, 3]
     at = path.at(seen.times[use])
-    points = at[:, :2] + se2.turned(as_given.points[use, :2] + place, at[:, 2])
+    points = se2.placed(at, as_given.points[use, :2] + place)
     places = np.array([landmark_map.landmarks[int(i)].position[:2] for i in seen.ids[use]]).reshape(-1, 2)
-    started = se2.rigid(points, places, np.ones(len(points))) if len(points) > 3 else None
+    started = se2.rigid_if_spread(points, places) if len(points) > 3 else None
     sentence = None if started is None else first_pose_sentence(found.config, started)
     if sentence is not None:
         found.findings.append(Finding("frame.first_pose", sentence, Severity.ERROR))

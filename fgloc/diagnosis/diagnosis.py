@@ -105,7 +105,7 @@ class Diagnosis:
         return () if sentence is None else (sentence,)
 
     def findings(self, ended: bool = True) -> tuple[Finding, ...]:
-        """What does not fit together, with its remedy.
+        """Findings: signals of the sensors that do not fit together, each with its remedy.
 
         Args:
             ended: compare all signals; otherwise only once they are many more than those compared before.

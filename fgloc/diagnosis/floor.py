@@ -57,7 +57,12 @@ class FloorWatch:
         self._looked_ns = 0
 
     def observe(self, step: Step, by_hand: bool = False) -> None:
-        """Take in a step; ``by_hand``: a person has the robot in hand, also a moment before that showed."""
+        """Collect the tilt of a step.
+
+        Args:
+            step: with its inertial measurements.
+            by_hand: a person holds the robot; the moment before that showed is discarded as well.
+        """
         if by_hand:
             if self._seconds > 0.0 and self._ups and self._by_force:
                 del self._ups[-1], self._turned[-1]

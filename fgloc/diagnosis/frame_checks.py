@@ -62,10 +62,10 @@ def truth_sentence(config: Config, truth: Sequence[TruthEvent], stamps_ns: IntAr
     path = np.column_stack([np.interp(t, (at - at[0]) * 1e-9, known[:, k]) for k in (0, 1)])
     here = poses[there, :2]
     apart = float(np.hypot(*(path - here).T).mean())
-    T = se2.rigid(path, here, np.ones(len(here)))
+    T = se2.rigid_if_spread(path, here)
     if apart < _FRAME_M or T is None:
         return None
-    left = float(np.hypot(*(se2.turned(path, T[2]) + T[:2] - here).T).mean())
+    left = float(np.hypot(*(se2.placed(T, path) - here).T).mean())
     if left > _ALIGNED * apart:
         return None
     return (

@@ -130,7 +130,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """What came of the comparison.
+    """Result of comparing an estimate with its odometry and with the textbook's pipeline.
 
     Attributes:
         findings: none where nothing is to be said.
@@ -398,7 +398,7 @@ def _percent(share: float) -> str:
 
 
 def _unsure(track: Track, ours: Comparison, odometry: Comparison) -> str | None:
-    """What leaves doubt, though not beyond doubt; None: nothing."""
+    """Sentence on an estimate that explains few sightings, or moves unlike the odometry; None: neither holds."""
     if track.landmarks is not None and ours.explained < _WELL and ours.residual > 1.0:
         return (
             f"The estimate explains {_percent(ours.explained)} of the sightings, though more than odometry alone: the "
@@ -443,12 +443,10 @@ def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: floa
     some = replace(track, stamps_ns=track.stamps_ns[kept], joined=np.ones(len(kept), dtype=np.int64))
     nearest = np.clip(np.searchsorted(some.stamps_ns, track.seen_ns), 0, len(kept) - 1)
     then = se2.interpolate(track.stamps_ns, alone, track.seen_ns)
-    places = _world(
-        np.array([se2.between(alone[kept[k]], pose) for k, pose in zip(nearest, then, strict=True)]), track.places
-    )
+    places = se2.placed(se2.between_array(alone[kept[nearest]], then), track.places)
     solved = textbook_poses(
         laid[kept],
-        _between(alone, kept[:-1], kept[1:]),
+        se2.between_array(alone[kept[:-1]], alone[kept[1:]]),
         Seen(nearest, track.ids, places, track.sigmas),
         track.landmarks,
     )
@@ -585,7 +583,7 @@ def _windows(track: Track, poses: FloatArray, odometry: FloatArray) -> list[Wind
     edges = np.unique(np.searchsorted(t, np.arange(0.0, t[-1] + 1e-6, _WINDOW_S)))
     edges = edges[edges < len(t)]
     lengths = np.hypot(track.motions[:, 0], track.motions[:, 1])
-    theirs, ours = _between(odometry, edges[:-1], edges[1:]), _between(poses, edges[:-1], edges[1:])
+    theirs, ours = (se2.between_array(path[edges[:-1]], path[edges[1:]]) for path in (odometry, poses))
     found = []
     for a, b, motion, our_motion in zip(edges[:-1], edges[1:], theirs, ours, strict=True):
         inside = slice(a + 1, b + 1)
@@ -600,16 +598,9 @@ def _windows(track: Track, poses: FloatArray, odometry: FloatArray) -> list[Wind
     return found
 
 
-def _between(poses: FloatArray, starts: IntArray, ends: IntArray) -> FloatArray:
-    """Motions ``(k, 3)`` between pairs of poses."""
-    a, d = poses[starts], poses[ends] - poses[starts]
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    return np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], se2.wrap_array(d[:, 2])])
-
-
 def _distances(track: Track, poses: FloatArray) -> FloatArray:
     """Whitened distances ``(k,)`` of the sightings from their landmarks under a trajectory."""
-    places = _world(se2.interpolate(track.stamps_ns, poses, track.seen_ns), track.places)
+    places = se2.placed(se2.interpolate(track.stamps_ns, poses, track.seen_ns), track.places)
     if track.landmarks is not None:
         known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
         where = np.array([track.landmarks[i] for i in track.ids[known].tolist()]).reshape(-1, 2)
@@ -623,12 +614,6 @@ def _distances(track: Track, poses: FloatArray) -> FloatArray:
     return np.asarray(away[np.isfinite(away)])
 
 
-def _world(poses: FloatArray, places: FloatArray) -> FloatArray:
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = poses[:, 0] + c * places[:, 0] - s * places[:, 1]
-    return np.column_stack([x, poses[:, 1] + s * places[:, 0] + c * places[:, 1]])
-
-
 def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArray:
     """The odometry's poses ``(n, 3)`` in the map's frame: by its sightings of a known map, else by the first pose.
 
@@ -637,35 +622,21 @@ def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArr
         odometry: from zero.
         first: pose of the estimate at the first keyframe.
     """
-    begun = _moved(first, odometry)
+    begun = se2.compose_array(first, odometry)
     if track.landmarks is None or len(track.ids) < _SIGHTINGS:
         return begun
     known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
     if known.sum() < _SIGHTINGS:
         return begun
     where = np.array([track.landmarks[i] for i in track.ids[known].tolist()])
-    places = _world(se2.interpolate(track.stamps_ns, odometry, track.seen_ns[known]), track.places[known])
+    places = se2.placed(se2.interpolate(track.stamps_ns, odometry, track.seen_ns[known]), track.places[known])
     T, weights = np.asarray(first, dtype=float), np.ones(len(places))
     for _ in range(_ITERATIONS):
-        T = _aligned(places, where, weights)
-        off = np.hypot(*(_moved(T, np.column_stack([places, np.zeros(len(places))]))[:, :2] - where).T)
+        T = se2.rigid(places, where, weights)
+        off = np.hypot(*(se2.placed(T, places) - where).T)
         weights = 1.0 / (1.0 + (off / _CAUCHY_M) ** 2)
-    aligned = _moved(T, odometry)
+    aligned = se2.compose_array(T, odometry)
     return min((aligned, begun), key=lambda poses: float(np.median(_distances(track, poses))))
-
-
-def _aligned(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
-    """Rigid motion ``(3,)`` between weighted points; source: Umeyama 1991, in the plane and without scale."""
-    w = weights[:, None] / weights.sum()
-    a, b = (w * source).sum(axis=0), (w * target).sum(axis=0)
-    s, t = source - a, target - b
-    turned = float((w[:, 0] * (s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])).sum())
-    yaw = math.atan2(turned, float((w * s * t).sum()))
-    return np.array([*(b - se2.compose((0.0, 0.0, yaw), (*a, 0.0))[:2]), yaw])
-
-
-def _moved(T: FloatArray, poses: FloatArray) -> FloatArray:
-    return se2.compose_array(np.broadcast_to(T, poses.shape), poses)
 
 
 # --- while a run goes on ---
@@ -759,7 +730,7 @@ class Watch:
 
     @property
     def sentence(self) -> str | None:
-        """What was found; None: nothing."""
+        """Sentence on the times at which the odometry was given in place of the estimate; None: it never was."""
         if not self._spans:
             return None
         spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans[:_SPANS_TOLD])

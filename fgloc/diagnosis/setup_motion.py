@@ -164,16 +164,16 @@ def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
 
 def laid(path: FloatArray, seen: FloatArray, places: FloatArray) -> FloatArray | None:
     """Pose ``(3,)`` of a path's start that brings what was seen from it onto the map; without the worst third."""
-    points = path[:, :2] + se2.turned(seen, path[:, 2])
+    points = se2.placed(path, seen)
     weights = 1.0 / np.maximum((seen**2).sum(axis=1), 0.01)
     place: FloatArray | None = None
     for _ in range(3):
         if len(points) < _FEWEST_POINTS:
             return None
-        place = se2.rigid(points, places, weights)
+        place = se2.rigid_if_spread(points, places, weights)
         if place is None:
             return None
-        off = se2.turned(points, place[2]) + place[:2] - places
+        off = se2.placed(place, points) - places
         distance = np.hypot(off[:, 0], off[:, 1])
         near = distance <= max(float(np.quantile(distance, _KEPT)), 0.05)
         points, places, weights = points[near], places[near], weights[near]

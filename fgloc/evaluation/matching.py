@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,27 +75,14 @@ def match(
     reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
     T_map_truth = np.zeros(3)
     if align == "se2":
-        T_map_truth = align_se2(reference[:, :2], poses[:, :2])
-        reference = transform(T_map_truth, reference)
+        T_map_truth = se2.rigid(reference[:, :2], poses[:, :2])
+        reference = se2.compose_array(T_map_truth, reference)
     covs = None if estimate.covs is None else estimate.covs[indices]
     if estimate.ground is None or estimate.ground_covs is None or truth.ground is None or align == "se2":
         return Matched(stamps, poses, reference, covs, T_map_truth)
     true = np.column_stack([np.interp(stamps, truth.stamps_ns, column) for column in truth.ground.T])
     ground, spatial = estimate.ground[indices], estimate.ground_covs[indices]
     return Matched(stamps, poses, reference, covs, T_map_truth, ground, true, spatial)
-
-
-def align_se2(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Rigid motion ``(3,)`` that takes the points ``(n, 2)`` of source nearest to those of target, in least squares.
-
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without
-    scale; in the plane the rotation has a closed form.
-    """
-    center_s, center_t = source.mean(axis=0), target.mean(axis=0)
-    s, t = source - center_s, target - center_t
-    yaw = math.atan2(float(np.sum(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])), float(np.sum(s * t)))
-    turned = se2.compose((0.0, 0.0, yaw), (*center_s, 0.0))
-    return np.array([*(center_t - turned[:2]), yaw])
 
 
 def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
@@ -116,25 +102,12 @@ def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
         J[:, 0, 2], J[:, 1, 2] = -truth[:, 1], truth[:, 0]
         H, b = np.einsum("nij,nik,nkl->jl", J, weights, J), np.einsum("nij,nik,nk->j", J, weights, errors)
         step = np.linalg.lstsq(H, b, rcond=None)[0]
-        truth = transform(step, truth)
+        truth = se2.compose_array(step, truth)
         errors = matched.estimate - truth
         errors[:, 2] = se2.wrap_array(errors[:, 2])
         if float(np.abs(step).max()) < 1e-9:
             break
     return errors, covs
-
-
-def transform(T: FloatArray, poses: FloatArray) -> FloatArray:
-    """Left-multiply poses ``(n, 3)`` by T ``(3,)``."""
-    x, y, yaw = T
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack(
-        [
-            x + c * poses[:, 0] - s * poses[:, 1],
-            y + s * poses[:, 0] + c * poses[:, 1],
-            se2.wrap_array(poses[:, 2] + yaw),
-        ]
-    )
 
 
 def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:

@@ -223,7 +223,7 @@ class OnlineRun:
         return None if self.parts is None else self.parts.diagnosis.comparison()
 
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong, the gravest first; those without a code of their own are sentences of the parts."""
+        """Findings on the running estimate, the gravest first; sentences of the parts get the code ``run``."""
         if self.parts is None:
             return tuple(note("run", self._notes))
         diagnosis = self.parts.diagnosis

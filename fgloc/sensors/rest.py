@@ -35,7 +35,12 @@ class Standing:
         return forked
 
     def observe(self, motion: FloatArray | None, seconds: float) -> bool:
-        """Take in the wheels' motion ``(3,)`` over the next step; None: it is not known, or they are to move."""
+        """Whether the wheels stand still, after the next step.
+
+        Args:
+            motion: ``(3,)`` of the wheels over the step; None: unknown, or they are commanded to move.
+            seconds: length of the step.
+        """
         if motion is None:
             self._steps.clear()
             return False

@@ -105,7 +105,7 @@ def test_pooling_counts_the_prior_once():
 
 
 def clocks(odometer: str = "odometry", **off: tuple[float, float, float]) -> list[Finding]:
-    """What is said of clocks that are off: mean, sigma and sigma of the prior."""
+    """Findings on clocks that are off: mean, sigma and sigma of the prior."""
     state = found({f"{name}.time_offset_s": values for name, values in off.items()}, wheels=odometer)
     state = InstallationFound(**_fields(state), settings=settings_found(state, Config()))
     return contradictions(state, Config())

@@ -232,6 +232,17 @@ def test_init_finds_topics_wheels_and_says_what_is_missing(tmp_path):
     assert fgloc("init", bag, "--out", file, "--force")[0] == 0
 
 
+def test_init_of_a_recording_without_a_known_topic_writes_settings_and_exits_with_1(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.flag("/lights", True, START_NS)
+        bag.flag("/lights", False, START_NS + 10**9)
+    file = tmp_path / "robot.yaml"
+    code, _, err = fgloc("init", tmp_path / "bag", "--out", file)
+    assert code == 1
+    assert "nothing measures how the robot moves" in err
+    assert load_config(file) == Config()
+
+
 def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path):
     """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps."""
     path, late = tmp_path / "run" / "bag", 14 * 86_400 * 10**9

@@ -30,7 +30,7 @@ FOOT = 0.3048
 
 @dataclass(frozen=True)
 class Broken:
-    """What is wrong: factors of what is reported, delays [s], and matrices of axes."""
+    """Mistakes of a recording: factors of its signals, delays [s], and matrices of axes."""
 
     bearing: float = 1.0
     range: float = 1.0

@@ -109,7 +109,7 @@ def events(landmark_map, corners=False, seed=0, wheels_late=0.0, gyro_late=None,
 
 
 def diagnose(made, landmark_map, camera=None, settings=None, place=None) -> dict[str, Finding]:
-    """What a diagnosis finds of these events, by code."""
+    """Findings of a diagnosis of these events, by code."""
     diagnosis = Diagnosis(settings or config(), landmark_map, camera, place, np.array([0.0, 0.0, 1.0]))
     for event in made:
         diagnosis.add(event)

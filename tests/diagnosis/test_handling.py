@@ -28,7 +28,7 @@ HANDS = {"motion.held", "motion.lifted"}
 
 @dataclass(frozen=True)
 class Robot:
-    """What the recording of a small robot has that it need not have.
+    """Optional contents of a small robot's recording.
 
     Attributes:
         hands: held while its wheels turn it on the spot, then lifted and turned.

@@ -153,7 +153,7 @@ def test_odometry_in_place_of_the_estimate_has_an_honest_covariance():
 
 
 def watched(poses, given, motions, away=None, mapped=True):
-    """What a watch gives for each step."""
+    """Estimates that a watch returns, one for each step."""
     watch, out = Watch(mapped, Config()), []
     for k in range(len(poses)):
         stamp = T0 + k * TICK_NS

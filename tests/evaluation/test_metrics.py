@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation import consistency, metrics
-from fgloc.evaluation.matching import Matched, align_se2, in_own_gauge, match, transform
+from fgloc.evaluation.matching import Matched, in_own_gauge, match
 from fgloc.evaluation.metrics import relative_error
 from fgloc.frames import yaw_quaternion
 from fgloc.rounding import rounded
@@ -29,7 +29,7 @@ def random_walk(rng, n=200, period_ns=100_000_000):
 def disturbed(rng, truth, T=(0.0, 0.0, 0.0)):
     """The truth seen from another frame, with noise."""
     noise = rng.normal(0.0, [0.05, 0.05, 0.04], (len(truth), 3))
-    poses = transform(np.asarray(T), truth.poses) + noise
+    poses = se2.compose_array(np.asarray(T), truth.poses) + noise
     poses[:, 2] = se2.wrap_array(poses[:, 2])
     return Trajectory(truth.stamps_ns, poses)
 
@@ -104,7 +104,7 @@ def test_rigid_motion_is_found_exactly(rng):
     points = rng.normal(size=(50, 3))
     for yaw in (-3.1, -1.0, 0.0, 0.4, 3.0):
         T = np.array([1.5, -7.0, yaw])
-        np.testing.assert_allclose(align_se2(points[:, :2], transform(T, points)[:, :2]), T, atol=1e-12)
+        np.testing.assert_allclose(se2.rigid(points[:, :2], se2.placed(T, points[:, :2])), T, atol=1e-12)
 
 
 def test_truth_is_interpolated_at_the_estimates_stamps():
@@ -230,7 +230,9 @@ def test_honest_dead_reckoning_is_called_honest_where_the_truths_frame_is_fitted
             F[:2, 2] = [-s * step[0], c * step[0]]
             cov.append(F @ cov[-1] @ F.T + R @ np.diag(sigma**2) @ R.T)
         stamps = np.arange(len(true)) * 100_000_000
-        moved = transform(np.array([2.0, -1.0, 0.7]), np.array(true)) + rng.normal(0.0, [0.003, 0.003, 0.005], (301, 3))
+        moved = se2.compose_array(np.array([2.0, -1.0, 0.7]), np.array(true)) + rng.normal(
+            0.0, [0.003, 0.003, 0.005], (301, 3)
+        )
         matched = match(Trajectory(stamps, np.array(guess), np.array(cov)), Trajectory(stamps, moved), "se2")
         values.append(np.mean(consistency.nees(*in_own_gauge(matched))) / 3.0)
     assert 0.5 < np.mean(values) < 1.5

@@ -111,6 +111,12 @@ def test_harmless_aliases_are_followed():
     assert plain(node) == {"a": x, "b": x, "c": x | {"p": 5}, "d": x | {"r": 1}}
 
 
+def test_sections_whose_keys_are_all_comments_are_empty(write):
+    """As `fgloc init` writes them where a recording has no topic of a role."""
+    text = "wheels:\n  # scale_v: 1.0\nrecording:\n  topics:\n    # odometry:\n"
+    assert load_config(write(text)) == Config()
+
+
 def test_values_are_those_of_yaml():
     text = "[1, 0x1f, 1_000, 1.5, .5, 1e3, yes, off, ~, null, '', word, 2024-01-31, \"1\", !!str 1, !!float 1]"
     assert plain(parse(text, "t")) == [
