@@ -30,7 +30,7 @@ from benchmarks.installed_recordings import SEEDS, Take, folder, prepare
 from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
 from fgloc.datasets.sim.camera import RenderError
-from fgloc.diagnosis.gross_mistakes import inspect_all
+from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.errors import FglocError
 from fgloc.replay.options import RunMode
 from fgloc.runner import run

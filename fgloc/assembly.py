@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgloc.config import Config
-from fgloc.diagnosis.diagnosis import Diagnosis
-from fgloc.diagnosis.floor import FloorWatch
+from fgloc.diagnosis.handling import FloorWatch
+from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.diagnosis.sanity import Sanity
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.stream_facts import StreamFacts

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Optical axes (x right, y down, z ahead) in body axes (x ahead, y left, z up), REP 103."""
 BASE_NAMES = ("base_link", "base_footprint", "base")  # what robots call our "base", first match wins
 
 
@@ -79,3 +81,10 @@ def rpy_matrix(roll: float, pitch: float, yaw: float) -> FloatArray:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def sensor_pose(T: FloatArray, optical: bool) -> tuple[float, float, float, float, float, float]:
+    """x, y, z [m], roll, pitch, yaw [rad] of a sensor at ``T_base_sensor (4, 4)``; optical axes have z forward."""
+    R = T[:3, :3] @ OPTICAL_TO_BODY.T if optical else T[:3, :3]
+    x, y, z = T[:3, 3].tolist()
+    return x, y, z, *roll_pitch(R), math.atan2(R[1, 0], R[0, 0])

@@ -11,11 +11,9 @@ from typing import Unpack
 import numpy as np
 
 from fgloc.assembly import Assembly, assemble
-from fgloc.calibration.contradictions import contradiction_findings, contradictions
-from fgloc.calibration.found import found_values
-from fgloc.calibration.settings import installation_found
+from fgloc.calibration.installation import contradiction_findings, contradictions, found_values, installation_found
 from fgloc.config import Config
-from fgloc.diagnosis.gross_mistakes import Mistakes, find_mistakes
+from fgloc.diagnosis.mistakes import Mistakes, find_mistakes
 from fgloc.errors import EstimatorError
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation.timing import one_blas_thread

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError, RecordingError
-from fgloc.frames import BASE_NAMES, rpy_matrix
+from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
 from fgloc.intake.stream_facts import HasFrames, RecordingFacts, StreamFacts, first_events
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
@@ -30,10 +30,6 @@ from fgloc.types import (
     RawEvent,
     SightingsEvent,
 )
-
-_OPTICAL_TO_BODY = np.array(
-    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-)  # optical axes in body axes (REP 103)
 
 _ESTIMATED = {  # uncertainties of what is estimated of a sensor of landmarks on a known map
     "landmarks": ("range_scale_sigma", "bearing_bias_sigma_rad", "time_offset_sigma_s"),
@@ -290,7 +286,7 @@ def given_pose(config: Config, default_axes: str) -> FloatArray | None:
     T = np.eye(4)
     T[:3, :3] = rpy_matrix(roll, pitch, yaw)
     if (config.recording.sightings_axes or default_axes) == "optical":
-        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
+        T[:3, :3] = T[:3, :3] @ OPTICAL_TO_BODY
     T[:3, 3] = x, y, z
     return T
 
@@ -312,5 +308,5 @@ def _sensor_pose(facts: StreamFacts, config: Config, notes: list[str]) -> FloatA
             "the base; set recording.sightings_pose otherwise."
         )
     if config.recording.sightings_axes == "optical":  # although the frame that the header names has x forward
-        T[:3, :3] = T[:3, :3] @ _OPTICAL_TO_BODY
+        T[:3, :3] = T[:3, :3] @ OPTICAL_TO_BODY
     return T

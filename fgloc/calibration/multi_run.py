@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc.calibration import shown
-from fgloc.calibration.settings import settings_found, with_settings
+from fgloc.calibration.installation import found_text, settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.recording.files import find_beside
@@ -64,7 +63,7 @@ def _key(setting: Setting) -> str:
 def _check(settings: Sequence[Setting]) -> None:
     wheels = _of_odometer(settings)
     if any(abs(s.found - s.given) > _FAR * s.prior_sigma for s in wheels):
-        listed = ", ".join(f"{_key(s)} {shown.found(s)}" for s in wheels)
+        listed = ", ".join(f"{_key(s)} {found_text(s)}" for s in wheels)
         raise EstimatorError(
             f"the wheels cannot be calibrated on this run: {listed} is no robot's; see the rejections of "
             "`fgloc smooth`, and begin with gains that are less far off"

@@ -136,7 +136,7 @@ def calibrate(
     config: ConfigOption = None,
 ) -> None:
     """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
-    from fgloc.calibration import shown
+    from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.recording.outputs import write_text
@@ -146,7 +146,7 @@ def calibrate(
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
-    rows = [(s.name, shown.unit(s.name), shown.given(s), shown.found(s)) for s in settings]
+    rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
     say_table(("setting", "unit", "given", "found"), rows)
     say(f"configuration: {out}")
     paths = " ".join(shown_path(bag) for bag in bags)

@@ -14,8 +14,7 @@ from fgloc.errors import ConfigError, RecordingError
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
-    from fgloc.calibration.survey import Survey
-    from fgloc.calibration.survey_graph import Distance
+    from fgloc.calibration.survey import Distance, Survey
     from fgloc.config import Config
     from fgloc.types import LandmarkMap
 
@@ -46,8 +45,7 @@ def make_map(
 
     Markers in images (or their corners) are surveyed in position and orientation, from one or several recordings.
     """
-    from fgloc.calibration.drives import sees_corners
-    from fgloc.calibration.survey import survey
+    from fgloc.calibration.survey import sees_corners, survey
     from fgloc.sensors.maps import configured_map, write_map
 
     check_out(out, folder=False)
@@ -124,7 +122,7 @@ def _with_markers(settings: Config, dictionary: str | None, size: float | None, 
 
 
 def _distance(text: str) -> Distance:
-    from fgloc.calibration.survey_graph import Distance
+    from fgloc.calibration.survey import Distance
 
     try:
         first, second, metres = text.split(",")

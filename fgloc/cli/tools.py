@@ -21,7 +21,7 @@ class Align(StrEnum):
 
 def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
     """Tell what a recording holds. Topics, rates, gaps, what a run would use, what looks wrong (also with the map)."""
-    from fgloc.diagnosis.gross_mistakes import inspect_all
+    from fgloc.diagnosis.mistakes import inspect_all
     from fgloc.errors import MapError
     from fgloc.recording.files import find_beside
     from fgloc.recording.info import format_info

@@ -25,7 +25,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.diagnosis.collect import SightingCollector
+from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
 from fgloc.sensors.equipment import Odometer, RateSensor
 from fgloc.sensors.landmarks import LandmarkSensor

@@ -1,26 +1,447 @@
-"""Whether a set-up explains an excerpt: a small batch problem with every pose, marker and parameter of it.
+"""How well a set-up of camera, map and wheels explains an excerpt of a recording: a small batch problem.
 
-The cost is the negative log-likelihood of corners, wheel motion and gyro with the priors of the configuration, so that
-two set-ups can be compared by their costs. Poses of the images are free; wheels and gyro tie each to the next one.
+The excerpt is a few short stretches: images with their markers, wheel motion, gyro. The cost is the negative
+log-likelihood of corners, wheel motion and gyro with the priors of the configuration, so that two set-ups can be
+compared by their costs. Poses of the images are free; wheels and gyro tie each to the next one.
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config
-from fgloc.diagnosis.excerpt import Stretch, usable
-from fgloc.diagnosis.setup_motion import EXTRAS, Motion, extra_sigmas, laid
+from fgloc.config import Config, Role
 from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
+from fgloc.intake.validation import EventValidator, reported_bounds
+from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.cameras import pinhole, undistort_points
+from fgloc.sensors.detection import DetectionError, Detector
 from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.types import Camera, FloatArray, IntArray, Landmark, LandmarkMap, PixelMeasurement
+from fgloc.types import (
+    Camera,
+    Event,
+    FloatArray,
+    InertialEvent,
+    IntArray,
+    Landmark,
+    LandmarkMap,
+    MotionEvent,
+    PixelMeasurement,
+    RawEvent,
+    SightingsEvent,
+    Step,
+    TruthEvent,
+    by_class,
+)
+
+STRETCHES = 5
+STRETCH_S = 4.0  # within it wheels err by centimetres only
+PERIOD_S = 12.0  # from one stretch to the next
+MARGIN_S = 1.2  # wheels and gyro before and after the images, for clocks that differ
+GRID_S = 0.02
+_SPACING_S = 0.19  # images nearer to the one before are passed over
+_PATIENCE_S = 120.0  # so long an image is waited for
+_FEWEST = 8  # sightings of a stretch
+_SPREAD_M = 0.4  # of the markers that they are of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """The markers of the map in one image."""
+
+    stamp_ns: int
+    seen: tuple[Any, ...]  # sightings in pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Some images, and what wheels and gyro measured meanwhile on an even grid of times.
+
+    Attributes:
+        times: ``(n,)`` of the images [s], from the first grid point.
+        pictures: the images.
+        wheels: ``(g, 3)`` twist times time of each grid interval, as configured.
+        gyro: ``(g,)`` rotation [rad] of each grid interval; None: there is no gyro.
+        start_ns: stamp of the first grid point.
+    """
+
+    times: FloatArray
+    pictures: tuple[Picture, ...]
+    wheels: FloatArray
+    gyro: FloatArray | None
+    start_ns: int
+
+
+@dataclass
+class Excerpt:
+    """What was read.
+
+    Attributes:
+        pictures: by stretch.
+        motion: odometry, joints and commands in order of receipt.
+        imu, truth: likewise.
+        delays: received minus stamped [s] by role.
+        wheel_source: as the odometer has it, once stretches were made.
+    """
+
+    pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
+    motion: list[MotionEvent] = field(default_factory=list)
+    imu: list[InertialEvent] = field(default_factory=list)
+    truth: list[TruthEvent] = field(default_factory=list)
+    delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
+    wheel_source: str = ""
+
+    def stretches(self, config: Config, imu_up: FloatArray | None) -> list[Stretch]:
+        """The stretches with motion by this configuration.
+
+        Args:
+            config: of the wheels.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: the gyro is not used.
+        """
+        made = [_stretch(self, pictures, config, imu_up) for pictures in self.pictures if len(pictures) > 3]
+        return [s for s in made if s is not None]
+
+
+def read_excerpt(recording: Recording, config: Config, detector: Detector | None) -> Excerpt:
+    """Read the beginning of a recording: bounded work, however long it is.
+
+    Args:
+        recording: to be read from its start.
+        config: bounds of what is taken.
+        detector: of markers; None: the recording holds corners.
+    """
+    collector = ExcerptCollector(recording, config, detector)
+    for event in recording.events():
+        if not collector.add(event):
+            break
+    return collector.found
+
+
+class ExcerptCollector:
+    """Takes an excerpt from the events of a recording, as `read_excerpt` does.
+
+    Attributes:
+        found: the excerpt, so far.
+    """
+
+    def __init__(self, recording: Recording, config: Config, detector: Detector | None) -> None:
+        """As `read_excerpt`, but nothing is read."""
+        self.found = Excerpt()
+        self._gate = EventValidator(reported_bounds(config))
+        self._detector = detector
+        self._role_of = {topic: role for role, topic in recording.roles.items()}
+        self._first_image: int | None = None
+        self._last_image = 0
+        self._end_ns: int | None = None
+
+    def add(self, event: Event) -> bool:
+        """Take what is wanted of an event; False: it came after the excerpt's end."""
+        if self._end_ns is None:
+            self._end_ns = event.received_ns + round(_PATIENCE_S * 1e9)
+        if event.received_ns > self._end_ns:
+            return False
+        role = self._role_of.get(event.topic)
+        if role is not None:
+            self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
+        if isinstance(event, RawEvent) or (isinstance(event, SightingsEvent) and event.in_pixels):
+            self._take_image(event)
+        else:
+            _take_motion(self.found, self._gate, event)
+        return True
+
+    def _take_image(self, event: RawEvent | SightingsEvent) -> None:
+        if self._first_image is None:
+            self._first_image = event.stamp_ns
+            self._end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
+        which, within = divmod((event.stamp_ns - self._first_image) * 1e-9, PERIOD_S)
+        near = event.stamp_ns - self._last_image < _SPACING_S * 1e9
+        if near or not (0 <= which < STRETCHES and within < STRETCH_S):
+            return
+        self._last_image = event.stamp_ns
+        corners = _corners(event, self._detector)
+        passed = None if corners is None else self._gate.check(corners)
+        if isinstance(passed, SightingsEvent):
+            self.found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
+        elif corners is not None:
+            self.found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
+
+
+def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
+    passed = gate.check(event)
+    if isinstance(passed, InertialEvent):
+        found.imu.append(passed)
+    elif isinstance(passed, MotionEvent):
+        found.motion.append(passed)
+    elif isinstance(passed, TruthEvent):
+        found.truth.append(passed)
+
+
+def _corners(event: RawEvent | SightingsEvent, detector: Detector | None) -> SightingsEvent | None:
+    if isinstance(event, SightingsEvent):
+        return event
+    if detector is None:
+        return None
+    try:
+        found: SightingsEvent = detector.detect(event)
+        return found
+    except DetectionError:
+        return None
+
+
+def _stretch(excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: FloatArray | None) -> Stretch | None:
+    """One stretch; None where the motion is not known throughout."""
+    start_ns = pictures[0].stamp_ns - round(MARGIN_S * 1e9)
+    count = int((pictures[-1].stamp_ns - start_ns) * 1e-9 / GRID_S + MARGIN_S / GRID_S) + 1
+    grid = start_ns + np.arange(count + 1) * round(GRID_S * 1e9)
+    wheels = wheel_increments(excerpt, config, grid)
+    if wheels is None:
+        return None
+    gyro = None if imu_up is None else _gyro_increments(excerpt.imu, imu_up, grid)
+    times = np.array([(p.stamp_ns - start_ns) * 1e-9 for p in pictures])
+    return Stretch(times, tuple(pictures), wheels, gyro, start_ns)
+
+
+def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatArray | None:
+    """Twist times time ``(g, 3)`` between the stamps ``(g + 1,)``; None where too few messages were received."""
+    reach = 1_000_000_000
+    events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
+    events.sort(key=lambda e: e.stamp_ns)
+    step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
+    wheels = registry.odometer().build(config)
+    wheels.measure(step)
+    if not wheels.source:
+        return None
+    excerpt.wheel_source = wheels.source
+    motions = [wheels.motion_between(step, a, b)[0] for a, b in pairwise(grid.tolist())]
+    return np.array([se2.log(m) for m in motions])
+
+
+def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -> FloatArray | None:
+    """Rotation ``(g,)`` between the stamps; None where they are not covered."""
+    stamps = np.array([e.stamp_ns for e in imu], dtype=np.int64)
+    inside = (stamps >= grid[0] - 500_000_000) & (stamps <= grid[-1] + 500_000_000)
+    if inside.sum() < 0.2 * len(grid):
+        return None
+    at = (stamps[inside] - grid[0]) * 1e-9
+    rates = np.array([e.angular_velocity for e, used in zip(imu, inside, strict=True) if used]) @ up
+    order = np.argsort(at, kind="stable")
+    middle = (np.arange(len(grid) - 1) + 0.5) * GRID_S
+    return np.asarray(np.interp(middle, at[order], rates[order]) * GRID_S)
+
+
+def usable(picture: Picture, landmark_map: LandmarkMap) -> list[Any]:
+    """Markers of the map that have a size and are seen once in an image: sightings in pixels."""
+    times = Counter(m.landmark_id for m in picture.seen)
+    known = landmark_map.landmarks
+    return [
+        m for m in picture.seen if times[m.landmark_id] == 1 and m.landmark_id in known and known[m.landmark_id].size_m
+    ]
+
+
+def tells_place(stretch: Stretch, landmark_map: LandmarkMap) -> bool:
+    """Whether the markers seen in a stretch are enough, and far enough apart, to determine where the robot was."""
+    ids = [m.landmark_id for p in stretch.pictures for m in usable(p, landmark_map)]
+    places = np.array([landmark_map.landmarks[i].position[:2] for i in ids]).reshape(-1, 2)
+    return len(ids) >= _FEWEST and float(places.var(axis=0).sum()) > _SPREAD_M**2
+
+
+# --- Wheel motion and gyro between the images, as functions of what they may be off by --------------------------------
+
+EXTRAS = ("size", "map_scale", "radius", "track", "yaw_per_m", "late_s", "gyro_late_s", "gyro_scale", "gyro_bias")
+"""Parameters beside camera and markers: logs of true over given size, map, radius and track; yaw gained per metre
+[rad/m]; how late the images' stamps are against wheels and gyro [s]; the gyro's scale and bias [rad/s]."""
+_WHEELS = slice(2, 6)  # what the wheels' motion depends on
+_GYRO_LATE, _GYRO_SCALE, _GYRO_BIAS = 6, 7, 8
+_SIZE_SIGMA = 0.005  # share: prints are exact to a millimetre in 0.2 m
+_MAP_SIGMA = 1e-3  # share of all its distances
+_HELD = 1e-4  # sigma of what is taken as exact
+_WHEELS_FLOOR = np.array([0.001, 0.001, 0.001])  # m, m, rad: of the integration on a grid
+_GYRO_FLOOR_RAD = 0.0005
+_NO_GYRO_RAD = 1e9  # sigma where there is none
+_NUDGE = 1e-6
+_KEPT = 0.67  # share of the sightings that lay a path onto the map: the others may be of wrong markers
+_FEWEST_POINTS = 4
+
+Rows = tuple[FloatArray, FloatArray, IntArray]
+"""Whitened residuals ``(m, d)``, their derivatives ``(m, d, c)`` and by which unknowns these are ``(m, c)``."""
+
+
+class Motion:
+    """Of all stretches."""
+
+    def __init__(self, stretches: Sequence[Stretch], turned: FloatArray, config: Config) -> None:
+        """Prepare.
+
+        Args:
+            stretches: of the excerpt.
+            turned: ``(3, 3)`` applied to the wheels' twist.
+            config: noise of wheels and gyro.
+        """
+        self._stretches, self._turned_by = stretches, turned
+        self._noise = registry.odometer().errors(config).noise
+        self._gyro_noise = registry.rate_sensor().errors(config).yaw_per_sqrt_s
+        lengths = [len(s.times) for s in stretches]
+        self.stretch_of = np.repeat(np.arange(len(stretches)), lengths)
+        self.pairs: IntArray = np.flatnonzero(np.diff(self.stretch_of) == 0)
+
+    def rows(self, poses: FloatArray, extras: FloatArray, first: int) -> list[Rows]:
+        """Residuals of wheels and gyro between the poses ``(n, 3)`` of the images.
+
+        Args:
+            poses: right perturbations of them are unknowns 0 to 3 n.
+            extras: ``(9,)`` values of `EXTRAS`.
+            first: number of the first of these among the unknowns.
+        """
+        i = self.pairs
+        a, c = poses[i], poses[i + 1]
+        cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
+        dx, dy = c[:, 0] - a[:, 0], c[:, 1] - a[:, 1]
+        x, y = cos * dx + sin * dy, cos * dy - sin * dx
+        turn = se2.wrap_array(c[:, 2] - a[:, 2])
+        rows: list[Rows] = []
+        went, sigmas, seconds = self.between(extras)
+        r = np.column_stack([x, y, turn]) - went
+        r[:, 2] = se2.wrap_array(r[:, 2])
+        J = np.zeros((len(i), 3, 10))
+        J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
+        J[:, 0, 2], J[:, 1, 2] = y, -x
+        ct, st = np.cos(turn), np.sin(turn)
+        J[:, 0, 3], J[:, 0, 4], J[:, 1, 3], J[:, 1, 4], J[:, 2, 5] = ct, -st, st, ct, 1.0
+        for k in range(4):
+            nudged = extras.copy()
+            nudged[_WHEELS.start + k] += _NUDGE
+            J[:, :, 6 + k] = -(self.between(nudged)[0] - went) / _NUDGE
+        ends = np.concatenate([3 * i[:, None] + np.arange(3), 3 * (i + 1)[:, None] + np.arange(3)], axis=1)
+        wheels = np.broadcast_to(first + np.arange(_WHEELS.start, _WHEELS.stop), (len(i), 4))
+        rows.append((r / sigmas, J / sigmas[:, :, None], np.concatenate([ends, wheels], axis=1)))
+        turned, by_late, has = self._by_gyro(extras[_GYRO_LATE])
+        sigma = np.hypot(self._gyro_noise * np.sqrt(seconds), _GYRO_FLOOR_RAD)
+        sigma = np.where(has, sigma, _NO_GYRO_RAD)
+        scale = 1.0 + extras[_GYRO_SCALE]
+        r = se2.wrap_array(turn - scale * turned + extras[_GYRO_BIAS] * seconds)
+        J = np.zeros((len(i), 1, 5))
+        J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3], J[:, 0, 4] = -1.0, 1.0, -scale * by_late, -turned, seconds
+        ends = np.column_stack([3 * i + 2, 3 * i + 5])
+        gyro = np.broadcast_to(first + np.array([_GYRO_LATE, _GYRO_SCALE, _GYRO_BIAS]), (len(i), 3))
+        rows.append(((r / sigma)[:, None], J / sigma[:, None, None], np.concatenate([ends, gyro], axis=1)))
+        return rows
+
+    def between(self, extras: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Wheel motion ``(k, 3)`` between images, its sigmas, and the time between them [s]."""
+        radius, track, pull, late = extras[_WHEELS]
+        noise = self._noise
+        motions, sigmas, spans = [], [], []
+        for s in self._stretches:
+            steps = s.wheels @ self._turned_by.T
+            forward = np.exp(radius) * steps[:, :2]
+            turns = np.exp(radius - track) * steps[:, 2] + pull * forward[:, 0]
+            at = s.times - late
+            x, y, yaw = (_at(at, v) for v in _path(forward, turns))
+            c, d = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+            ax, ay, turn = np.diff(x), np.diff(y), np.diff(yaw)
+            motions.append(np.column_stack([c * ax + d * ay, c * ay - d * ax, turn]))
+            dt = np.diff(s.times)
+            way = np.diff(_at(at, _summed(np.hypot(forward[:, 0], forward[:, 1]))))
+            bend = np.diff(_at(at, _summed(np.abs(turns))))
+            q = np.column_stack(
+                [
+                    noise.x_per_sqrt_m**2 * way + noise.xy_per_sqrt_rad**2 * bend + noise.xy_per_sqrt_s**2 * dt,
+                    noise.y_per_sqrt_m**2 * way + noise.xy_per_sqrt_rad**2 * bend + noise.xy_per_sqrt_s**2 * dt,
+                    noise.yaw_per_sqrt_m**2 * way + noise.yaw_per_sqrt_rad**2 * bend + noise.yaw_per_sqrt_s**2 * dt,
+                ]
+            )
+            sigmas.append(np.sqrt(q + _WHEELS_FLOOR**2))
+            spans.append(dt)
+        return np.concatenate(motions), np.concatenate(sigmas), np.concatenate(spans)
+
+    def path(self, k: int, extras: FloatArray) -> FloatArray:
+        """Poses ``(n, 3)`` of the images of a stretch by the wheels, from its first grid point."""
+        radius, track, _, late = extras[_WHEELS]
+        s = self._stretches[k]
+        steps = s.wheels @ self._turned_by.T
+        x, y, yaw = _path(np.exp(radius) * steps[:, :2], np.exp(radius - track) * steps[:, 2])
+        return np.column_stack([_at(s.times - late, v) for v in (x, y, yaw)])
+
+    def _by_gyro(self, late: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rotation by the gyro between images ``(k,)``, its derivative by the lateness, and where there is any."""
+        turned, slope, has = [], [], []
+        for s in self._stretches:
+            k = len(s.times) - 1
+            if s.gyro is None:
+                turned.append(np.zeros(k))
+                slope.append(np.zeros(k))
+            else:
+                angles, at = _summed(s.gyro), s.times - late
+                turned.append(np.diff(_at(at, angles)))
+                slope.append(-np.diff(_at(at, np.append(s.gyro, s.gyro[-1]) / GRID_S)))
+            has.append(np.full(k, s.gyro is not None))
+        return np.concatenate(turned), np.concatenate(slope), np.concatenate(has)
+
+
+def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
+    """Prior sigmas of `EXTRAS` in an ordinary installation; what can be no unknown is held."""
+    wheels, camera = registry.odometer().errors(config), config.camera
+    gyro = registry.rate_sensor().errors(config)
+    late = float(np.hypot(camera.time_offset_sigma_s, wheels.time_offset_sigma_s))
+    sigmas = (
+        _SIZE_SIGMA,
+        _MAP_SIGMA,
+        max(wheels.scale_sigma, _HELD),
+        max(wheels.turn_scale_sigma, _HELD),
+        max(wheels.yaw_per_m_sigma, _HELD),
+        late,
+        camera.time_offset_sigma_s,
+        gyro.scale_sigma if has_gyro else _HELD,
+        gyro.bias_sigma if has_gyro else _HELD,
+    )
+    return dict(zip(EXTRAS, sigmas, strict=True))
+
+
+def laid(path: FloatArray, seen: FloatArray, places: FloatArray) -> FloatArray | None:
+    """Pose ``(3,)`` of a path's start that brings what was seen from it onto the map; without the worst third."""
+    points = se2.placed(path, seen)
+    weights = 1.0 / np.maximum((seen**2).sum(axis=1), 0.01)
+    place: FloatArray | None = None
+    for _ in range(3):
+        if len(points) < _FEWEST_POINTS:
+            return None
+        place = se2.rigid_if_spread(points, places, weights)
+        if place is None:
+            return None
+        off = se2.placed(place, points) - places
+        distance = np.hypot(off[:, 0], off[:, 1])
+        near = distance <= max(float(np.quantile(distance, _KEPT)), 0.05)
+        points, places, weights = points[near], places[near], weights[near]
+    return place
+
+
+def _summed(steps: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _path(forward: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Poses at the grid points from steps ``(g, 2)`` [m] and ``(g,)`` [rad]: x, y, yaw ``(g + 1,)``."""
+    yaw = _summed(turns)
+    middle = yaw[:-1] + 0.5 * turns
+    c, s = np.cos(middle), np.sin(middle)
+    x = _summed(c * forward[:, 0] - s * forward[:, 1])
+    return x, _summed(s * forward[:, 0] + c * forward[:, 1]), yaw
+
+
+def _at(times: FloatArray, values: FloatArray) -> FloatArray:
+    """Values of the grid points at some times [s]."""
+    return np.asarray(np.interp(times, np.arange(len(values)) * GRID_S, values))
+
+
+# --- The batch problem ------------------------------------------------------------------------------------------------
 
 _SIZE, _MAP = 0, 1
 _SIGMA_PX = 0.2  # px: of corners in motion, on top of the configured noise

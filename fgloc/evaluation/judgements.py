@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from fgloc.calibration.contradictions import contradicted
+from fgloc.calibration.installation import contradicted
 from fgloc.evaluation.judgement_effects import effect, plural
 from fgloc.sensors import registry
 from fgloc.stats import SURE_SIGMAS

@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fgloc.calibration.settings import with_settings
+from fgloc.calibration.installation import with_settings
 from fgloc.config import Config, yaml_of
 from fgloc.evaluation.ground_plots import plot_height, plot_space
 from fgloc.evaluation.html import embedded, page, plotly, script_data

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.calibration import shown
-from fgloc.calibration.contradictions import contradicted
+from fgloc.calibration.installation import contradicted, found_text, given_text, setting_unit
 from fgloc.evaluation.judgements import GRAVITY, Judgement
 from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.metrics import Metrics
@@ -160,9 +159,9 @@ def _installation(result: RunResult) -> list[Row]:
     return [
         (
             s.name + (" (contradicts the given value)" if contradicted(s) else ""),
-            shown.unit(s.name),
-            f"{shown.given(s)} ± {rounded(0.0, s.prior_sigma)[1]}",
-            shown.found(s),
+            setting_unit(s.name),
+            f"{given_text(s)} ± {rounded(0.0, s.prior_sigma)[1]}",
+            found_text(s),
             f"{s.off:+z.1f}",
         )
         for s in (() if result.found is None else result.found.settings)

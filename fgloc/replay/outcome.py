@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 from fgloc.assembly import Assembly
 from fgloc.config import Role
-from fgloc.diagnosis.gross_mistakes import Mistakes
-from fgloc.diagnosis.unused_sightings import unused_sightings
+from fgloc.diagnosis.mistakes import Mistakes, unused_sightings
 from fgloc.recording.reader import Recording
 from fgloc.replay.replay import Replay
 from fgloc.sensors import registry

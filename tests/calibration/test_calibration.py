@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
-from fgloc.calibration import shown
+from fgloc.calibration.installation import found_text, given_text, setting_unit
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.datasets.bag import BagWriter
@@ -178,4 +178,4 @@ def test_a_written_configuration_is_read_back(tmp_path):
     ids=lambda value: value.name if isinstance(value, Setting) else "",
 )
 def test_a_setting_is_shown_with_unit_and_the_digits_of_its_sigma(setting, told):
-    assert (shown.unit(setting.name), shown.given(setting), shown.found(setting)) == told
+    assert (setting_unit(setting.name), given_text(setting), found_text(setting)) == told

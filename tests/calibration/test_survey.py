@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from world_bags import write_world
 
-from fgloc.calibration.first_guess import aligned, planar_matrix
-from fgloc.calibration.survey import Distance, survey
+from fgloc.calibration.survey import Distance, aligned, planar_matrix, survey
 from fgloc.cli import app
 from fgloc.errors import ConfigError, MapError, RecordingError
 from fgloc.evaluation.metrics import match_result

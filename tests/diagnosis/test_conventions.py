@@ -13,7 +13,7 @@ import yaml
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
 from fgloc.datasets.bag import BagWriter
-from fgloc.diagnosis.gross_mistakes import inspect_all
+from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap, Severity
 

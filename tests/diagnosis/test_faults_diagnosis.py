@@ -28,7 +28,7 @@ from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
 from fgloc.datasets import mrclam, pioneer, turtlebot3
 from fgloc.datasets.bag import BagWriter
-from fgloc.diagnosis.diagnosis import Diagnosis
+from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.topic_activity import TopicActivity
 from fgloc.recording.files import find_beside

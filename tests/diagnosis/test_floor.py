@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgloc.diagnosis.floor import FloorWatch
+from fgloc.diagnosis.handling import FloorWatch
 from fgloc.frames import rpy_matrix
 from fgloc.graph.ground import GRAVITY
 from fgloc.sensors.pnp import up_in_base

@@ -15,11 +15,10 @@ from fgloc import cli
 from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
-from fgloc.diagnosis.excerpt import Picture, read_excerpt
-from fgloc.diagnosis.frame_checks import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.raw_checks import clock_sentence, other_clocks
-from fgloc.diagnosis.setup_changes import mirrored, swapped
-from fgloc.diagnosis.setup_check import check_fit
+from fgloc.diagnosis.conventions import first_pose_sentence, truth_sentence
+from fgloc.diagnosis.mistakes import clock_sentence, other_clocks
+from fgloc.diagnosis.setup import check_fit, mirrored, swapped
+from fgloc.diagnosis.setup_fit import Picture, read_excerpt
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import rpy_matrix, yaw_quaternion
 from fgloc.recording.reader import open_recording

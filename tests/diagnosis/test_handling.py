@@ -14,7 +14,7 @@ from fgloc import run
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
 from fgloc.datasets.bag import BagWriter
-from fgloc.diagnosis.gross_mistakes import inspect_all
+from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
 from fgloc.types import RunResult

@@ -66,7 +66,7 @@ def fgloc(*arguments: object, seconds: float = 20.0) -> Done:
 def load() -> None:
     """Import what the commands import late, so that no case pays for it."""
     import fgloc.calibration.multi_run
-    import fgloc.diagnosis.gross_mistakes
+    import fgloc.diagnosis.mistakes
     import fgloc.evaluation.report
     import fgloc.recording.info
     import fgloc.runner  # noqa: F401

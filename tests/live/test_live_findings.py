@@ -15,7 +15,7 @@ from robot_world import SIGMA_BEARING, SIGMA_RANGE, START_NS, World, beacons, co
 from fgloc import se2
 from fgloc.cli.live import _exit_if_wrong
 from fgloc.cli.terminal import EXIT_LOST
-from fgloc.diagnosis.diagnosis import Diagnosis
+from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
 from fgloc.live.status import LiveStatus

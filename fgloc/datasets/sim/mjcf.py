@@ -12,11 +12,10 @@ import numpy as np
 
 from fgloc.datasets.sim.ground import Ground
 from fgloc.datasets.sim.scenario import Camera, Motor, Payload, Robot, Scenario
-from fgloc.frames import rpy_matrix
+from fgloc.frames import OPTICAL_TO_BODY, rpy_matrix
 from fgloc.types import FloatArray, LandmarkMap
 
 _CELL_PX = 64  # of a marker's texture
-_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body axes of x right, y down, z forward
 _CHASSIS_CLEARANCE_M = 0.04
 _CASTER_RADIUS_M = 0.02
 
@@ -34,7 +33,7 @@ def camera_rotation(camera: Camera) -> FloatArray:
 
 def optical_rotation(rpy: Sequence[float] | FloatArray) -> FloatArray:
     """``(3, 3)`` rotation of the optical frame whose forward looking body axes are turned by roll, pitch, yaw [rad]."""
-    return np.asarray(rpy_matrix(*rpy) @ _OPTICAL)
+    return np.asarray(rpy_matrix(*rpy) @ OPTICAL_TO_BODY)
 
 
 def render_size(camera: Camera) -> tuple[int, int, float]:

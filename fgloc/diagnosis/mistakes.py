@@ -1,0 +1,447 @@
+"""Mistakes of a recording and its set-up: before a run, while it goes on, and of what it dropped.
+
+Before a run they are found in bounded time, with the settings that undo them. While it goes on the same engine compares
+the signals so far, more and more of them.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config, Role
+from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
+from fgloc.diagnosis.handling import FloorWatch
+from fgloc.diagnosis.setup import Checked, check_fit
+from fgloc.diagnosis.setup_fit import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
+from fgloc.diagnosis.signals import SightingCollector, SignalCollector, Signals, read_signals
+from fgloc.errors import FglocError
+from fgloc.recording.info import RecordingInfo, inspect_recording
+from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
+from fgloc.sensors import registry
+from fgloc.sensors.detection import RememberingDetector
+from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.roles import with_values
+from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
+
+# --- Stamps of another clock ------------------------------------------------------------------------------------------
+
+_OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps that differ more from the receive times are of another clock
+_FEWEST = 5  # messages of a role
+
+
+def other_clocks(delays: Mapping[Role, Sequence[float]]) -> tuple[Role, ...]:
+    """Roles whose stamps are of another clock than most.
+
+    Args:
+        delays: received minus stamped [s], by role.
+    """
+    middle = {role: float(np.median(values)) for role, values in delays.items() if len(values) >= _FEWEST}
+    if len(middle) < 3:
+        return ()
+    usual = float(np.median(list(middle.values())))
+    return tuple(sorted(role for role, delay in middle.items() if abs(delay - usual) > _OTHER_CLOCK_S))
+
+
+def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, Sequence[float]], given: Sequence[Role]) -> str:
+    """The sentence on such roles; ``given``: those that the configuration lists already."""
+    usual = float(np.median([np.median(values) for role, values in delays.items() if role not in roles]))
+    off = [float(np.median(delays[role])) - usual for role in roles]
+    sentence = " and ".join(
+        f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
+        for role, late in zip(roles, off, strict=True)
+    )
+    line = f"recording.received_stamps: [{', '.join([*given, *roles])}]"
+    return f"Some stamps are of another clock ({sentence}): set {line}."
+
+
+# --- Before a run -----------------------------------------------------------------------------------------------------
+
+_MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
+_FEWEST_IMAGES = 5
+_MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
+_MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mistakes:
+    """What is wrong with a set-up.
+
+    Attributes:
+        findings: one for each mistake, with the line to be set; none on a sound set-up.
+        config: with the mistakes undone.
+        landmark_map: likewise; None: the file is taken as it is.
+        undone: whether ``config`` and ``landmark_map`` are not as they were given.
+        checked: whether anything was looked for.
+    """
+
+    findings: tuple[Finding, ...]
+    config: Config
+    landmark_map: LandmarkMap | None = None
+    undone: bool = False
+    checked: bool = False
+
+    @property
+    def grave(self) -> bool:
+        """Whether a mistake would make the poses wrong."""
+        return any(finding.severity is Severity.ERROR for finding in self.findings)
+
+
+def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes:
+    """Check an excerpt of a recording against what is given of map, camera, wheels, clocks and frames.
+
+    Args:
+        path: recording.
+        map_path: map; None: only what needs none is checked.
+        config: as given.
+
+    Raises:
+        FglocError: the input cannot be used, as `fgloc.runner.run` would raise too.
+    """
+    found = _Search(path, map_path, config)
+    found.run()
+    undone = found.config != config or found.landmark_map is not None
+    findings = found.findings
+    if undone and any(finding.severity is Severity.ERROR for finding in findings):
+        findings += note("setup.corrected", ["This run was made with that corrected; correct it, too."])
+    return Mistakes(tuple(findings), found.config, found.landmark_map, undone, checked=True)
+
+
+def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
+    """What `inspect` reports of a recording, with the gross mistakes first among the findings; it is read once.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    search = _Search(path, map_path, config)
+    with Recording(path, config.recording) as recording:
+        if recording.problems:
+            return inspect_recording(recording, config)
+        try:
+            setup, detector = search.begin(recording)
+        except FglocError as error:
+            info = inspect_recording(recording, config)
+            return replace(info, problems=(str(error), *info.problems))
+        collector = ExcerptCollector(recording, config, detector)
+        info = inspect_recording(recording, config, collector.add)
+        try:
+            search.go_on(recording, setup, collector.found)
+        except FglocError as error:
+            return replace(info, problems=(str(error), *info.problems))
+    return replace(info, found=ordered([*search.findings, *info.found]))
+
+
+class _Search:
+    """One search: reads the excerpt, again where a mistake of clocks or dictionary made it useless."""
+
+    def __init__(self, path: Path, map_path: Path | None, config: Config) -> None:
+        self._path, self._map_path = path, map_path
+        self.config = config
+        self.landmark_map: LandmarkMap | None = None
+        self.sentences: list[str] = []
+        self._conventions: list[Finding] = []
+        self._compared = False
+        self.detections: dict[bytes, Any] = {}
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Everything that was found: conventions, then what the fits of the set-up name."""
+        return [*self._conventions, *note("setup", self.sentences, Severity.ERROR)]
+
+    def run(self) -> None:
+        """Read the excerpt, and check it."""
+        with open_recording(self._path, self.config.recording) as recording:
+            self.go_on(recording, *self._read(recording))
+
+    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberingDetector | None]:
+        """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
+        setup = recorded_setup(recording, self._map_path, self.config)[1]
+        if setup.detector is None:
+            return setup, None
+        memory = setup.detector.remembering(setup.detector.following(), None, self.detections)
+        self.detections = memory.found
+        return setup, memory
+
+    def go_on(self, recording: Recording, setup: SensorSetup, excerpt: Excerpt) -> None:
+        """As `run`, of an excerpt that was read."""
+        if not self._check(recording, setup, excerpt):
+            return
+        for _ in range(_MOST_READINGS):
+            with open_recording(self._path, self.config.recording) as corrected:
+                if not self._check(corrected, *self._read(corrected)):
+                    return
+
+    def _read(self, recording: Recording) -> tuple[SensorSetup, Excerpt]:
+        setup, detector = self.begin(recording)
+        return setup, read_excerpt(recording, self.config, detector)
+
+    def _check(self, recording: Recording, parts: SensorSetup, excerpt: Excerpt) -> bool:
+        """All checks, in the order in which one makes the next possible; whether stamps were corrected meanwhile."""
+        roles = other_clocks(excerpt.delays)
+        given = self.config.recording.received_stamps
+        if roles and not set(roles) <= set(given):
+            self.sentences.append(clock_sentence(roles, excerpt.delays, given))
+            self._change("recording", received_stamps=(*given, *roles))
+            return True
+        if not self._compared:
+            self._compared = True
+            signals = read_signals(recording, self.config)
+            found = conventions(signals, self.config, parts.T_base_sensor, parts.imu_up, parts.landmark_map)
+            self._conventions += found.findings
+            read = (self.config.recording, self.config.map)
+            changed, self.config = (found.config.recording, found.config.map) != read, found.config
+            if changed:
+                return True
+        for mistake in registry.raw_mistakes(excerpt.motion, self.config):
+            self.sentences.append(mistake.sentence)
+            self._change(mistake.section, **mistake.values)
+        if parts.landmark_map is None:
+            return False
+        if self._unseen(excerpt, parts) and not self._images(recording, parts):
+            return False
+        if registry.raw_landmarks().dictionary(self.config) != registry.raw_landmarks().dictionary(parts.config):
+            self.detections.clear()
+            parts, excerpt = self._read(recording)
+        self._fit(recording, excerpt, parts)
+        return False
+
+    def _unseen(self, excerpt: Excerpt, parts: SensorSetup) -> bool:
+        """Whether images were searched and next to none shows a marker of the map."""
+        assert parts.landmark_map is not None
+        shown = [any(m.landmark_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
+        return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+
+    def _images(self, recording: Recording, parts: SensorSetup) -> bool:
+        """Report why no marker is found; whether another dictionary finds them."""
+        assert parts.detector is not None
+        hints, fitting = parts.detector.hints(recording)
+        self.sentences += hints
+        if fitting is not None:
+            self._change("markers", dictionary=fitting)
+        return fitting is not None
+
+    def _fit(self, recording: Recording, excerpt: Excerpt, parts: SensorSetup) -> None:
+        landmark_map, camera = parts.landmark_map, parts.camera
+        if camera is None or landmark_map is None:
+            return
+        image: Role = "image" if parts.detector is not None else "sightings"
+        up = base_up(recording, self.config)
+        checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
+        if checked.unexplained:
+            self.sentences.append(
+                f"What the camera saw does not fit {self._map_path}, and no single mistake of the set-up explains it: "
+                "check that it is the map of this place, then the positions of its markers and the camera's transform."
+            )
+        if checked.correction is not None:
+            self.sentences.append(checked.correction.sentence)
+            self.config, changed = checked.correction.config, checked.correction.landmark_map
+            self.landmark_map = None if changed is landmark_map else changed
+        if checked.corrected is not None:
+            self._frames(excerpt, checked)
+
+    def _frames(self, excerpt: Excerpt, checked: Checked) -> None:
+        assert checked.corrected is not None
+        poses = checked.corrected.poses
+        stamps = np.array([p.stamp_ns for s in checked.stretches for p in s.pictures], dtype=np.int64)
+        started = self._started(excerpt, int(stamps[0]), poses[0])
+        sentence = None if started is None else first_pose_sentence(self.config, started)
+        if sentence is not None:
+            self.sentences.append(sentence)
+            self._change("estimator", initial_pose=None)
+        sentence = truth_sentence(self.config, excerpt.truth, stamps, poses)
+        if sentence is not None:
+            self.sentences.append(sentence)
+            self._change("truth", align="se2")
+
+    def _started(self, excerpt: Excerpt, stamp_ns: int, pose: FloatArray) -> FloatArray | None:
+        """The pose at the run's start ``(3,)``, by the wheels, if that was not long before."""
+        first = min((e.stamp_ns for e in excerpt.motion), default=stamp_ns)
+        if self.config.estimator.initial_pose is None or not 0 <= stamp_ns - first < _MOST_TRAVEL_S * 1e9:
+            return None
+        grid = np.append(np.arange(first, stamp_ns, round(GRID_S * 1e9)), stamp_ns)
+        steps = wheel_increments(excerpt, self.config, grid) if len(grid) > 1 else None
+        travelled = np.zeros(3)
+        for step in () if steps is None else steps:
+            travelled = se2.compose(travelled, se2.exp(step))
+        return se2.compose(pose, se2.inverse(travelled))
+
+    def _change(self, section: str, **values: object) -> None:
+        part = getattr(self.config, section).model_copy(update=values)
+        self.config = self.config.model_copy(update={section: part})
+
+
+# --- While a run goes on ----------------------------------------------------------------------------------------------
+
+_FIRST_S, _GROWTH = 20.0, 2.0  # signals of a first comparison, and how many times as much the next one needs
+_FIRST_MOVING_S, _GROWTH_MOVING = 5.0, 1.4  # likewise, of motion: until `_FIRST_S` of it, four more comparisons
+_MOVES_M_S, _MOVES_RAD_S = 0.01, 0.02  # by the wheels: below, the robot stands
+_SCALES = ("sightings.scale", "wheels.scale", "map.unit", "scales", "sightings.range")
+_TURNED_RAD = 0.3  # of a camera: more than the turn by which wheels are off
+_SPARSE_S = 0.09  # images closer than this to the one before add little information
+
+
+class Diagnosis:
+    """Collects the signals of a run, in bounded memory, whatever the estimator makes of them.
+
+    Corners of markers are compared as points in the camera's axes.
+
+    Attributes:
+        found: by the last comparison; of little motion, by the last two alike.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        camera: Camera | None,
+        T_base_sensor: FloatArray | None,
+        imu_up: FloatArray | None,
+        floor: FloorWatch | None = None,
+    ) -> None:
+        """Set up for the sensors of a run.
+
+        Args:
+            config: as the run uses it.
+            landmark_map: the known map; None if landmarks are estimated.
+            camera: of corners; None if there is none.
+            T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: there is no gyro.
+            floor: watches whether it is flat; None: it may be as it is.
+        """
+        self._floor, self._camera, self._map, self._up = floor, camera, landmark_map, imu_up
+        self._config, self._place = config, T_base_sensor
+        if camera is not None:
+            self._config = with_values(config, "recording", {"sightings_axes": "optical"})
+            self._place = camera.T_base_cam
+        sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)  # what it refuses does not count
+        place = np.eye(4) if self._place is None else self._place
+        self._corners = SightingCollector(config, landmark_map, sensor, place)
+        self._signals = SignalCollector(config)
+        self._began_ns: int | None = None
+        self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0
+        self._moving_s, self._compared_moving_s = 0.0, 0.0
+        self._codes: set[str] = set()  # found by the last comparison
+        self.found: tuple[Finding, ...] = ()
+
+    def add(self, event: Event) -> None:
+        """Take the signals of an event, as it came: what the gate refuses may have another unit."""
+        self._began_ns = event.received_ns if self._began_ns is None else self._began_ns
+        if not self._signals.add(event):
+            return
+        self._span_s = (event.received_ns - self._began_ns) * 1e-9
+        if not isinstance(event, SightingsEvent) or not event.in_pixels:
+            return
+        signals = self._signals.found
+        at_s = (event.stamp_ns - signals.origin_ns) * 1e-9
+        if abs(at_s - self._looked_s) >= _SPARSE_S:
+            self._looked_s, signals.spatial = at_s, True
+            signals.seen += [(at_s, s.landmark_id, *s.point.tolist()) for s in self._corners.sightings(event, at_s)]
+
+    def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
+        """Watch the floor over a step.
+
+        Args:
+            step: as the localizer got it.
+            by_hand: a person has the robot in hand.
+            motion: ``(3,)`` by the wheels, which tells how much of the signals is of a robot in motion.
+        """
+        if self._floor is not None:
+            self._floor.observe(step, by_hand)
+        if motion is not None and (
+            math.hypot(motion[0], motion[1]) > _MOVES_M_S * step.dt or abs(motion[2]) > _MOVES_RAD_S * step.dt
+        ):
+            self._moving_s += step.dt
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """What is surely wrong with the configuration, and makes the poses wrong: a sentence each."""
+        sentence = None if self._floor is None else self._floor.sentence
+        return () if sentence is None else (sentence,)
+
+    def findings(self, ended: bool = True) -> tuple[Finding, ...]:
+        """Findings: signals of the sensors that do not fit together, each with its remedy.
+
+        Args:
+            ended: compare all signals; otherwise only once they are many more than those compared before.
+        """
+        comparison = self.comparison(ended)
+        if comparison is not None:
+            comparison()
+        return self.found
+
+    def comparison(self, ended: bool = False) -> Callable[[], None] | None:
+        """A comparison to be made by any thread, of the signals so far; it sets `found`.
+
+        Args:
+            ended: as `findings` has it. None is given where no comparison is due.
+        """
+        growth = _GROWTH_MOVING if self._compared_moving_s < _FIRST_S else _GROWTH
+        enough = self._span_s >= max(_FIRST_S, _GROWTH * self._compared_s)
+        enough |= self._moving_s >= max(_FIRST_MOVING_S, growth * self._compared_moving_s)
+        if self._span_s <= self._compared_s or not (ended or enough):
+            return None
+        self._compared_s, self._compared_moving_s = self._span_s, self._moving_s
+        now = self._signals.found
+        signals = replace(now, **{f.name: copy.copy(getattr(now, f.name)) for f in fields(now)})
+        little = not ended and 0.0 < self._moving_s < _FIRST_S
+        return lambda: self._compare(signals, little)
+
+    def _compare(self, signals: Signals, little: bool) -> None:
+        found = conventions(signals, self._config, self._place, self._up, self._map)
+        named = ordered(found.findings if self._camera is None else self._of_camera(found.findings))
+        self.found = tuple(f for f in named if not little or f.code in self._codes)
+        self._codes = {f.code for f in named}
+
+    @staticmethod
+    def _of_camera(findings: Iterable[Finding]) -> Iterator[Finding]:
+        """Findings about points that corners of markers tell: sizes and focal length are in every distance.
+
+        Small turns of the camera are left to the graph, and to the fit of corners before a run: at a marker's distance
+        the wheels' own turn does the same.
+        """
+        for finding in findings:
+            severity = min(finding.severity, Severity.WARNING)
+            if finding.code == "sightings.mounting" and abs(finding.value or 0.0) < _TURNED_RAD:
+                continue
+            if finding.code not in _SCALES:
+                yield replace(finding, severity=severity)
+                continue
+            said = finding.text.partition(": set ")[0].removesuffix(".")
+            text = f"{said}; a wrong size of the markers or focal length does the same: measure them."
+            yield replace(finding, text=text, lines={}, severity=severity)
+
+
+# --- After a run ------------------------------------------------------------------------------------------------------
+
+_CLOCK_REASONS = ("late", "future", "stray", "stamp_zero", "duplicate", "duplicate_stamp")
+
+
+def unused_sightings(rejections: Mapping[str, int], roles: Mapping[Role, str], used: int) -> tuple[str, ...]:
+    """A sentence if no sighting reached the estimator and stamps are the main reason.
+
+    Args:
+        rejections: of the run, by "sensor.reason".
+        roles: topics in use.
+        used: sightings that the estimator was given, whatever it made of them.
+    """
+    role: Role = "image" if "image" in roles else "sightings"
+    if used or role not in roles:
+        return ()
+    dropped = {k: n for k, n in rejections.items() if k.split(".")[0] in ("sightings", "image") and n}
+    by_clock = {k: n for k, n in dropped.items() if k.split(".", 1)[1] in _CLOCK_REASONS}
+    if 2 * sum(by_clock.values()) <= sum(dropped.values()):
+        return ()
+    reasons = ", ".join(f"{name} {n}" for name, n in sorted(by_clock.items(), key=lambda item: -item[1]))
+    return (
+        f"None of the sightings on {roles[role]} was used, for their stamps do not fit the clock of the other topics "
+        f"({reasons}): the run is dead reckoning. `fgloc info` compares the clocks; recording.received_stamps: "
+        f"[{role}] takes the receive times instead.",
+    )
