@@ -5,6 +5,8 @@ FROM python:3.12-slim AS build
 WORKDIR /source
 COPY pyproject.toml README.md LICENSE constraints.txt ./
 COPY fgloc fgloc
+COPY training training
+COPY datasets datasets
 RUN python -m venv /opt/fgloc \
     && /opt/fgloc/bin/pip install --no-cache-dir -c constraints.txt '.[live]'
 

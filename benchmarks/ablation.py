@@ -26,7 +26,7 @@ from fgloc.ablation.jobs import Job, make_jobs
 from fgloc.ablation.records import Record, attempts, record_path
 from fgloc.ablation.suite import Suite, expand
 from fgloc.ablation.sweep import sweep
-from fgloc.datasets import mrclam
+from fgloc_datasets import mrclam
 
 _ROOT = Path(__file__).resolve().parent.parent
 _SAMPLE = _ROOT / "datasets" / "samples" / "first_run" / "bag"

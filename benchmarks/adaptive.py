@@ -30,9 +30,9 @@ from benchmarks.adaptive_recordings import SEEDS, Split, prepare
 from benchmarks.adaptive_runs import CASES, cell
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
-from fgloc.datasets.sim.camera import RenderError
 from fgloc.instrumentation.progress import counted
 from fgloc.types import FloatArray
+from fgloc_datasets.sim.camera import RenderError
 
 
 @dataclass(frozen=True, slots=True)

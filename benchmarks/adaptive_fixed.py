@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.adaptive_recordings import SEEDS, prepare
 from benchmarks.adaptive_runs import CASES, cell
-from fgloc.datasets.sim.record import robot_settings
-from fgloc.datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.record import robot_settings
+from fgloc_datasets.sim.scenario import Scenario
 
 WAY, TURN = 5.0, 5.0  # as tuned
 _FACTORS = (1.0, 3.0, 10.0, 30.0)

@@ -21,13 +21,13 @@ from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, not_run
 from fgloc import se2
 from fgloc.config import load_config
-from fgloc.datasets import mrclam
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Event, TruthEvent
+from fgloc_datasets import mrclam
 
 _ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

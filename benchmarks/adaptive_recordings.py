@@ -24,9 +24,6 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from fgloc.config import Config
-from fgloc.datasets.sim.record import describe, is_recorded, robot_settings
-from fgloc.datasets.sim.scenario import Scenario
-from fgloc.datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
@@ -37,6 +34,9 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.markers.images import ImageError
 from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
+from fgloc_datasets.sim.record import describe, is_recorded, robot_settings
+from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 
 Split = Literal["train", "validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]

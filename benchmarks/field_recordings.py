@@ -22,11 +22,11 @@ from rosbags.highlevel import AnyReader
 from scipy.io import loadmat
 
 from fgloc import se2
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.convert import Message, nanoseconds, new_bag, read_table, write_merged
 from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
 from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.convert import Message, nanoseconds, new_bag, read_table, write_merged
 
 DATA = Path(os.environ.get("FGLOC_REAL_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 _EPOCH_S = 1_600_000_000.0

@@ -1,15 +1,15 @@
 """Following waypoints: ``python -m benchmarks.follow [--quick] [--json FILE] [--split validation] [--jobs N]``.
 
 A simulated robot, as installed by a careful person (`benchmarks.installed`), drives itself along waypoints
-(`fgloc.datasets.sim.following`). Nothing is told of what is off. ``track_mm``: mean distance of the true path from the
+(`fgloc_datasets.sim.following`). Nothing is told of what is off. ``track_mm``: mean distance of the true path from the
 curve through the waypoints, over the length of the path. Values are means over the seeds, spreads their standard
 deviations; a value ``a_over_b`` is the mean of a over the mean of b, its spread that of the single ratios.
 ``over_truth``: over a drive on the same floor with the true pose. ``no_model_pose``, ``no_model_seconds``: error of the
 pose that guided the robot, and how long it drove, without the learned motion: an uncertain robot slows down and waits.
 ``reached``: share of the waypoints that the robot has come within 10 cm of.
 
-With ``--corners`` the camera sends corners with a detector's noise (`fgloc.datasets.sim.corners`); nothing is rendered.
-Cases (`fgloc.datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
+With ``--corners`` the camera sends corners with a detector's noise (`fgloc_datasets.sim.corners`); nothing is rendered.
+Cases (`fgloc_datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 16 to 36 s, on ice; onewheel, the left encoder counts nothing in that
 time; moved, a marker is 0.5 m from where the map has it. Rows ``slope``, ``rough`` and ``flat.uneven_over_flat`` are
 described in `benchmarks.follow_ground`; ``--ground`` measures these alone. Finished drives are kept, so that an
@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks import follow_ground
 from benchmarks.common import Row, main, not_run
 from benchmarks.follow_runs import Cell, Driven, run_all
-from fgloc.datasets.sim.camera import RenderError
-from fgloc.datasets.sim.following import PoseName
+from fgloc_datasets.sim.camera import RenderError
+from fgloc_datasets.sim.following import PoseName
 
 Split = Literal["validation", "test"]
 SEEDS: dict[Split, tuple[int, ...]] = {"validation": (141, 142, 143), "test": tuple(range(161, 171))}

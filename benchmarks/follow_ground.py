@@ -28,12 +28,12 @@ from benchmarks.adaptive_recordings import cache_folder
 from benchmarks.common import Row
 from benchmarks.follow_runs import source_hash
 from fgloc.config import Config, load_config
-from fgloc.datasets.sim.following import PoseName, follow
-from fgloc.datasets.sim.following.cases import drive_of
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.files.atomic import atomic_file
 from fgloc.runner import run
+from fgloc_datasets.sim.following import PoseName, follow
+from fgloc_datasets.sim.following.cases import drive_of
 
 _GUIDE: dict[str, PoseName] = {"slope": "fgloc", "rough": "truth", "level": "truth"}
 _FLAT_TOO = ("slope", "level")

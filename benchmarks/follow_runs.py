@@ -19,10 +19,10 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks.adaptive_recordings import cache_folder
-from fgloc.datasets.sim.following import PoseName, follow
-from fgloc.datasets.sim.following.cases import drive_of
 from fgloc.errors import FglocError
 from fgloc.files.atomic import atomic_file
+from fgloc_datasets.sim.following import PoseName, follow
+from fgloc_datasets.sim.following.cases import drive_of
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What came of it: see `fgloc.datasets.sim.following.results.Score`; or why it failed."""
+    """What came of it: see `fgloc_datasets.sim.following.results.Score`; or why it failed."""
 
     track_mm: float = float("nan")
     reached: float = 0.0

@@ -29,11 +29,11 @@ from benchmarks.gross_recordings import MISTAKES, write
 from benchmarks.installed_recordings import SEEDS, Take, folder, prepare
 from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
-from fgloc.datasets.sim.camera import RenderError
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.errors import FglocError
 from fgloc.replay.options import RunMode
 from fgloc.runner import run
+from fgloc_datasets.sim.camera import RenderError
 
 RECORDINGS = 3
 QUICK = ("size_0.95", "joints_swapped", "dictionary")

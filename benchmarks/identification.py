@@ -27,19 +27,19 @@ from benchmarks import identification_husky, identification_limits, identificati
 from benchmarks.common import Row, main, not_run
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
-from fgloc.datasets import mrclam
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.sensors.learned import MotionModel, load_model, save_model
 from fgloc.sensors.learned.card import Kinematics, Split
 from fgloc.sensors.learned.load import model_of, read_model
-from fgloc.training.adapt import adapted
-from fgloc.training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc.training.data import Run, cut, make_run
-from fgloc.training.evaluate import STEP_S, Figures, evaluate
-from fgloc.training.rollouts import Rollout, roll_kinematics, roll_model
-from fgloc.training.train import leave_one_out, train
 from fgloc.types import ControlEvent, FloatArray
+from fgloc_datasets import mrclam
+from fgloc_training.adapt import adapted
+from fgloc_training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc_training.data import Run, cut, make_run
+from fgloc_training.evaluate import STEP_S, Figures, evaluate
+from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model
+from fgloc_training.train import leave_one_out, train
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

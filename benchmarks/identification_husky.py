@@ -17,19 +17,19 @@ import numpy as np
 
 from benchmarks.common import Row
 from fgloc.config import load_config
-from fgloc.datasets import drive
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Input, Split
-from fgloc.training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc.training.data import Run, make_run
-from fgloc.training.evaluate import evaluate
-from fgloc.training.rollouts import Rollout, roll_model, roll_wheels
-from fgloc.training.sensor_record import SensorRecord
-from fgloc.training.train import train
 from fgloc.types import Event, TruthEvent
+from fgloc_datasets import drive
+from fgloc_training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc_training.data import Run, make_run
+from fgloc_training.evaluate import evaluate
+from fgloc_training.rollouts import Rollout, roll_model, roll_wheels
+from fgloc_training.sensor_record import SensorRecord
+from fgloc_training.train import train
 
 _STEPS = {"train": range(120), "validation": range(120, 150), "test": range(150, 201)}  # of the calibration
 _HORIZON_S = 1.5

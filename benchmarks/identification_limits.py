@@ -16,8 +16,8 @@ import numpy as np
 from scipy.stats import kurtosis
 
 from benchmarks.common import Row
-from fgloc.datasets import mrclam
 from fgloc.types import FloatArray
+from fgloc_datasets import mrclam
 
 _GAIN = 0.93  # of the turn command
 _CLEAR = 0.15  # rad/s, a change of command

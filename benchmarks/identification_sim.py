@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import Row
-from fgloc.datasets.sim.suite import BUNDLED, Job, jobs, load_suite, record_suite
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Input, Split
-from fgloc.training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc.training.data import Run, load_run
-from fgloc.training.evaluate import STEP_S, evaluate
-from fgloc.training.rollouts import Rollout, roll_model, roll_wheels
-from fgloc.training.train import train
+from fgloc_datasets.sim.suite import BUNDLED, Job, jobs, load_suite, record_suite
+from fgloc_training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc_training.data import Run, load_run
+from fgloc_training.evaluate import STEP_S, evaluate
+from fgloc_training.rollouts import Rollout, roll_model, roll_wheels
+from fgloc_training.train import train
 
 _SEEDS = {"train": (11, 12, 13, 14), "validation": (21, 22, 23), "test": (31, 32, 33, 34)}
 _WINDOW_S = 5.0

@@ -32,7 +32,7 @@ from benchmarks.installed_recordings import SEEDS, Take, Variant, prepare
 from benchmarks.installed_runs import CASES, Cell, floor, run_all
 from benchmarks.installed_scores import Scores, inside
 from benchmarks.textbook import PIPELINES
-from fgloc.datasets.sim.camera import RenderError
+from fgloc_datasets.sim.camera import RenderError
 
 QUICK_CASES = ("none", "slip")
 TEXTBOOK_CASES = ("none", "slip", "dark30", "ids30", "moved")

@@ -26,14 +26,14 @@ from benchmarks.installed_recordings import SEEDS, installed
 from benchmarks.installed_runs import kept
 from fgloc.calibration.survey import survey
 from fgloc.config import Config, load_config
-from fgloc.datasets.sim.camera import RenderError
-from fgloc.datasets.sim.installed import INSTALLED, load_installed
-from fgloc.datasets.sim.scenario import Control, Markers, Scenario, World
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match_result
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import LandmarkMap
+from fgloc_datasets.sim.camera import RenderError
+from fgloc_datasets.sim.installed import INSTALLED, load_installed
+from fgloc_datasets.sim.scenario import Control, Markers, Scenario, World
 
 TOUR_S = 180.0
 VALIDATION = 3  # seeds of the validation split that are used

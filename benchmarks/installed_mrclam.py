@@ -23,10 +23,10 @@ from benchmarks.common import Row, not_run
 from benchmarks.installed_runs import kept
 from benchmarks.installed_scores import errors
 from fgloc.config import load_config
-from fgloc.datasets import mrclam
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.types import Estimate, Step, Trajectory
+from fgloc_datasets import mrclam
 
 _ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

@@ -45,8 +45,8 @@ from benchmarks.mechanisms_robots import SOURCE
 from benchmarks.mechanisms_rows import CASES, Outcomes, Scope, Wanted, of_one, over_before, wanted
 from benchmarks.mechanisms_runs import run_all, run_plain
 from benchmarks.mechanisms_switch import Mechanism, together
-from fgloc.datasets import mrclam
-from fgloc.datasets.sim.camera import RenderError
+from fgloc_datasets import mrclam
+from fgloc_datasets.sim.camera import RenderError
 
 RULES = "corners_rules"
 RULES_CASES = ("none", "slip", "mu01", "dark30", "ids30", "moved", "frozen", "onewheel")

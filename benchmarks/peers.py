@@ -39,8 +39,6 @@ from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
 from fgloc.ablation.failures import Scene, corrupt, generators
 from fgloc.config import load_config
-from fgloc.datasets import mrclam
-from fgloc.datasets.bag import BagWriter
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.matching import match
 from fgloc.frames import quaternion_yaw
@@ -53,6 +51,8 @@ from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, Event, Step, Trajectory, TruthEvent
+from fgloc_datasets import mrclam
+from fgloc_datasets.bag import BagWriter
 
 CASES = ("none", "slip", "dark30", "ids30", "moved", "frozen")
 _REWRITTEN = (

@@ -25,13 +25,13 @@ from benchmarks.installed_mrclam import DATA, MODELS
 from fgloc import se2
 from fgloc.ablation.jobs import start_at_truth
 from fgloc.config import Config, load_config
-from fgloc.datasets import mrclam
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, FloatArray, LandmarkMap, Step, Trajectory
+from fgloc_datasets import mrclam
 
 SOURCE = DATA / "mrclam6"
 _START = np.array([0.1, 0.1, 0.1])  # m, m, rad

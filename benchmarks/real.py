@@ -1,7 +1,7 @@
 """Real recordings and the bundled sample, through the same program: ``python -m benchmarks.real``.
 
 MRCLAM 6: robot k is localized with a motion model trained on the other four and constants fitted on the other four
-(`fgloc.datasets.mrclam`); shared settings (correlation time of the sightings, priors of the self-calibration) are one
+(`fgloc_datasets.mrclam`); shared settings (correlation time of the sightings, priors of the self-calibration) are one
 set for all five. Values are means over the robots, spreads their standard deviation.
 """
 
@@ -18,7 +18,6 @@ from benchmarks import stills
 from benchmarks.common import Row, main, not_run
 from fgloc import se2
 from fgloc.config import Config, load_config
-from fgloc.datasets import mrclam, pioneer, turtlebot3
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
@@ -27,6 +26,7 @@ from fgloc.sensors.landmarks import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.types import PointMeasurement, RunResult
+from fgloc_datasets import mrclam, pioneer, turtlebot3
 
 _ROOT = Path(__file__).resolve().parent.parent
 _DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))

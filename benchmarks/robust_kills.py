@@ -128,8 +128,8 @@ def _ablation(place: Path, bag: Path) -> Writer:
 
 
 def _simulation(place: Path) -> Writer:
-    from fgloc.datasets.sim.record import record
-    from fgloc.datasets.sim.scenario import Scenario
+    from fgloc_datasets.sim.record import record
+    from fgloc_datasets.sim.scenario import Scenario
 
     out = place / "sim" / "out"
     scenario = Scenario(name="short", duration_s=0.5)
@@ -142,7 +142,7 @@ def _simulation(place: Path) -> Writer:
 
 
 def _training(place: Path) -> Writer:
-    from fgloc.training.session import Reporter, train_models
+    from fgloc_training.session import Reporter, train_models
     from tests.support.synthetic_robot import write_bag
 
     out = place / "train" / "out"

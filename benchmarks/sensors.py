@@ -17,10 +17,10 @@ from benchmarks.common import Row, main
 from benchmarks.example_sensors import example_sensors
 from fgloc.ablation.jobs import start_at_truth
 from fgloc.config import Config, load_config
-from fgloc.datasets.sim.record import record
-from fgloc.datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc.evaluation.metrics import Metrics, compute_metrics
 from fgloc.runner import run
+from fgloc_datasets.sim.record import record
+from fgloc_datasets.sim.scenario import Gnss, Scenario, Uwb
 
 SEEDS = (71, 72, 73, 74, 75)
 NAMES = ("uwb", "gnss")

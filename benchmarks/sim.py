@@ -16,11 +16,15 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.sim.camera import RenderError, frames, pose_at
-from fgloc.datasets.sim.floor import Floor
-from fgloc.datasets.sim.mjcf import camera_rotation, intrinsics
-from fgloc.datasets.sim.physics import (
+from fgloc.frames import quaternion_matrix
+from fgloc.sensors.markers.config import MarkersConfig
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.types import FloatArray
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.sim.camera import RenderError, frames, pose_at
+from fgloc_datasets.sim.floor import Floor
+from fgloc_datasets.sim.mjcf import camera_rotation, intrinsics
+from fgloc_datasets.sim.physics import (
     Log,
     Scene,
     base_twist,
@@ -30,14 +34,10 @@ from fgloc.datasets.sim.physics import (
     slipping,
     wheel_twist,
 )
-from fgloc.datasets.sim.record import record
-from fgloc.datasets.sim.scenario import Camera, Control, Robot, Scenario, World
-from fgloc.datasets.sim.sensors import streams
-from fgloc.datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
-from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.types import FloatArray
+from fgloc_datasets.sim.record import record
+from fgloc_datasets.sim.scenario import Camera, Control, Robot, Scenario, World
+from fgloc_datasets.sim.sensors import streams
+from fgloc_datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 
 _HALL = World(size_m=(30.0, 30.0))
 _NEAR_M = 3.0
@@ -220,7 +220,7 @@ def _round_trip(seconds: float) -> Row:
 
 
 def _can_render(scene: Scene) -> bool:
-    from fgloc.datasets.sim.camera import Renderer
+    from fgloc_datasets.sim.camera import Renderer
 
     try:
         Renderer(scene).close()

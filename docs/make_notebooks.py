@@ -21,8 +21,9 @@ import fgloc
 from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error
 from fgloc.evaluation.trajectory_plot import plot_trajectory
+from fgloc_datasets import SAMPLE
 
-sample = Path(fgloc.__file__).parent / "datasets" / "samples" / "installed_run"
+sample = SAMPLE.parent
 config = fgloc.load_config(sample / "robot.yaml")
 result = fgloc.run(sample / "bag", sample / "map.yaml", config, "batch")
 len(result.trajectory), result.notes""",

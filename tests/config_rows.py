@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from fgloc.config import Config
-from fgloc.training.config import TrainConfig
+from fgloc_training.config import TrainConfig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = {"configuration.md": Config, "identification.md": TrainConfig}

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_results import START_NS, figure_eight
+from source_roots import PYTHONPATH
 
 import fgloc
 
@@ -63,9 +64,7 @@ def test_public_names_are_these():
 
 def test_all_errors_are_public():
     known = {fgloc.FglocError.__name__} | {
-        error.__name__
-        for error in fgloc.FglocError.__subclasses__()
-        if error.__module__.startswith("fgloc.") and not error.__module__.startswith("fgloc.datasets.")
+        error.__name__ for error in fgloc.FglocError.__subclasses__() if error.__module__.startswith("fgloc.")
     }
     assert known <= set(fgloc.__all__)
 
@@ -103,7 +102,7 @@ def run_example(*arguments):
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
+        env={**os.environ, "PYTHONPATH": PYTHONPATH, "MPLBACKEND": "agg"},
     )
 
 

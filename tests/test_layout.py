@@ -12,10 +12,12 @@ import pytest
 from config_rows import rows, sections, tables
 
 import fgloc
-from fgloc.training.config import TrainConfig
+import fgloc_datasets
+from fgloc_training.config import TrainConfig
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
-MODULES = sorted((ROOT / "fgloc").rglob("*.py"))
+PACKAGES = {"fgloc": ROOT, "fgloc_datasets": ROOT / "datasets", "fgloc_training": ROOT / "training"}
+MODULES = sorted(path for name, folder in PACKAGES.items() for path in (folder / name).rglob("*.py"))
 BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats", "rounding"}
 UPWARD = {
     ("types", "fgloc.evaluation.report"),  # RunResult.write, imported when it is called
@@ -23,21 +25,24 @@ UPWARD = {
 }
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
-OUTER = {"datasets": {"datasets"}, "training": {"datasets", "training"}}  # which of the two each may import
+OUTER = {  # which of the two each may import
+    "fgloc_datasets": {"fgloc_datasets"},
+    "fgloc_training": {"fgloc_datasets", "fgloc_training"},
+}
 ONLY = {  # the places that may import a library
-    "rosbags": {"recording", "datasets"},
+    "rosbags": {"recording", "fgloc_datasets"},
     "mcap": {"recording"},
     "gtsam": {"graph"},
-    "cv2": {"sensors", "datasets"},
-    "matplotlib": {"evaluation", "datasets", "training"},
+    "cv2": {"sensors", "fgloc_datasets"},
+    "matplotlib": {"evaluation", "fgloc_datasets", "fgloc_training"},
     "typer": {"cli"},
     "rich": {"cli"},
     "dask": {"ablation"},
     "distributed": {"ablation"},
     "cyclonedds": {"live"},
     "rerun": {"view"},
-    "mujoco": {"datasets"},
-    "torch": {"training"},
+    "mujoco": {"fgloc_datasets"},
+    "torch": {"fgloc_training"},
 }
 NEVER = {"datasets", "training", "benchmarks", "tests", "evo"}
 EXTRAS = {"dask", "distributed", "cyclonedds", "rerun", "mujoco", "torch"}  # of these packages and no other part
@@ -57,8 +62,9 @@ def imported(path):
 
 
 def part_of(path):
-    """The first name below fgloc: a package or a module."""
-    return path.relative_to(ROOT / "fgloc").parts[0].removesuffix(".py")
+    """The first name below fgloc, a package or a module; outside fgloc the name of the package."""
+    parts = path.relative_to(ROOT).parts
+    return parts[1].removesuffix(".py")
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -67,13 +73,13 @@ def test_imports_follow_the_layers(path):
     for name in imported(path):
         top, *rest = name.split(".")
         assert top not in NEVER, f"{name} in {path}"
-        assert part in ONLY.get(top, {part}), f"{name} in {path}; only {ONLY[top]} of fgloc import it"
+        assert part in ONLY.get(top, {part}), f"{name} in {path}; only {ONLY[top]} import it"
+        if top in OUTER:
+            assert part == "cli" or top in OUTER.get(part, ()), f"{name} in {path}: training → datasets → the rest"
         if top != "fgloc" or not rest or (part, name) in UPWARD:
             continue
         target = rest[0]
         assert target != "cli" or part in ("cli", "__main__"), f"{name} in {path}: nothing imports the command line"
-        if target in OUTER:
-            assert part == "cli" or target in OUTER.get(part, ()), f"{name} in {path}: training → datasets → the rest"
         if part in BASE:
             assert target in BASE, f"{name} in {path}: the foundation stands alone"
         elif part in PARTS:
@@ -100,8 +106,12 @@ def run_python(code):
 
 def test_base_install_is_enough_for_every_module():
     """No module but those of the simulator and of training needs torch or another extra to be imported."""
-    modules = [module.name for module in pkgutil.walk_packages(fgloc.__path__, "fgloc.")]
-    names = [name for name in modules if not name.startswith(("fgloc.datasets.sim.", "fgloc.training."))]
+    modules = [
+        module.name
+        for package in (fgloc, fgloc_datasets)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    names = [name for name in modules if not name.startswith("fgloc_datasets.sim.")]
     code = (
         "import sys\n"
         "class Blocked:\n"
@@ -117,8 +127,8 @@ def test_base_install_is_enough_for_every_module():
 
 def test_help_does_not_wait_for_heavy_libraries():
     done = run_python(
-        "import sys, fgloc.cli; print({'gtsam', 'cv2', 'matplotlib', 'scipy', 'rosbags', 'fgloc.datasets', "
-        "'fgloc.training'} & set(sys.modules))"
+        "import sys, fgloc.cli; print({'gtsam', 'cv2', 'matplotlib', 'scipy', 'rosbags', 'fgloc_datasets', "
+        "'fgloc_training'} & set(sys.modules))"
     )
     assert done.stdout.strip() == "set()", done.stdout + done.stderr
 

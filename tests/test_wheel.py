@@ -31,7 +31,8 @@ def wheel(tmp_path_factory):
     """The wheel of this source, built as `make dist` does."""
     out = tmp_path_factory.mktemp("dist")
     source = out / "source"  # a copy: setuptools leaves its build/ beside what it builds
-    shutil.copytree(ROOT / "fgloc", source / "fgloc", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("fgloc", "training", "datasets"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     subprocess.run(
@@ -69,18 +70,19 @@ def run(wheel, tmp_path_factory):
 
 
 def bundled(run):
-    code = "import fgloc.cli.runs as runs, fgloc; print(runs.SAMPLE)"
+    code = "import fgloc_datasets; print(fgloc_datasets.SAMPLE)"
     sample = Path(run("-c", code, program="python").strip())
     assert not sample.is_relative_to(ROOT)
     return sample
 
 
 @pytest.mark.slow
-def test_the_wheel_is_small_and_holds_no_top_level_package_but_fgloc(wheel):
+def test_the_wheel_is_small_and_holds_no_top_level_package_but_its_three(wheel):
     assert wheel.stat().st_size < MOST_BYTES
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.partition("/")[0] for name in names} == {"fgloc", f"fgloc-{wheel.name.split('-')[1]}.dist-info"}
-    assert [n for n in names if n.endswith(".mcap")] == ["fgloc/datasets/samples/installed_run/bag/bag.mcap"]
+    about = f"fgloc-{wheel.name.split('-')[1]}.dist-info"
+    assert {name.partition("/")[0] for name in names} == {"fgloc", "fgloc_datasets", "fgloc_training", about}
+    assert [n for n in names if n.endswith(".mcap")] == ["fgloc_datasets/samples/installed_run/bag/bag.mcap"]
 
 
 @pytest.mark.slow

@@ -30,8 +30,8 @@ def mrclam(
     fit: Annotated[bool, typer.Option("--fit", help="refit the leave-one-out constants and print them")] = False,
 ) -> None:
     """UTIAS MRCLAM: iRobot Creates and landmarks. Five robots that see each other; truth by Vicon."""
-    from fgloc.datasets import mrclam as data
-    from fgloc.datasets.mrclam_run import Calibration
+    from fgloc_datasets import mrclam as data
+    from fgloc_datasets.mrclam_run import Calibration
 
     check_out(out)
     if download is not None:
@@ -39,7 +39,7 @@ def mrclam(
     if source is None:
         raise typer.BadParameter("give the folder of the unpacked set, or --download FOLDER", param_hint="SRC")
     if fit:
-        from fgloc.datasets.mrclam_fit import left_out
+        from fgloc_datasets.mrclam_fit import left_out
 
         fitted = left_out({k: data.read(source, k) for k in data.ROBOTS})
         for name in Calibration.__dataclass_fields__:
@@ -66,9 +66,9 @@ def pioneer(
     name: Annotated[str, typer.Option(help="which one to download: duarte or pinto1")] = "duarte",
 ) -> None:
     """A Pioneer with ArUco markers. Truth by motion capture."""
-    from fgloc.datasets.download import fetch
-    from fgloc.datasets.pioneer import REMOTES
-    from fgloc.datasets.pioneer import convert as converted
+    from fgloc_datasets.download import fetch
+    from fgloc_datasets.pioneer import REMOTES
+    from fgloc_datasets.pioneer import convert as converted
 
     check_out(out)
     if download is not None:
@@ -95,8 +95,8 @@ def turtlebot3(
     url: Url = None,
 ) -> None:
     """A TurtleBot3 Burger with AprilTags."""
-    from fgloc.datasets.download import unpack
-    from fgloc.datasets.turtlebot3 import convert_and_tell
+    from fgloc_datasets.download import unpack
+    from fgloc_datasets.turtlebot3 import convert_and_tell
 
     check_out(out)
     unknown = "the set has no public address that we know; give one with --url"
@@ -124,8 +124,8 @@ def drive(
     url: Url = None,
 ) -> None:
     """DRIVE: a skid-steered Husky. Windows of 2 s; truth by ICP."""
-    from fgloc.datasets.drive import convert as converted
-    from fgloc.datasets.drive import span
+    from fgloc_datasets.drive import convert as converted
+    from fgloc_datasets.drive import span
 
     check_out(out)
     unknown = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
@@ -136,7 +136,7 @@ def drive(
 
 def _given_or_fetched(source: Path | None, name: str, download: Path | None, url: str | None, unknown: str) -> Path:
     """The recording that was given as the argument ``name``, or downloaded; ``unknown``: why it needs an address."""
-    from fgloc.datasets.download import Remote, fetch
+    from fgloc_datasets.download import Remote, fetch
 
     if download is not None:
         if url is None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-import fgloc
 from fgloc.cli.exports import write_for_viewers
 from fgloc.cli.options import (
     Bag,
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
     from fgloc.types import RunResult
 
 _TOLD = 3  # judgements in the short form
-SAMPLE = Path(fgloc.__file__).parent / "datasets" / "samples" / "installed_run" / "bag"
 
 
 class Speed(StrEnum):
@@ -66,6 +64,8 @@ def demo(
     ),
 ) -> None:
     """Run the bundled recording, batch and online. Says where the reports are."""
+    from fgloc_datasets import SAMPLE
+
     runs: list[tuple[str, Metrics]] = []
     code = 0
     for mode, command in (("batch", "smooth"), ("online", "online")):

@@ -46,8 +46,8 @@ def record(
     longest: Annotated[float | None, typer.Option(metavar="S", min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
     """Record a scenario, or a suite of them. Of a suite only what is missing is recorded."""
-    from fgloc.datasets.sim.record import record as record_run
-    from fgloc.datasets.sim.suite import BUNDLED, find_scenario, jobs, load_suite, record_suite
+    from fgloc_datasets.sim.record import record as record_run
+    from fgloc_datasets.sim.suite import BUNDLED, find_scenario, jobs, load_suite, record_suite
 
     check_out(out)
     from_file = Path(what).suffix in (".yaml", ".yml")
@@ -92,12 +92,12 @@ def follow_path(
     corners: Corners = False,
 ) -> None:
     """Let the robot drive itself along waypoints. Its guide is a pose that is estimated while it drives."""
-    from fgloc.datasets.sim.following.failing import read_failures
-    from fgloc.datasets.sim.following.figures import draw_drives, table
-    from fgloc.datasets.sim.following.loop import Drive, follow, seen_by
-    from fgloc.datasets.sim.following.path import load_path
-    from fgloc.datasets.sim.following.poses import POSES
-    from fgloc.datasets.sim.suite import find_scenario
+    from fgloc_datasets.sim.following.failing import read_failures
+    from fgloc_datasets.sim.following.figures import draw_drives, table
+    from fgloc_datasets.sim.following.loop import Drive, follow, seen_by
+    from fgloc_datasets.sim.following.path import load_path
+    from fgloc_datasets.sim.following.poses import POSES
+    from fgloc_datasets.sim.suite import find_scenario
 
     check_out(out)
     known = {name: name for name in POSES}
@@ -119,8 +119,8 @@ def follow_demo(
     corners: Corners = False,
 ) -> None:
     """Six drives, with a picture and a table. Flat, on ice, with sensors that fail."""
-    from fgloc.datasets.sim.following.demo import PICTURE, demonstrate
-    from fgloc.datasets.sim.following.loop import seen_by
+    from fgloc_datasets.sim.following.demo import PICTURE, demonstrate
+    from fgloc_datasets.sim.following.loop import seen_by
 
     check_out(out)
     say(demonstrate(out, workers, seen_by(corners)))
@@ -133,7 +133,7 @@ def figures(
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the pictures")],
 ) -> None:
     """Draw a recorded run. Trajectory, controls, slip and, if it has images, a contact sheet with detections."""
-    from fgloc.datasets.sim.figures import draw
+    from fgloc_datasets.sim.figures import draw
 
     check_out(out)
     for path in draw(run, out):

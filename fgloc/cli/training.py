@@ -53,7 +53,7 @@ def train(
             "for one of these recordings: fgloc train --init BAG... --out train.yaml"
         )
     check_out(out)
-    from fgloc.training.session import CHECKPOINTS, Reporter, train_models
+    from fgloc_training.session import CHECKPOINTS, Reporter, train_models
 
     (config,) = inputs
     kept = f"what was trained so far is kept in {out / CHECKPOINTS}; the same command goes on from there"
@@ -81,7 +81,7 @@ def evaluate_model(
     for path, folder in ((json_file, False), (plots, True)):
         if path is not None:
             check_out(path, folder)
-    from fgloc.training.evaluate import compare, draw, table, write_json
+    from fgloc_training.evaluate import compare, draw, table, write_json
 
     found, rows = compare(model, bags, against or [])
     say(table(rows))
@@ -95,7 +95,7 @@ def _write_config(bags: list[Path], out: Path) -> None:
     """``--init``."""
     from fgloc.cli.options import configured
     from fgloc.recording.outputs import write_text
-    from fgloc.training.initial import look, missing, training_yaml
+    from fgloc_training.initial import look, missing, training_yaml
 
     check_out(out, folder=False)
     found = [look(bag, configured(bag, None, None)) for bag in bags]

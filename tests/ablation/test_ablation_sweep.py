@@ -20,8 +20,8 @@ from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import attempts, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import ConfigError
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}

@@ -13,11 +13,11 @@ from fgloc import cli, se2
 from fgloc.calibration.installation import found_text, given_text, setting_unit
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, yaml_of
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.learned.config import model_path
 from fgloc.types import Setting
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (4.0, 0.5), 1: (0.5, 4.0), 2: (-4.0, -0.5), 3: (-0.5, -4.0)}

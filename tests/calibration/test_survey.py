@@ -18,6 +18,7 @@ from fgloc.evaluation.metrics import match_result
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import LandmarkMap
+from fgloc_datasets import SAMPLE
 
 START = truth_at(0.0)
 SIZE = 0.25
@@ -184,8 +185,6 @@ def test_what_is_missing_is_said(bag, tmp_path):
 
 
 def test_images_without_a_dictionary_get_one_suggested(tmp_path):
-    from fgloc.cli.runs import SAMPLE
-
     done = CliRunner().invoke(app, ["map", str(SAMPLE), "--size", "0.2", "--out", str(tmp_path / "map.yaml")])
     assert done.exit_code == 1
     assert "--dictionary DICT_4X4_50" in done.output

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from command_line import fgloc
 
-from fgloc import cli, se2
-from fgloc.datasets.bag import BagWriter
+import fgloc_datasets
+from fgloc import se2
 from fgloc.recording.outputs import write_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Trajectory
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
@@ -241,7 +242,7 @@ def test_pipe_gets_no_progress_bar_and_no_traceback(bag, tmp_path):
 
 
 def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli.runs, "SAMPLE", bag)
+    monkeypatch.setattr(fgloc_datasets, "SAMPLE", bag)
     code, stdout, _ = fgloc("demo", "--out", tmp_path / "out")
     assert code == 0
     for mode in ("batch", "online"):

@@ -15,14 +15,14 @@ from test_cli import write_circle
 from fgloc.cli import extras
 from fgloc.cli.progress import LINE_S, Lines
 from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.evaluation.warnings import all_findings
 from fgloc.instrumentation import progress
 from fgloc.runner import run
 from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.training.config import load_train_config
 from fgloc.types import Finding, Severity, ordered
+from fgloc_datasets.bag import BagWriter
+from fgloc_training.config import load_train_config
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from source_roots import PYTHONPATH
 
 import fgloc
 
@@ -34,7 +35,7 @@ def test_the_tutorial_leads_from_bags_to_a_model(tmp_path):
     command = tmp_path / "bin" / "fgloc"
     command.write_text(f'#!/bin/sh\nexec {sys.executable} -m fgloc "$@"\n')
     command.chmod(0o755)
-    paths = {"PATH": f"{command.parent}:{os.environ['PATH']}", "PYTHONPATH": str(PAGE.parent.parent)}
+    paths = {"PATH": f"{command.parent}:{os.environ['PATH']}", "PYTHONPATH": PYTHONPATH}
     said = ""
     for block in blocks("sh"):
         done = subprocess.run(

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fgloc.datasets.download import Remote, fetch, unpack
 from fgloc.errors import RecordingError
+from fgloc_datasets.download import Remote, fetch, unpack
 
 _CONTENT = bytes(range(256)) * 300
 

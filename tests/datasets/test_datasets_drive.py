@@ -12,10 +12,10 @@ from dataset_files import header_ns, read_back
 from real_data import real_data
 
 from fgloc.config import load_config
-from fgloc.datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, convert, span
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels.events import JointsEvent
+from fgloc_datasets.drive import _COLUMNS, TRACK_M, WHEEL_RADIUS_M, convert, span
 
 _ROWS = 40
 

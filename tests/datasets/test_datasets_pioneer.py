@@ -13,14 +13,14 @@ from real_data import real_data
 from rosbags.rosbag1 import Writer
 
 from fgloc.config import load_config
-from fgloc.datasets.mounting import sensor_mounting
-from fgloc.datasets.pioneer import convert, date_bursts
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.marker_pose.events import MarkerPosesEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Trajectory, TruthEvent
+from fgloc_datasets.mounting import sensor_mounting
+from fgloc_datasets.pioneer import convert, date_bursts
 
 _START_NS = 1_575_641_303_000_000_000
 _WRONG_CLOCK_NS = 1_202_150_932_000_000_000

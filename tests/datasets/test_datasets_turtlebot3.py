@@ -12,8 +12,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
 from fgloc.config import load_config
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.turtlebot3 import convert
 from fgloc.errors import MapError, RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
@@ -21,6 +19,8 @@ from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.turtlebot3 import convert
 
 _NAME = "rosbag2_2025_11_25-15_11_34"
 _START_NS = 1_764_079_894_000_000_000

@@ -9,12 +9,12 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from fgloc.config import load_config
-from fgloc.datasets.sim.floor import Floor, Patch
-from fgloc.datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from fgloc.datasets.sim.readings import odometry
-from fgloc.datasets.sim.record import is_recorded, record
-from fgloc.datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 from fgloc.sensors.maps import load_map
+from fgloc_datasets.sim.floor import Floor, Patch
+from fgloc_datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
+from fgloc_datasets.sim.readings import odometry
+from fgloc_datasets.sim.record import is_recorded, record
+from fgloc_datasets.sim.scenario import Camera, Control, Robot, Scenario, World
 
 HALL = World(size_m=(20.0, 20.0))
 

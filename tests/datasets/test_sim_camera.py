@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from fgloc.datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
-from fgloc.datasets.sim.mjcf import camera_rotation, intrinsics
-from fgloc.datasets.sim.physics import Log, Scene, make_scene, simulate
-from fgloc.datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
+from fgloc_datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
+from fgloc_datasets.sim.mjcf import camera_rotation, intrinsics
+from fgloc_datasets.sim.physics import Log, Scene, make_scene, simulate
+from fgloc_datasets.sim.scenario import Camera, Control, Scenario
 
 pytestmark = pytest.mark.render
 

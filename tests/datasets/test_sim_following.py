@@ -14,24 +14,24 @@ from benchmarks import follow as benchmark
 from benchmarks.follow_runs import Driven
 from fgloc import run, se2
 from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.sim.control import Command, Driver
-from fgloc.datasets.sim.following.cases import CASES, drive_of
-from fgloc.datasets.sim.following.failing import FailingSensors, read_failures
-from fgloc.datasets.sim.following.figures import draw_drives, table
-from fgloc.datasets.sim.following.loop import PROCESSING_S, Arrivals, Drive, Written, follow
-from fgloc.datasets.sim.following.path import BUNDLED, Curve, WaypointPath, load_path
-from fgloc.datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
-from fgloc.datasets.sim.following.results import Followed
-from fgloc.datasets.sim.physics import Simulation, make_scene, simulate
-from fgloc.datasets.sim.scenario import Camera, Gnss, Scenario, Uwb, World
-from fgloc.datasets.sim.sensors import EPOCH_NS, stamp_ns, streams
 from fgloc.errors import ConfigError
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.sim.control import Command, Driver
+from fgloc_datasets.sim.following.cases import CASES, drive_of
+from fgloc_datasets.sim.following.failing import FailingSensors, read_failures
+from fgloc_datasets.sim.following.figures import draw_drives, table
+from fgloc_datasets.sim.following.loop import PROCESSING_S, Arrivals, Drive, Written, follow
+from fgloc_datasets.sim.following.path import BUNDLED, Curve, WaypointPath, load_path
+from fgloc_datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
+from fgloc_datasets.sim.following.results import Followed
+from fgloc_datasets.sim.physics import Simulation, make_scene, simulate
+from fgloc_datasets.sim.scenario import Camera, Gnss, Scenario, Uwb, World
+from fgloc_datasets.sim.sensors import EPOCH_NS, stamp_ns, streams
 
 HOOK = WaypointPath(name="hook", speed_m_s=0.4, waypoints=((-0.6, 0), (-0.3, 0), (0, 0), (0.3, 0.1), (0.4, 0.4)))
 ROOM = Scenario(

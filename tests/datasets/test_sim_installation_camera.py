@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from sim_bags import messages
 
-from fgloc.datasets.sim.camera import Renderer, RenderError, frames, pose_at
-from fgloc.datasets.sim.installation import Installation
-from fgloc.datasets.sim.installed import MountedCamera, load_installed
-from fgloc.datasets.sim.physics import Log, make_scene, simulate
-from fgloc.datasets.sim.record import record
-from fgloc.datasets.sim.scenario import Camera, Control, Scenario
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, Landmark
+from fgloc_datasets.sim.camera import Renderer, RenderError, frames, pose_at
+from fgloc_datasets.sim.installation import Installation
+from fgloc_datasets.sim.installed import MountedCamera, load_installed
+from fgloc_datasets.sim.physics import Log, make_scene, simulate
+from fgloc_datasets.sim.record import record
+from fgloc_datasets.sim.scenario import Camera, Control, Scenario
 
 pytestmark = pytest.mark.render
 

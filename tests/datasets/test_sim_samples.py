@@ -8,11 +8,11 @@ import pytest
 import yaml
 
 from fgloc.config import load_config
-from fgloc.datasets.sim.installed import install, load_installed
-from fgloc.datasets.sim.room import make_map
-from fgloc.datasets.sim.scenario import Scenario
-from fgloc.datasets.sim.suite import BUNDLED, load_suite
 from fgloc.sensors.maps import load_map
+from fgloc_datasets.sim.installed import install, load_installed
+from fgloc_datasets.sim.room import make_map
+from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.suite import BUNDLED, load_suite
 
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 SEEDS = {"first_run": 1, "patches_run": 1, "light_drop_run": 1, "installed_run": 3}

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fgloc.datasets.sim.camera import light_level
-from fgloc.datasets.sim.control import Driver, make_function
-from fgloc.datasets.sim.figures import draw
-from fgloc.datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
-from fgloc.datasets.sim.ground import make_ground
-from fgloc.datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from fgloc.datasets.sim.record import record
-from fgloc.datasets.sim.room import make_map
-from fgloc.datasets.sim.scenario import (
+from fgloc.errors import ConfigError, RecordingError
+from fgloc.types import FloatArray
+from fgloc_datasets.sim.camera import light_level
+from fgloc_datasets.sim.control import Driver, make_function
+from fgloc_datasets.sim.figures import draw
+from fgloc_datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
+from fgloc_datasets.sim.ground import make_ground
+from fgloc_datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
+from fgloc_datasets.sim.record import record
+from fgloc_datasets.sim.room import make_map
+from fgloc_datasets.sim.scenario import (
     Control,
     ControlKind,
     LightStep,
@@ -27,10 +29,8 @@ from fgloc.datasets.sim.scenario import (
     Scenario,
     World,
 )
-from fgloc.datasets.sim.section import channel_rng
-from fgloc.datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
-from fgloc.errors import ConfigError, RecordingError
-from fgloc.types import FloatArray
+from fgloc_datasets.sim.section import channel_rng
+from fgloc_datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 
 SUITE = load_suite(BUNDLED)
 KINDS: tuple[ControlKind, ...] = (

@@ -12,10 +12,10 @@ import yaml
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
-from fgloc.datasets.bag import BagWriter
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap, Severity
+from fgloc_datasets.bag import BagWriter
 
 START_S, SECONDS, STEP_S = 1_700_000_000.0, 50.0, 0.005
 TIMES = np.arange(0.0, SECONDS, STEP_S)

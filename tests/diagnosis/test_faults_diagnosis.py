@@ -26,8 +26,6 @@ from robot_world import (
 
 from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
-from fgloc.datasets import mrclam, pioneer, turtlebot3
-from fgloc.datasets.bag import BagWriter
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.topic_activity import TopicActivity
@@ -41,6 +39,8 @@ from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Finding, LandmarkMap, Severity
+from fgloc_datasets import mrclam, pioneer, turtlebot3
+from fgloc_datasets.bag import BagWriter
 
 SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 START = 1_700_000_000_000_000_000

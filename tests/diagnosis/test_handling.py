@@ -13,11 +13,11 @@ from real_data import real_data
 from fgloc import run
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
-from fgloc.datasets.bag import BagWriter
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
 from fgloc.types import RunResult
+from fgloc_datasets.bag import BagWriter
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

@@ -11,13 +11,13 @@ import pytest
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config
-from fgloc.datasets.bag import BagWriter
 from fgloc.diagnosis.sanity import Track, Watch, gyro_agrees, judged
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.localizer import Localizer
 from fgloc.runner import run
 from fgloc.types import Estimate, Mode, MotionMeasurement, Step
+from fgloc_datasets.bag import BagWriter
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND

@@ -10,6 +10,7 @@ import sys
 import pytest
 from doc_blocks import PAGES, ROOT, blocks
 from schema_files import MODELS, schema
+from source_roots import PYTHONPATH
 from typer.main import get_command
 
 from fgloc.ablation.suite import load_suite
@@ -47,7 +48,7 @@ def workspace(tmp_path, monkeypatch):
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fgloc.cli "$@"\n')
     command.chmod(0o755)
     monkeypatch.setenv("PATH", f"{command.parent}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -135,7 +136,7 @@ def test_pictures_are_small():
 def test_notebooks_run_and_say_what_they_show(path, tmp_path, monkeypatch):
     """Executed as they are; printed figures are those of the page."""
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
     (tmp_path / "datasets").symlink_to(ROOT / "datasets")
     shown = nbformat.read(path, as_version=4)
     again = nbformat.read(path, as_version=4)
@@ -159,7 +160,7 @@ def test_there_are_two_notebooks():
 def test_the_site_is_built_without_a_warning_and_asks_for_nothing(tmp_path):
     pytest.importorskip("mkdocs")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     pages = list((tmp_path / "site").rglob("*.html"))

@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from fgloc.datasets.bag import BagWriter
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 

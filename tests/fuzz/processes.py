@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+_PYTHONPATH = os.pathsep.join(str(ROOT / name) for name in (".", "training", "datasets"))
 _ADDRESS_SPACE = 8 << 30  # of a process, most of which libraries reserve and never touch
 
 
@@ -59,7 +60,7 @@ def run(arguments: Sequence[str], seconds: float = 20.0) -> Done:
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": _PYTHONPATH, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         ended = Path(folder) / "ended"
         process = subprocess.Popen(

@@ -10,12 +10,12 @@ from robot_world import SPEED, START_NS, TURN, World, beacons, config, truth_at
 from world_bags import write_world
 
 from fgloc import se2
-from fgloc.datasets.bag import BagWriter
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Mode
+from fgloc_datasets.bag import BagWriter
 
 MODES = ("batch", "online")
 STEP_NS = 20_000_000

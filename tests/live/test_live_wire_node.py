@@ -18,7 +18,6 @@ import fgloc
 from fgloc import se2
 from fgloc.cli import app
 from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.live import LivePose
@@ -34,6 +33,7 @@ from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.roles import with_values
 from fgloc.types import Mode, TransformEvent
+from fgloc_datasets.bag import BagWriter
 
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"

@@ -12,7 +12,6 @@ from test_cli import fgloc, write_circle
 
 from fgloc.cli.terminal import say
 from fgloc.config import Config, GateConfig, RecordingConfig
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import MapError, RecordingError
 from fgloc.evaluation.style import plain_label
 from fgloc.intake.validation import EventValidator
@@ -21,6 +20,7 @@ from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc_datasets.bag import BagWriter
 from tests.fuzz.hostile_yaml import SYNTAX
 
 

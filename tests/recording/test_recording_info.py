@@ -14,9 +14,9 @@ from real_data import real_data
 from recording_bags import START_NS, TICK_NS, write_drive, write_ros1
 
 from fgloc.config import Config
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
 from fgloc.recording.info import RecordingInfo, format_info, inspect
+from fgloc_datasets.bag import BagWriter
 
 CONFIG = Config()
 

@@ -17,7 +17,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fgloc.config import Config, RecordingConfig, TopicsConfig
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
 from fgloc.recording.info import format_info, inspect
 from fgloc.recording.messages import default_typestore
@@ -27,6 +26,7 @@ from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Event, TransformEvent, TruthEvent
+from fgloc_datasets.bag import BagWriter
 
 DEFAULT = RecordingConfig()
 

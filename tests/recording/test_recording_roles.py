@@ -115,7 +115,7 @@ def test_configured_topics_that_do_not_fit(given, message):
 
 
 def test_open_recording_refuses_what_is_ambiguous(tmp_path):
-    from fgloc.datasets.bag import BagWriter
+    from fgloc_datasets.bag import BagWriter
 
     with BagWriter(tmp_path / "run") as bag:
         for topic in ("/a", "/b"):

@@ -11,11 +11,11 @@ from motion_models import make_card, make_tensors
 
 from fgloc.assembly import assemble
 from fgloc.config import Config, RecordingConfig
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensor_setup import given_pose
 from fgloc.sensors.learned.load import save_model
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]

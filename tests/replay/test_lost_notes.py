@@ -11,12 +11,12 @@ from test_cli import BEACONS, START_NS, fgloc, sight, write_circle
 import fgloc as fgloc_package
 from fgloc import se2
 from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
 from fgloc.recording.reader import open_recording
 from fgloc.replay.outcome import Outcome
 from fgloc.runner import run
 from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.types import Finding, Mode, Severity
+from fgloc_datasets.bag import BagWriter
 
 
 def write_late_circle(folder, late_s, seconds=6.0):

@@ -12,14 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from source_roots import PYTHONPATH
 
 from benchmarks.example_sensors import example_sensors
 from benchmarks.sensors import only
 from fgloc import se2
 from fgloc.config import Config, GateConfig, config_of, load_config
-from fgloc.datasets.sim.positioning import geodetic
-from fgloc.datasets.sim.record import record
-from fgloc.datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc.errors import ConfigError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.extensions import outside_sensors
@@ -30,6 +28,9 @@ from fgloc.sensors.gyro.rate import Gyro
 from fgloc.sensors.motion_compensation import compensated
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
+from fgloc_datasets.sim.positioning import geodetic
+from fgloc_datasets.sim.record import record
+from fgloc_datasets.sim.scenario import Gnss, Scenario, Uwb
 
 SECONDS = 14.0
 ANCHORS = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.2), 3: (6.0, 5.0, 1.8)}
@@ -306,7 +307,7 @@ def test_online_every_estimator_takes_both(recording, kind):
 
 def command_line(folders, *arguments):
     """fgloc in a process of its own, which finds the sensors by their entry points."""
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([os.getcwd(), *map(str, folders)])}
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([PYTHONPATH, *map(str, folders)])}
     command = [sys.executable, "-m", "fgloc.cli", *arguments]
     return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
 

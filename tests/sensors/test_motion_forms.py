@@ -11,10 +11,10 @@ from synthetic_robot import synthetic
 
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import FAMILIES, Kind, Split
-from fgloc.training import train as training
-from fgloc.training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc.training.evaluate import Figures, evaluate
-from fgloc.training.rollouts import roll_model
+from fgloc_training import train as training
+from fgloc_training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc_training.evaluate import Figures, evaluate
+from fgloc_training.rollouts import roll_model
 
 pytestmark = pytest.mark.slow  # seven trainings
 SPLIT = Split(train=("run1", "run2", "run3"), validation=("run4",), test=("run0",))

@@ -9,14 +9,14 @@ import pytest
 from real_data import real_data
 
 import fgloc.sensors.learned
-from fgloc.datasets import mrclam
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Kinematics
-from fgloc.training.config import DataConfig
-from fgloc.training.data import make_run
-from fgloc.training.evaluate import evaluate
-from fgloc.training.rollouts import roll_kinematics, roll_model
 from fgloc.types import ControlEvent
+from fgloc_datasets import mrclam
+from fgloc_training.config import DataConfig
+from fgloc_training.data import make_run
+from fgloc_training.evaluate import evaluate
+from fgloc_training.rollouts import roll_kinematics, roll_model
 
 MODELS = Path(fgloc.sensors.learned.__file__).parent / "models"
 

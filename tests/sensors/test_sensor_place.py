@@ -6,9 +6,9 @@ import pytest
 
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config
-from fgloc.datasets.bag import BagWriter
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 K = [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]

@@ -9,8 +9,8 @@ import numpy as np
 from robot_world import NOISE, SIGMA_BEARING, SIGMA_RANGE, START_NS, beacons, polar
 
 from fgloc import se2
-from fgloc.datasets.bag import BagWriter
 from fgloc.sensors.maps import write_map
+from fgloc_datasets.bag import BagWriter
 
 _LEG_S = 4.0  # after which speed and turn rate change
 

@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from fgloc.datasets.bag import BagWriter
+from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 50_000_000

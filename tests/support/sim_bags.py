@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from fgloc.datasets.sim.sensors import EPOCH_NS
+from fgloc_datasets.sim.sensors import EPOCH_NS
 
 Row = tuple[int, int, Any]  # header stamp and receive time [ns], message
 

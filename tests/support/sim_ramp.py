@@ -8,12 +8,12 @@ from pathlib import Path
 
 from fgloc import run
 from fgloc.config import Config, load_config
-from fgloc.datasets.bag import BagWriter
-from fgloc.datasets.sim.physics import make_scene, simulate
-from fgloc.datasets.sim.record import write_beside
-from fgloc.datasets.sim.scenario import Scenario
-from fgloc.datasets.sim.sensors import streams
 from fgloc.types import RunResult
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.sim.physics import make_scene, simulate
+from fgloc_datasets.sim.record import write_beside
+from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.sensors import streams
 
 RAMP = Scenario.model_validate(
     {

@@ -8,14 +8,14 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.datasets.bag import BagWriter
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.training.config import DataConfig
-from fgloc.training.data import Run, make_run
-from fgloc.training.sensor_record import SensorRecord
 from fgloc.types import ControlEvent, Event, FloatArray
+from fgloc_datasets.bag import BagWriter
+from fgloc_training.config import DataConfig
+from fgloc_training.data import Run, make_run
+from fgloc_training.sensor_record import SensorRecord
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND

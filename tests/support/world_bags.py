@@ -10,12 +10,12 @@ from robot_world import CAMERA, T_BASE_CAM, World
 from scipy.spatial.transform import Rotation
 
 from fgloc import se2
-from fgloc.datasets.bag import BagWriter
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.events import CornersEvent
 from fgloc.sensors.range_bearing.events import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
+from fgloc_datasets.bag import BagWriter
 
 
 def write_world(folder: Path, *worlds: World, body=(0.0, 0.0, 0.0), sightings: bool = True) -> Path:

@@ -11,7 +11,7 @@ from fgloc.graph.ground import GRAVITY, driven
 from fgloc.sensors import registry
 from fgloc.sensors.channels import Mounting
 from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.training.slopes import in_robots_plane
+from fgloc_training.slopes import in_robots_plane
 
 
 def test_the_truth_on_a_slope_is_unrolled_to_the_robots_plane() -> None:

@@ -19,11 +19,11 @@ from fgloc.sensors.base import MotionRole
 from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Input, Kind, Split
 from fgloc.sensors.learned.load import read_model
-from fgloc.training import evaluate as evaluation
-from fgloc.training import optimize
-from fgloc.training import train as training
-from fgloc.training.checkpoint import Checkpoint, Checkpoints
-from fgloc.training.config import (
+from fgloc_training import evaluate as evaluation
+from fgloc_training import optimize
+from fgloc_training import train as training
+from fgloc_training.checkpoint import Checkpoint, Checkpoints
+from fgloc_training.config import (
     AdaptationConfig,
     CalibrationConfig,
     NetworkConfig,
@@ -32,12 +32,12 @@ from fgloc.training.config import (
     TrainConfig,
     load_train_config,
 )
-from fgloc.training.controls import controls, draw_controls
-from fgloc.training.data import Run
-from fgloc.training.export import card_of, tensors_of
-from fgloc.training.members import new_net
-from fgloc.training.models import DisplacementNet
-from fgloc.training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.controls import controls, draw_controls
+from fgloc_training.data import Run
+from fgloc_training.export import card_of, tensors_of
+from fgloc_training.members import new_net
+from fgloc_training.models import DisplacementNet
+from fgloc_training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
 
 
 @pytest.fixture(scope="module")

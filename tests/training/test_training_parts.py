@@ -12,18 +12,18 @@ from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from fgloc import se2
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
 from fgloc.sensors.noise_density import NoiseDensity
-from fgloc.training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
-from fgloc.training.config import CalibrationConfig, DataConfig, OptimizationConfig
-from fgloc.training.data import Run, cut, load_run, make_run
-from fgloc.training.losses import composed_nll, end_errors, rollout_loss
-from fgloc.training.planar import integrate, relative
-from fgloc.training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 from fgloc.types import ControlEvent, Trajectory
+from fgloc_datasets.bag import BagWriter
+from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
+from fgloc_training.config import CalibrationConfig, DataConfig, OptimizationConfig
+from fgloc_training.data import Run, cut, load_run, make_run
+from fgloc_training.losses import composed_nll, end_errors, rollout_loss
+from fgloc_training.planar import integrate, relative
+from fgloc_training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 
 
 @pytest.fixture(scope="module")

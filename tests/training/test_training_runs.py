@@ -11,17 +11,17 @@ from command_line import fgloc
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
 from fgloc.config import Config
-from fgloc.datasets.bag import BagWriter
 from fgloc.errors import RecordingError
 from fgloc.sensors.gyro.events import ImuEvent
 from fgloc.sensors.learned import load_model
 from fgloc.sensors.wheels.config import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.training.config import DataConfig
-from fgloc.training.data import load_runs
-from fgloc.training.rollouts import roll_wheels
-from fgloc.training.sensor_record import SensorRecord
 from fgloc.types import Event
+from fgloc_datasets.bag import BagWriter
+from fgloc_training.config import DataConfig
+from fgloc_training.data import load_runs
+from fgloc_training.rollouts import roll_wheels
+from fgloc_training.sensor_record import SensorRecord
 
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
 

@@ -1,0 +1,238 @@
+"""What the camera sees: MuJoCo's render through a lens, an exposure and a sensor.
+
+Radiance is linear: sub-frames over the exposure are averaged, blurred by the lens, distorted, exposed and quantised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fgloc.errors import FglocError
+from fgloc.types import FloatArray
+from fgloc_datasets.sim.mjcf import intrinsics, render_size
+from fgloc_datasets.sim.physics import TICK_S, Log, Scene
+from fgloc_datasets.sim.scenario import Camera, LightStep
+from fgloc_datasets.sim.section import channel_rng
+
+Image = NDArray[np.uint8]
+_REMEDY = "install libegl1 and libgl1-mesa-dri (EGL) or libosmesa6 (MUJOCO_GL=osmesa), or record without camera"
+_SUBFRAMES = (4, 24)  # at least: they also smooth the edges; at most
+_READ_SHARE = 0.3  # of the noise's variance at gain 1 and middle gray that does not depend on the light
+_FIRST_FRAME_S = 0.1
+
+
+class RenderError(FglocError):
+    """No OpenGL to render with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """When an image is taken (the middle of the exposure) and how; known before the robot is there."""
+
+    stamp_s: float
+    exposure_s: float
+    gain: float
+    light: float  # 1 is full
+    take: Callable[[], Image]  # the image; once the log reaches beyond the exposure, and in order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image and when it was taken (the middle of the exposure)."""
+
+    stamp_s: float
+    exposure_s: float
+    gain: float
+    light: float  # 1 is full
+    image: Image  # (height, width)
+
+
+class Renderer:
+    """Renders the scene from the robot's camera, undistorted and oversampled. Close it after use."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Open an off-screen context.
+
+        Raises:
+            RenderError: no OpenGL library, or it cannot render off screen.
+        """
+        self._scene, self._data = scene, mujoco.MjData(scene.model)
+        assert scene.scenario.camera is not None
+        self._width, self._height, _ = render_size(scene.scenario.camera)
+        try:
+            self._renderer = mujoco.Renderer(scene.model, self._height, self._width)
+        except Exception as error:  # every backend raises its own kind, down to AttributeError
+            raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {_REMEDY}") from error
+        self._pixels = np.empty((self._height, self._width, 3), np.uint8)
+
+    def render(self, position: FloatArray, quaternion: FloatArray, shift_px: FloatArray) -> Image:
+        """Radiance ``(height, width)`` seen from a pose of the base, the pixel grid shifted by a part of a pixel."""
+        data = self._data
+        data.qpos[:3], data.qpos[3:7] = position, np.roll(quaternion, 1)
+        mujoco.mj_kinematics(self._scene.model, data)
+        mujoco.mj_camlight(self._scene.model, data)
+        self._renderer.update_scene(data, "camera")
+        for camera in self._renderer.scene.camera:
+            pixel = (camera.frustum_top - camera.frustum_bottom) / self._height
+            camera.frustum_center += shift_px[0] * pixel
+            camera.frustum_top -= shift_px[1] * pixel
+            camera.frustum_bottom -= shift_px[1] * pixel
+        self._renderer.render(out=self._pixels)
+        return self._pixels[..., 0]
+
+    def screen(self, marker_ids: set[int]) -> None:
+        """Put screens in front of these markers and of no others."""
+        for marker_id in self._scene.landmarks.landmarks:
+            self._scene.model.geom(f"screen{marker_id}").rgba[3] = float(marker_id in marker_ids)
+
+    def close(self) -> None:
+        """Free the context."""
+        self._renderer.close()
+
+
+class Lens:
+    """Point spread and distortion: from an oversampled pinhole render to the image."""
+
+    def __init__(self, camera: Camera) -> None:
+        """Prepare the lookup."""
+        width, height, focal = render_size(camera)
+        self._sigma = camera.blur_px * camera.oversampling
+        u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+        rays = cv2.undistortPoints(
+            pixels, intrinsics(camera), np.asarray(camera.distortion), None, None, None, criteria
+        ).reshape(camera.height, camera.width, 2)
+        at = rays * focal + (0.5 * width - 0.5, 0.5 * height - 0.5)
+        self._maps = cv2.convertMaps(at.astype(np.float32), None, cv2.CV_32FC1)[:2]
+
+    def image(self, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Image ``(height, width)`` of a render."""
+        if self._sigma > 0:
+            radiance = cv2.GaussianBlur(radiance, (0, 0), self._sigma)
+        return np.asarray(cv2.remap(radiance, *self._maps, cv2.INTER_LINEAR))
+
+
+def frames(scene: Scene, log: Log) -> Iterator[Frame]:
+    """All images of a finished run, in order.
+
+    Raises:
+        RenderError: no OpenGL.
+    """
+    for e in exposures(scene, log):
+        yield Frame(e.stamp_s, e.exposure_s, e.gain, e.light, e.take())
+
+
+def exposures(scene: Scene, log: Log) -> Iterator[Exposure]:
+    """All exposures of a run, in order; an image is rendered when it is taken, at the latest before the next exposure.
+
+    Raises:
+        RenderError: no OpenGL.
+    """
+    camera = scene.scenario.camera
+    assert camera is not None
+    rng = channel_rng(scene.seed, "camera")
+    lens = Lens(camera)
+    hidden = occluded(scene)
+    renderer = Renderer(scene)
+    try:
+        for shot in shots(scene, log):
+
+            def take(shot: Shot = shot) -> Image:
+                renderer.screen({m for ids, begin, end in hidden if begin <= shot.start_s < end for m in ids})
+                image = lens.image(_expose(renderer, camera, log, shot.start_s, shot.exposure_s))
+                image *= shot.light * shot.gain * shot.exposure_s / camera.exposure_s
+                return _sense(image, camera.noise, shot.gain, rng)
+
+            yield Exposure(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s, shot.gain, shot.light, take)
+    finally:
+        renderer.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """When the shutter opens and what the automatic exposure has set."""
+
+    start_s: float
+    exposure_s: float
+    gain: float
+    light: float  # 1 is full
+
+
+def shots(scene: Scene, log: Log) -> Iterator[Shot]:
+    """All shots of a run, in order."""
+    camera = scene.scenario.camera
+    assert camera is not None
+    n = int((log.stamps_s[-1] - _FIRST_FRAME_S - camera.max_exposure_s) * camera.rate_hz) + 1
+    wanted = camera.exposure_s  # exposure times gain that the automatic exposure has reached
+    for k in range(n):
+        start = _FIRST_FRAME_S + k / camera.rate_hz
+        light = light_level(scene.scenario.world.light, start)
+        follow = 1.0 - math.exp(-1.0 / camera.rate_hz / camera.exposure_lag_s)
+        wanted *= (camera.exposure_s / light / wanted) ** follow if k > 0 else 1.0 / light
+        exposure = min(wanted, camera.max_exposure_s)
+        yield Shot(start, exposure, min(max(wanted / exposure, 1.0), camera.max_gain), light)
+
+
+def light_level(steps: tuple[LightStep, ...], t: float) -> float:
+    """Light at a time [s]; 1 before the first step."""
+    level = 1.0
+    for step in steps:
+        if step.at_s <= t:
+            level = step.level
+    return level
+
+
+def pose_at(log: Log, t: float) -> tuple[FloatArray, FloatArray]:
+    """Position ``(3,)`` and quaternion ``(4,)`` at a time [s], between the log's ticks."""
+    k = min(int(t / TICK_S), len(log.stamps_s) - 2)
+    a = t / TICK_S - k
+    q = (1 - a) * log.quaternions[k] + a * log.quaternions[k + 1]
+    return (1 - a) * log.positions[k] + a * log.positions[k + 1], q / np.linalg.norm(q)
+
+
+def _expose(renderer: Renderer, camera: Camera, log: Log, start: float, exposure: float) -> NDArray[np.float32]:
+    tick = min(int(start / TICK_S), len(log.stamps_s) - 1)
+    speed_px = camera.focal_px * (np.linalg.norm(log.rates[tick]) + np.linalg.norm(log.velocities[tick]))
+    low, high = _SUBFRAMES
+    n = low
+    if camera.motion_blur:
+        n = int(np.clip(math.ceil(speed_px * exposure / 0.8), low, high))
+    shifts = _shifts(n)
+    total = 0.0
+    for i in range(n):
+        at = start + exposure * ((i + 0.5) / n if camera.motion_blur else 0.5)
+        total = total + renderer.render(*pose_at(log, at), shifts[i]).astype(np.float32)
+    return np.asarray(total / n, dtype=np.float32)
+
+
+def _shifts(n: int) -> FloatArray:
+    """Places ``(n, 2)`` within a pixel, evenly spread, of mean zero [px]. Source: the R2 sequence of Roberts, 2018."""
+    i = np.arange(1, n + 1)[:, None]
+    points = (i * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
+    return np.asarray(points - points.mean(axis=0))
+
+
+def _sense(image: NDArray[np.float32], noise: float, gain: float, rng: np.random.Generator) -> Image:
+    middle = 128.0
+    variance = noise**2 * (_READ_SHARE * gain**2 + (1 - _READ_SHARE) * gain * image / middle)
+    noisy = image + np.sqrt(variance) * rng.standard_normal(image.shape, dtype=np.float32)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+
+
+def occluded(scene: Scene) -> list[tuple[set[int], float, float]]:
+    """Marker ids, start and end of each occlusion."""
+    rng = channel_rng(scene.seed, "occlusions")
+    ids = np.array(list(scene.landmarks.landmarks))
+    out = []
+    for occlusion in scene.scenario.world.occlusions:
+        chosen = rng.permutation(ids)[: math.ceil(occlusion.share * len(ids))]
+        out.append(({int(i) for i in chosen}, occlusion.start_s, occlusion.end_s))
+    return out

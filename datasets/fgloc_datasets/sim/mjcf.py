@@ -1,0 +1,292 @@
+"""The scenario as a MuJoCo model: robot, room, ground, markers, camera."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+import cv2
+import mujoco
+import numpy as np
+
+from fgloc.frames import OPTICAL_TO_BODY, rpy_matrix
+from fgloc.types import FloatArray, LandmarkMap
+from fgloc_datasets.sim.ground import Ground
+from fgloc_datasets.sim.scenario import Camera, Motor, Payload, Robot, Scenario
+
+_CELL_PX = 64  # of a marker's texture
+_CHASSIS_CLEARANCE_M = 0.04
+_CASTER_RADIUS_M = 0.02
+
+
+def wheel_names(robot: Robot) -> tuple[str, ...]:
+    """Joint names, left and right in turn."""
+    ends = ("",) if robot.kind == "diff_drive" else ("front_", "rear_")
+    return tuple(f"{end}{side}_wheel_joint" for end in ends for side in ("left", "right"))
+
+
+def camera_rotation(camera: Camera) -> FloatArray:
+    """``(3, 3)`` R_base_cam of the optical frame."""
+    return optical_rotation(np.radians(camera.rpy_deg))
+
+
+def optical_rotation(rpy: Sequence[float] | FloatArray) -> FloatArray:
+    """``(3, 3)`` rotation of the optical frame whose forward looking body axes are turned by roll, pitch, yaw [rad]."""
+    return np.asarray(rpy_matrix(*rpy) @ OPTICAL_TO_BODY)
+
+
+def render_size(camera: Camera) -> tuple[int, int, float]:
+    """Width and height of the undistorted render [px] that covers the lens's view, and its focal length [px]."""
+    border = np.array(
+        [(u, v) for u in np.linspace(-0.5, camera.width - 0.5, 33) for v in (-0.5, camera.height - 0.5)]
+        + [(u, v) for u in (-0.5, camera.width - 0.5) for v in np.linspace(-0.5, camera.height - 0.5, 33)]
+    )
+    rays = cv2.undistortPoints(border[:, None], intrinsics(camera), np.asarray(camera.distortion))[:, 0]
+    focal = camera.focal_px * camera.oversampling
+    half = np.ceil(np.abs(rays).max(axis=0) * focal) + 4  # a few pixels for the blur
+    return 2 * int(half[0]), 2 * int(half[1]), focal
+
+
+def intrinsics(camera: Camera) -> FloatArray:
+    """K ``(3, 3)``; the middle of the first pixel is (0, 0)."""
+    f = camera.focal_px
+    return np.array([[f, 0.0, camera.width / 2 - 0.5], [0.0, f, camera.height / 2 - 0.5], [0.0, 0.0, 1.0]])
+
+
+def marker_texture(dictionary: str, marker_id: int) -> bytes:
+    """PNG of a marker with one white cell around it."""
+    d = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    cells = d.markerSize + 2
+    bits = cv2.aruco.generateImageMarker(d, marker_id, cells)
+    image = np.pad(bits, 1, constant_values=255).repeat(_CELL_PX, 0).repeat(_CELL_PX, 1)
+    return bytes(cv2.imencode(".png", image)[1])
+
+
+def build_model(scenario: Scenario, ground: Ground, landmarks: LandmarkMap) -> mujoco.MjModel:
+    """Compile the model of a scenario."""
+    assets: dict[str, bytes] = {}
+    contact = scenario.robot.contact
+    root = ET.Element("mujoco", model=scenario.name)
+    _add(root, "compiler", angle="radian", autolimits="true")
+    option = _add(
+        root,
+        "option",
+        timestep=contact.timestep_s,
+        integrator="implicitfast",
+        cone="elliptic",
+        impratio=contact.impratio,
+    )
+    _add(option, "flag", multiccd="enable" if ground.height is not None else "disable")
+    _add(root, "statistic", extent=4.0, center=(0.0, 0.0, 0.5))
+    visual = _add(root, "visual")
+    _add(visual, "map", znear=0.005, zfar=10)
+    _add(visual, "quality", offsamples=0, shadowsize=0)
+    _add(visual, "headlight", ambient=(0.72, 0.72, 0.72), diffuse=(0.0, 0.0, 0.0), specular=(0.0, 0.0, 0.0))
+    if scenario.camera is not None:
+        width, height, _ = render_size(scenario.camera)
+        _add(visual, "global", offwidth=width, offheight=height)
+    asset = _add(root, "asset")
+    world = _add(root, "worldbody")
+    _room(asset, world, scenario, ground)
+    _markers(asset, world, landmarks, assets)
+    _robot(root, world, scenario)
+    model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"), assets)
+    if ground.height is not None:
+        model.hfield_data[:] = ((ground.height - ground.low_m) / (ground.high_m - ground.low_m)).ravel()
+    return model
+
+
+def _room(asset: ET.Element, world: ET.Element, scenario: Scenario, ground: Ground) -> None:
+    sx, sy = (0.5 * s for s in scenario.world.size_m)
+    _add(
+        asset,
+        "texture",
+        name="floor",
+        type="2d",
+        builtin="checker",
+        rgb1=(0.42, 0.42, 0.42),
+        rgb2=(0.5, 0.5, 0.5),
+        width=256,
+        height=256,
+    )
+    _add(asset, "material", name="floor", texture="floor", texrepeat=(1, 1), texuniform="true", specular=0)
+    _add(asset, "texture", type="skybox", builtin="flat", rgb1=(0.3, 0.3, 0.3), width=8, height=48)
+    lamp = {"diffuse": (0.22, 0.22, 0.22), "ambient": (0, 0, 0), "specular": (0, 0, 0), "castshadow": "false"}
+    _add(world, "light", type="directional", dir=(-0.5, 0.3, -0.6), pos=(0, 0, 3), **lamp)
+    _add(asset, "material", name="wall", rgba=(0.62, 0.62, 0.62, 1), specular=0)
+    if ground.height is None:
+        _add(world, "geom", name="ground", type="plane", size=(sx, sy, 0.1), material="floor")
+    else:
+        rows, columns = ground.height.shape
+        _add(asset, "hfield", name="h", nrow=rows, ncol=columns, size=(sx, sy, ground.high_m - ground.low_m, 0.1))
+        _add(world, "geom", name="ground", type="hfield", hfield="h", material="floor", pos=(0, 0, ground.low_m))
+    tilt = scenario.world.floor.tilt
+    low, high = (0.0, 0.0) if tilt is None else (ground.low_m, ground.high_m)  # walls stand on a leaning floor
+    h, z = 0.5 * (scenario.world.wall_height_m + high - low), 0.5 * (scenario.world.wall_height_m + high + low)
+    for name, place, size in (
+        ("east", (sx + 0.05, 0, z), (0.05, sy + 0.1, h)),
+        ("west", (-sx - 0.05, 0, z), (0.05, sy + 0.1, h)),
+        ("north", (0, sy + 0.05, z), (sx, 0.05, h)),
+        ("south", (0, -sy - 0.05, z), (sx, 0.05, h)),
+    ):
+        _add(world, "geom", name=name, type="box", pos=place, size=size, material="wall", friction=(0.1, 0.001, 0.0001))
+
+
+def _markers(asset: ET.Element, world: ET.Element, landmarks: LandmarkMap, assets: dict[str, bytes]) -> None:
+    for marker_id, landmark in landmarks.landmarks.items():
+        name = f"marker{marker_id}"
+        assets[f"{name}.png"] = marker_texture(landmarks.dictionary, marker_id)
+        cells = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, landmarks.dictionary)).markerSize + 2
+        half = 0.5 * landmark.size_m * (cells + 2) / cells
+        axes = (*landmark.rotation[:, 0], *landmark.rotation[:, 1])
+        _add(asset, "texture", name=name, type="2d", file=f"{name}.png")
+        _add(asset, "material", name=name, texture=name, specular=0)
+        shared = {"xyaxes": axes, "contype": 0, "conaffinity": 0}
+        place = {"pos": landmark.position, **shared}
+        _add(world, "geom", name=name, type="plane", size=(half, half, 0.01), material=name, **place)
+        _add(
+            world,
+            "geom",
+            name=f"screen{marker_id}",
+            type="box",
+            size=(1.3 * half, 1.3 * half, 0.005),
+            pos=landmark.position + 0.02 * landmark.rotation[:, 2],
+            rgba=(0.35, 0.35, 0.35, 0),
+            **shared,
+        )
+
+
+def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
+    robot = scenario.robot
+    base = _add(world, "body", name="base")
+    _add(base, "freejoint", name="base")
+    mass = robot.mass_kg - robot.wheel_mass_kg * len(wheel_names(robot))
+    length, width, height = robot.chassis
+    inertia = mass / 12 * np.array([width**2 + height**2, length**2 + height**2, length**2 + width**2])
+    _add(base, "inertial", pos=robot.center_of_mass, mass=mass, diaginertia=inertia)
+    middle = -0.05 if robot.kind == "diff_drive" else 0.0
+    _add(
+        base,
+        "geom",
+        name="chassis",
+        type="box",
+        size=(length / 2, width / 2, height / 2),
+        pos=(middle, 0, _CHASSIS_CLEARANCE_M + height / 2),
+        rgba=(0.2, 0.3, 0.6, 1),
+        friction=(0.1, 0.001, 0.0001),
+    )
+    if scenario.camera is not None:
+        rotation = camera_rotation(scenario.camera)
+        _, render_height, focal = render_size(scenario.camera)
+        _add(
+            base,
+            "camera",
+            name="camera",
+            pos=scenario.camera.position,
+            xyaxes=(*rotation[:, 0], *-rotation[:, 1]),
+            fovy=math.degrees(2 * math.atan(0.5 * render_height / focal)),
+        )
+    actuator = _add(root, "actuator")
+    for index, joint in enumerate(wheel_names(robot)):
+        _wheel(base, robot, joint, index)
+        _motor(actuator, robot.motor, joint)
+    if robot.kind == "diff_drive":
+        _caster(base, robot)
+    if robot.payload is not None:
+        _payload(base, actuator, robot.payload)
+
+
+def _caster(base: ET.Element, robot: Robot) -> None:
+    _add(
+        base,
+        "geom",
+        name="caster",
+        type="sphere",
+        size=(_CASTER_RADIUS_M,),
+        pos=(-robot.caster_behind_m, 0, _CASTER_RADIUS_M),
+        condim=3,
+        priority=3,
+        friction=(robot.contact.caster_friction, 0.001, 0.0001),
+        solref=robot.contact.solref,
+        solimp=robot.contact.solimp,
+        mass=0,
+    )
+
+
+def _wheel(base: ET.Element, robot: Robot, joint: str, index: int) -> None:
+    left = index % 2 == 0
+    radius = robot.radius_m * robot.radius_scale[0 if left else 1]
+    x = 0.0 if robot.kind == "diff_drive" else robot.wheelbase_m * (0.5 if index < 2 else -0.5)
+    y = robot.track_m * (0.5 if left else -0.5)
+    body = _add(base, "body", name=joint.removesuffix("_joint"), pos=(x, y, radius))
+    motor = robot.motor
+    _add(
+        body,
+        "joint",
+        name=joint,
+        axis=(0, 1, 0),
+        armature=motor.armature,
+        damping=motor.damping,
+        frictionloss=motor.friction_nm,
+    )
+    _add(
+        body,
+        "geom",
+        name=joint.removesuffix("_joint"),
+        type="cylinder",
+        size=(radius, robot.wheel_width_m / 2),
+        euler=(math.pi / 2, 0, 0),
+        mass=robot.wheel_mass_kg,
+        condim=4,
+        priority=1,
+        friction=(0.8, robot.contact.torsional_friction, robot.contact.rolling_friction),
+        solref=robot.contact.solref,
+        solimp=robot.contact.solimp,
+        rgba=(0.1, 0.1, 0.1, 1),
+    )
+
+
+def _motor(actuator: ET.Element, motor: Motor, joint: str) -> None:
+    """Torque = K (u - k ω): a DC motor without inductance, driven by its voltage u."""
+    torque_per_volt = motor.stall_torque_nm / motor.supply_v
+    drag = motor.stall_torque_nm / motor.no_load_rad_s
+    _add(
+        actuator,
+        "general",
+        name=joint,
+        joint=joint,
+        ctrlrange=(-motor.supply_v, motor.supply_v),
+        gainprm=(torque_per_volt,),
+        biastype="affine",
+        biasprm=(0, 0, -drag),
+    )
+
+
+def _payload(base: ET.Element, actuator: ET.Element, payload: Payload) -> None:
+    rail = np.subtract(payload.end, payload.start)
+    body = _add(base, "body", name="payload", pos=payload.start)
+    _add(body, "joint", name="payload", type="slide", axis=rail / np.linalg.norm(rail), damping=20)
+    _add(
+        body,
+        "geom",
+        type="box",
+        size=(0.05, 0.05, 0.03),
+        mass=payload.mass_kg,
+        contype=0,
+        conaffinity=0,
+        rgba=(0.6, 0.4, 0.2, 1),
+    )
+    _add(actuator, "position", name="payload", joint="payload", kp=800, kv=150)
+
+
+def _add(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
+    return ET.SubElement(parent, tag, {key: _text(value) for key, value in attributes.items()})
+
+
+def _text(value: object) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Sequence | np.ndarray):
+        return " ".join(repr(float(v)) for v in value)
+    return repr(value)

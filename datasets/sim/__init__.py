@@ -1,1 +1,0 @@
-"""Front of `fgloc.datasets.sim`."""

@@ -1,1 +1,0 @@
-"""Loaders of public data sets into bags, the physical simulator, and small bundled recordings."""

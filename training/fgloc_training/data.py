@@ -1,0 +1,277 @@
+"""Recordings to samples at a fixed time step: smoothed truth, body velocities, commands as a function of time.
+
+Source: paper eq. 1, 2.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from fgloc.config import Config, load_config
+from fgloc.errors import RecordingError, TrajectoryError
+from fgloc.recording.outputs import read_tum
+from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import base_ground, base_pose
+from fgloc.sensor_setup import mounted_up
+from fgloc.sensors.learned.commands import CommandHistory
+from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
+from fgloc_training.config import DataConfig
+from fgloc_training.sensor_record import SensorRecord
+from fgloc_training.slopes import in_robots_plane
+
+_FINE_S = 0.02  # the truth is resampled to this before it is smoothed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One recording at times ``k·dt_s``."""
+
+    name: str
+    origin_ns: int
+    dt_s: float
+    poses: FloatArray  # (n, 3) smoothed truth, yaw unwrapped
+    velocities: FloatArray  # (n, 3) body vx [m/s], vy [m/s], ω [rad/s]
+    valid: NDArray[np.bool_]  # (n,) there is a truth around this time, and it can be true
+    sensors: SensorRecord
+    track: CommandHistory  # time zero is origin_ns
+
+    @property
+    def commands(self) -> tuple[ControlEvent, ...]:
+        """In order of stamp."""
+        return self.sensors.commands
+
+    @property
+    def times(self) -> FloatArray:
+        """``(n,)`` s since the origin."""
+        return np.asarray(np.arange(len(self.poses)) * self.dt_s, dtype=float)
+
+    def starts(self, steps: int, stride: int = 1) -> NDArray[np.int64]:
+        """Indices from which ``steps`` steps are valid throughout."""
+        broken = np.concatenate([[0], np.cumsum(~self.valid)])
+        k = np.arange(0, len(self.poses) - steps, stride)
+        return np.asarray(k[broken[k + steps + 1] == broken[k]], dtype=np.int64)
+
+
+def load_run(
+    path: Path, name: str, dt_s: float, history_s: float, config: DataConfig, truth_from: Path | None = None
+) -> Run:
+    """Read a bag. A ``robot.yaml`` beside it says how.
+
+    Args:
+        path: the bag.
+        name: what the split calls it.
+        dt_s: time step of the samples.
+        history_s: commands wanted before the first sample.
+        config: smoothing and cutting.
+        truth_from: what `fgloc smooth` wrote for this bag, to be believed in place of the bag's own truth: its folder
+            or a TUM file. Poses whose covariance beside it says too little are left out.
+
+    Raises:
+        RecordingError: it cannot be read, or has no commands, no truth or too little of both.
+        TrajectoryError: the trajectory cannot be read.
+    """
+    whole = _read(path, config, truth_from)
+    return make_run(
+        name,
+        SensorRecord(whole.sensed, whole.settings, whole.imu_up, whole.truth),
+        *whole.truth,
+        dt_s,
+        history_s,
+        config,
+    )
+
+
+def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from: Path | None = None) -> dict[str, Run]:
+    """Read a bag as one run or, where no message at all came for longer than ``config.apart_s``, as several.
+
+    The name of one run is the recording's, of several ``name.0``, ``name.1`` and so on; stretches that are too short
+    are left out. Arguments else, and errors, as of `load_run`.
+    """
+    whole = _read(path, config, truth_from)
+    stamps, poses = whole.truth
+    all_ns = np.sort(np.concatenate([[e.stamp_ns for e in whole.sensed], stamps]).astype(np.int64))
+    limits = [int(all_ns[0]), *all_ns[1:][np.diff(all_ns) > config.apart_s * 1e9].tolist(), int(all_ns[-1]) + 1]
+    if len(limits) == 2:
+        record = SensorRecord(whole.sensed, whole.settings, whole.imu_up, whole.truth)
+        return {name: make_run(name, record, stamps, poses, dt_s, config.history_s, config)}
+    runs: dict[str, Run] = {}
+    sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
+    sensed_ns = [e.stamp_ns for e in sensed]
+    for k, (first, last) in enumerate(pairwise(limits)):
+        part = sensed[bisect_left(sensed_ns, first) : bisect_left(sensed_ns, last)]
+        inside = (stamps >= first) & (stamps < last)
+        if not inside.any() or not any(isinstance(event, ControlEvent) for event in part):
+            continue
+        record, label = SensorRecord(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
+        with suppress(RecordingError):
+            runs[label] = make_run(label, record, stamps[inside], poses[inside], dt_s, config.history_s, config)
+    if not runs:
+        raise RecordingError(f"{path}: {len(limits) - 1} stretches, each shorter than {config.shortest_s:g} s")
+    return runs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recorded:
+    """A recording before it is cut to samples."""
+
+    settings: Config
+    sensed: list[Event]
+    truth: tuple[NDArray[np.int64], FloatArray]  # stamps (m,) and poses (m, 3)
+    imu_up: FloatArray
+
+
+def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
+    settings = _settings(path)
+    truth: list[TruthEvent] = []
+    sensed: list[Event] = []
+    with open_recording(path, settings.recording) as recording:
+        for event in recording.events():
+            if isinstance(event, TruthEvent):
+                truth.append(event)
+            else:
+                sensed.append(event)
+        up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
+    if truth_from is None:
+        stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
+        if len(truth) > 1:
+            rows = in_robots_plane(rows, np.array([base_ground(e, settings.truth) for e in truth]))
+    else:
+        stamps, rows = smoothed_truth(truth_from, config)
+    for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
+        if count < 2:
+            raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
+    return _Recorded(settings, sensed, (stamps, rows), up)
+
+
+def make_run(
+    name: str,
+    record: SensorRecord | Sequence[ControlEvent],
+    truth_ns: NDArray[np.int64],
+    truth: FloatArray,
+    dt_s: float,
+    history_s: float,
+    config: DataConfig,
+) -> Run:
+    """A run from sensors, or commands alone, and truth poses ``(m, 3)`` at ``truth_ns``; else as `load_run`.
+
+    Raises:
+        RecordingError: commands and truth overlap too little.
+    """
+    record = record if isinstance(record, SensorRecord) else SensorRecord(record)
+    commands = record.commands
+    order = np.unique(truth_ns, return_index=True)[1]
+    truth_ns, truth = truth_ns[order], truth[order]
+    first = max(int(truth_ns[0]) + round(config.margin_s * 1e9), commands[0].stamp_ns + round(history_s * 1e9))
+    last = min(int(truth_ns[-1]), commands[-1].stamp_ns) - round(config.margin_s * 1e9)
+    n = int((last - first) * 1e-9 / dt_s) + 1
+    if n * dt_s < config.shortest_s:
+        raise RecordingError(
+            f"{name}: commands and truth overlap for {max(0.0, (last - first) * 1e-9):.1f} s; expected at least "
+            f"{config.shortest_s:g} s; check the stamps with `fgloc info`"
+        )
+    t_truth = np.asarray((truth_ns - first) * 1e-9, dtype=float)
+    times = np.asarray(np.arange(n) * dt_s, dtype=float)
+    poses, velocities = _smooth(t_truth, truth, times, config.smoothing_s)
+    return Run(
+        name=name,
+        origin_ns=first,
+        dt_s=dt_s,
+        poses=poses,
+        velocities=velocities,
+        valid=_has_truth(t_truth, times, config) & _possible(velocities, dt_s, config),
+        sensors=record,
+        track=CommandHistory(commands, first),
+    )
+
+
+def smoothed_truth(path: Path, config: DataConfig) -> tuple[NDArray[np.int64], FloatArray]:
+    """Stamps and poses ``(m, 3)`` of a smoothed trajectory, without those that its covariance says little of.
+
+    Args:
+        path: a folder that `fgloc smooth` wrote, or a TUM file; ``covariance.csv`` beside the file is read if there.
+        config: ``max_truth_sigma_m`` bounds the standard deviation of the position.
+
+    Raises:
+        TrajectoryError: it cannot be read, or nothing is left.
+    """
+    tum = path / "trajectory.tum" if path.is_dir() else path
+    trajectory = read_tum(tum)
+    table = tum.with_name("covariance.csv")
+    if config.max_truth_sigma_m is None or not table.is_file():
+        return trajectory.stamps_ns, trajectory.poses
+    try:
+        variances = np.loadtxt(table, delimiter=",", skiprows=1, usecols=(1, 4), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise TrajectoryError(f"{table}: not a table of covariances ({error}); write it with `fgloc smooth`") from error
+    if len(variances) != len(trajectory):
+        raise TrajectoryError(f"{table}: {len(variances)} rows, {tum} has {len(trajectory)}; both come from one run")
+    known = variances.sum(axis=1) <= config.max_truth_sigma_m**2
+    if not known.any():
+        raise TrajectoryError(
+            f"{tum}: no pose is known to {config.max_truth_sigma_m} m, the best to "
+            f"{np.sqrt(variances.sum(axis=1).min()):.3f} m; raise data.max_truth_sigma_m"
+        )
+    return trajectory.stamps_ns[known], trajectory.poses[known]
+
+
+def cut(run: Run, name: str, first: int, last: int) -> Run:
+    """The samples ``[first, last)`` of a run, as a run of their own; commands before them stay known."""
+    return replace(
+        run,
+        name=name,
+        origin_ns=run.origin_ns + round(first * run.dt_s * 1e9),
+        poses=run.poses[first:last],
+        velocities=run.velocities[first:last],
+        valid=run.valid[first:last],
+        track=CommandHistory(run.commands, run.origin_ns + round(first * run.dt_s * 1e9)),
+    )
+
+
+def _smooth(
+    t_truth: FloatArray, truth: FloatArray, times: FloatArray, window_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Poses ``(n, 3)`` and body velocities ``(n, 3)`` at the times, from local cubic fits."""
+    window = max(5, 2 * round(window_s / _FINE_S / 2) + 1)
+    first, last = max(times[0] - window * _FINE_S, t_truth[0]), min(times[-1] + window * _FINE_S, t_truth[-1])
+    fine = np.linspace(first, last, max(window, 1 + round((last - first) / _FINE_S)))
+    yaw = np.unwrap(truth[:, 2])
+    raw = np.column_stack([np.interp(fine, t_truth, c) for c in (truth[:, 0], truth[:, 1], yaw)])
+    smooth = savgol_filter(raw, window, 3, axis=0)
+    rates = savgol_filter(raw, window, 3, deriv=1, delta=fine[1] - fine[0], axis=0)
+    poses, rates = (np.column_stack([np.interp(times, fine, c) for c in part.T]) for part in (smooth, rates))
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    body = np.column_stack([c * rates[:, 0] + s * rates[:, 1], c * rates[:, 1] - s * rates[:, 0], rates[:, 2]])
+    return poses, body
+
+
+def _has_truth(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArray[np.bool_]:
+    """Whether the smoothing window around each time is free of gaps."""
+    reach = 0.5 * config.smoothing_s
+    gaps = np.flatnonzero(np.diff(t_truth) > config.max_truth_gap_s)
+    known = np.ones(len(times), dtype=bool)
+    for k in gaps:
+        known[(times > t_truth[k] - reach) & (times < t_truth[k + 1] + reach)] = False
+    return known
+
+
+def _possible(velocities: FloatArray, dt_s: float, config: DataConfig) -> NDArray[np.bool_]:
+    """Whether the smoothing window around each time is free of motion that wheels do not make."""
+    if config.max_sideways_mps is None:
+        return np.ones(len(velocities), dtype=bool)
+    reach = round(0.5 * config.smoothing_s / dt_s)
+    slid = np.abs(velocities[:, 1]) > config.max_sideways_mps
+    return np.convolve(slid, np.ones(2 * reach + 1), "same") < 0.5
+
+
+def _settings(path: Path) -> Config:
+    beside = path.parent / "robot.yaml"
+    return load_config(beside) if beside.is_file() else Config()

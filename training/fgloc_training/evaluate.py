@@ -1,0 +1,177 @@
+"""Free rollouts against the truth: ``fgloc evaluate-model MODEL BAG...``.
+
+Drift is the summed end error over the summed distance of all windows; ATE and yaw MAE (paper eq. 11, 12) are means over
+the windows' poses; NIS/3 and coverage say whether the composed covariance holds: the share of errors inside the
+ellipsoids that hold 68.27, 95.45 and 99.73 % of a Gaussian in three dimensions (Mahalanobis distance against χ²).
+Windows start every second.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from fgloc.recording.outputs import write_text
+from fgloc.sensors.learned.card import Kinematics, ModelCard
+from fgloc.sensors.learned.load import load_model
+from fgloc.types import FloatArray
+from fgloc_training.calibrate import nis
+from fgloc_training.config import DataConfig
+from fgloc_training.data import Run, load_runs
+from fgloc_training.evaluation_plots import draw_calibration, draw_growth, draw_tracks
+from fgloc_training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_wheels
+
+HORIZONS_S = (1.0, 5.0, 10.0, 30.0, 60.0)
+STEP_S = 0.2
+_SHARES = np.linspace(0.0, 0.999, 200)
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of one source at one horizon. The covariance's figures are None for a source that gives none."""
+
+    horizon_s: float
+    windows: int
+    drift_percent: float
+    ate_m: float
+    yaw_mae_deg: float
+    yaw_end_deg: float
+    nis_over_3: float | None
+    coverage: tuple[float, float, float] | None  # share of errors inside the 1, 2, 3 σ ellipsoids' probability
+
+
+def evaluate(rollouts: list[Rollout], horizon_s: float) -> Figures:
+    """Pool the windows of several rollouts.
+
+    Raises:
+        ValueError: no window of this length has truth throughout.
+    """
+    end_errors, distances, yaw_ends, ates, yaws, all_nis = [], [], [], [], [], []
+    for rollout in rollouts:
+        k, n = rollout.starts(horizon_s)
+        if not len(k):
+            continue
+        for j in range(1, n + 1):
+            error = relative(
+                relative(rollout.track[k], rollout.track[k + j]), relative(rollout.truth[k], rollout.truth[k + j])
+            )
+            ates.append(np.hypot(error[:, 0], error[:, 1]))
+            yaws.append(np.abs(error[:, 2]))
+        end_errors.append(ates[-1])
+        yaw_ends.append(yaws[-1])
+        travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(rollout.truth[:, :2], axis=0).T))])
+        distances.append(travelled[k + n] - travelled[k])
+        if rollout.covs.any():
+            all_nis.append(nis(rollout.errors(horizon_s), rollout.end_covs(horizon_s)))
+    if not end_errors:
+        raise ValueError(f"no window of {horizon_s:.0f} s with truth throughout")
+    values = np.concatenate(all_nis) if all_nis else None
+    return Figures(
+        horizon_s=horizon_s,
+        windows=sum(len(e) for e in end_errors),
+        drift_percent=100.0 * float(np.concatenate(end_errors).sum() / np.concatenate(distances).sum()),
+        ate_m=float(np.concatenate(ates).mean()),
+        yaw_mae_deg=float(np.degrees(np.concatenate(yaws).mean())),
+        yaw_end_deg=float(np.degrees(np.concatenate(yaw_ends).mean())),
+        nis_over_3=None if values is None else float(values.mean() / 3.0),
+        coverage=None if values is None else _coverage(values),
+    )
+
+
+def growth(rollouts: list[Rollout]) -> list[Figures]:
+    """Figures at every horizon that the rollouts are long enough for."""
+    return [evaluate(rollouts, h) for h in HORIZONS_S if any(len(r.starts(h)[0]) for r in rollouts)]
+
+
+def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
+    """The figures a card keeps, by name."""
+    out: dict[str, float] = {}
+    for figures in growth(rollouts):
+        name = f"{figures.horizon_s:.0f}s"
+        out |= {f"drift_percent_{name}": figures.drift_percent, f"yaw_end_deg_{name}": figures.yaw_end_deg}
+        if figures.nis_over_3 is not None and figures.coverage is not None:
+            out[f"nis_over_3_{name}"] = figures.nis_over_3
+            out |= {f"coverage_{i}sigma_{name}": c for i, c in enumerate(figures.coverage, 1)}
+    return {name: round(value, 4) for name, value in out.items()}
+
+
+def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]]:
+    """Rollouts of the models by name, and of what they have to beat.
+
+    That is: commands as given; scaled and delayed as the first model knows; wheel odometry if every run has it.
+    """
+    loaded = {name: load_model(path) for name, path in models.items()}
+    kinds = {"commands": Kinematics(), "calibrated commands": next(iter(loaded.values())).card.kinematics}
+    found = {name: [roll_kinematics(kinematics, run, STEP_S) for run in runs] for name, kinematics in kinds.items()}
+    if all(run.sensors.has_wheels for run in runs):
+        found["wheel odometry"] = [roll_wheels(run, STEP_S) for run in runs]
+    return found | {name: [roll_model(model, run, STEP_S) for run in runs] for name, model in loaded.items()}
+
+
+def calibration_curve(rollouts: list[Rollout], horizon_s: float, shares: FloatArray) -> FloatArray:
+    """Which share of errors lies inside the ellipsoids that should hold these shares of them."""
+    values = np.concatenate([nis(r.errors(horizon_s), r.end_covs(horizon_s)) for r in rollouts])
+    return np.asarray((values[:, None] < chi2.ppf(shares, 3)).mean(axis=0))
+
+
+def _coverage(values: FloatArray) -> tuple[float, float, float]:
+    one, two, three = (float((values < chi2.ppf(2 * norm.cdf(s) - 1, 3)).mean()) for s in (1, 2, 3))
+    return one, two, three
+
+
+def table(rows: list[tuple[str, Figures]]) -> str:
+    """The figures of each source and horizon as text."""
+    lines = [
+        f"{'source':<20}{'s':>4}{'n':>6}{'drift %':>9}{'ATE m':>8}{'yaw MAE':>9}{'yaw end':>9}{'NIS/3':>7}  1/2/3σ"
+    ]
+    for name, f in rows:
+        tail = (
+            ""
+            if f.nis_over_3 is None or f.coverage is None
+            else (f"{f.nis_over_3:>7.2f}  " + "/".join(f"{c:.3f}" for c in f.coverage))
+        )
+        lines.append(
+            f"{name:<20}{f.horizon_s:>4.0f}{f.windows:>6}{f.drift_percent:>9.2f}{f.ate_m:>8.4f}{f.yaw_mae_deg:>8.2f}°"
+            f"{f.yaw_end_deg:>8.2f}°{tail}"
+        )
+    return "\n".join(lines)
+
+
+def _runs(card: ModelCard, bags: list[Path]) -> list[Run]:
+    data = DataConfig(history_s=card.history_s)
+    return [run for bag in bags for run in load_runs(bag, bag.name, card.dt_s, data).values()]
+
+
+def write_json(path: Path, rows: list[tuple[str, Figures]]) -> None:
+    """Write the figures of each source and horizon."""
+    write_text(path, json.dumps([{"source": name, **asdict(f)} for name, f in rows], indent=1) + "\n")
+
+
+def draw(folder: Path, found: dict[str, list[Rollout]], rows: list[tuple[str, Figures]]) -> None:
+    """Draw tracks, growth of errors and calibration of the first model."""
+    draw_tracks(folder / "tracks.png", found["model"])
+    draw_growth(folder / "growth.png", rows)
+    curves = {
+        figures.horizon_s: calibration_curve(found["model"], figures.horizon_s, _SHARES)
+        for name, figures in rows
+        if name == "model" and figures.coverage is not None
+    }
+    draw_calibration(folder / "calibration.png", _SHARES, curves)
+
+
+def compare(
+    model: Path, bags: list[Path], against: list[Path]
+) -> tuple[dict[str, list[Rollout]], list[tuple[str, Figures]]]:
+    """Free rollouts of a model, of what it is compared with, and of the wheels; and their figures by horizon.
+
+    Raises:
+        ModelError: a model cannot be read.
+        RecordingError: a recording cannot be used.
+    """
+    models = {"model": model} | {path.stem: path for path in against}
+    found = sources(models, _runs(load_model(model).card, bags))
+    return found, [(name, figures) for name, rollouts in found.items() for figures in growth(rollouts)]
