@@ -25,7 +25,7 @@ DECIDING = (
     "relocalization/*.py",
     "sensors/learned/joint.py",
     "sensors/gyro/rate.py",
-    *(f"graph/{name}.py" for name in ("batch", "isam2", "joint", "noise_budget")),
+    *(f"graph/{name}.py" for name in ("batch", "estimators", "joint", "noise")),
 )
 SECTIONS = ("WeightsConfig", "GateConfig", "EstimatorConfig")
 _NOT_COUNTED = (0.0, 0.5, 1.0, 2.0)

@@ -17,10 +17,10 @@ from benchmarks.mechanisms_switch import (
     Switch,
     called,
 )
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 
 _TRUST = "fgloc.robust.motion_faults"
-_BUDGET = "fgloc.graph.noise_budget"
+_BUDGET = "fgloc.graph.noise"
 
 
 def _unscaled(real: Function) -> Function:
@@ -61,7 +61,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_scale",
         "Covariances of motion sources that disagree are scaled before the alarm.",
-        ("robust/glr_test.py", "graph/noise_budget.py"),
+        ("robust/glr_test.py", "graph/noise.py"),
         (Switch(f"{_BUDGET}:NoiseBudget.combine", _unscaled),),
         Probe(f"{_BUDGET}:NoiseBudget.combine", _scaled),
         batch=True,
@@ -79,7 +79,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "learned_alone",
         "Beside wheels that are left out the learned motion's covariance is four times its own.",
-        ("graph/noise_budget.py",),
+        ("graph/noise.py",),
         (Switch(f"{_BUDGET}:COVARIANCE_FACTOR", Constant(1.0)),),
         Probe(f"{_BUDGET}:NoiseBudget.combine", _without_wheels),
         batch=True,
@@ -88,7 +88,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "onset_reweighing",
         "Steps between the likeliest onset of a fault and its detection are weighed again.",
-        ("robust/motion_judge.py", "graph/estimator.py", "graph/isam2.py"),
+        ("robust/motion_judge.py", "graph/estimators.py"),
         (Switch("fgloc.robust.motion_judge:MotionJudge._revise", Returns(())),),
         Probe("fgloc.robust.motion_judge:MotionJudge._revise", lambda result, _, self, verdict: verdict.span > 1),
         batch=True,
@@ -105,7 +105,7 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "doubtful_wheels",
         "Flagged wheels that nothing replaces stay, with a covariance that allows for the fault.",
-        ("graph/noise_budget.py",),
+        ("graph/noise.py",),
         (Switch(f"{_BUDGET}:NoiseBudget._with_slip", Argument(1)),),
         Probe(f"{_BUDGET}:NoiseBudget._with_slip", called),
         batch=True,

@@ -33,8 +33,7 @@ import numpy as np
 from benchmarks.common import Row, main
 from benchmarks.steps import Chain, World
 from fgloc import se2
-from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.batch_solve import elimination_order, initial_values, solved, with_deep_stack
+from fgloc.graph.batch import BatchSmoother, elimination_order, initial_values, solved, with_deep_stack
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, pose_key, sighting_factors
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 

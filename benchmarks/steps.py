@@ -26,8 +26,8 @@ from benchmarks.common import Row, main
 from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
+from fgloc.graph.estimators import FixedLag, isam2_params
 from fgloc.graph.factors import pose_key
-from fgloc.graph.isam2_backends import FixedLag, isam2_params
 from fgloc.instrumentation.timing import Stopwatch
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
@@ -216,7 +216,7 @@ def _mirrored() -> Iterator[list[_Mirror]]:
             super().__init__(*arguments)
             self._smoother = Watched(arguments[0].lag_s, isam2_params(*arguments))
 
-    with patch("fgloc.graph.isam2.FixedLag", Backend):
+    with patch("fgloc.graph.estimators.FixedLag", Backend):
         yield mirrors
 
 

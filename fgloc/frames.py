@@ -88,3 +88,10 @@ def sensor_pose(T: FloatArray, optical: bool) -> tuple[float, float, float, floa
     R = T[:3, :3] @ OPTICAL_TO_BODY.T if optical else T[:3, :3]
     x, y, z = T[:3, 3].tolist()
     return x, y, z, *roll_pitch(R), math.atan2(R[1, 0], R[0, 0])
+
+
+def rotations(angles: FloatArray) -> FloatArray:
+    """``Ry(pitch) Rx(roll)`` ``(m, 3, 3)`` of angles roll, pitch ``(m, 2)``."""
+    cr, sr, cp, sp = (f(angles[:, i]) for i in range(2) for f in (np.cos, np.sin))
+    zero = np.zeros_like(cr)
+    return np.stack([cp, sp * sr, sp * cr, zero, cr, -sr, -sp, cp * sr, cp * cr], axis=1).reshape(-1, 3, 3)

@@ -17,8 +17,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
-from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.installation import CAMERA, Installation, installation_of
+from fgloc.graph.observation import CornerBatch
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry

@@ -11,13 +11,20 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
-from fgloc.graph.factors import INSTALLATION, LandmarkFactors, motion_factor, pose_key, sighting_factors
-from fgloc.graph.ground import of_ground
-from fgloc.graph.installation import Installation
-from fgloc.graph.linearized import Linearized, Stacked
+from fgloc.graph.factors import (
+    INSTALLATION,
+    LandmarkFactors,
+    installed_motion_factor,
+    motion_factor,
+    of_ground,
+    pose_key,
+    sighting_factors,
+)
+from fgloc.graph.ground import gravity, gravity_factor, ground_prior, step_factors, step_of
+from fgloc.graph.installation import GROUND, Installation
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
-from fgloc.graph.noise_models import whitening_of
-from fgloc.graph.observation import Observations
+from fgloc.graph.noise import whitening_of
+from fgloc.graph.observation import Linearized, Observations, Stacked
 from fgloc.types import FloatArray, IntArray, MotionMeasurement
 
 _AT_ONCE = 300  # keyframes whose sightings are linearized at the same time; each may have 100 kB of Jacobians
@@ -259,3 +266,35 @@ def whitened(A: FloatArray, shared: FloatArray) -> FloatArray:
     root = np.sqrt(1.0 + values)
     scaled = -vectors / (root * (1.0 + root))[:, None, :]  # (1/root - 1) / λ = -1 / (root (1 + root))
     return np.asarray(A + shared @ (scaled @ np.swapaxes(vectors, 1, 2) @ (np.swapaxes(shared, 1, 2) @ A)))
+
+
+class GroundMotions:
+    """Factors of motion of all keyframes, made anew about each solution."""
+
+    def __init__(self, frames: Sequence[Keyframe], installation: Installation) -> None:
+        """Take the keyframes in order."""
+        self._frames, self._installation = frames, installation
+        first = installation.prior()
+        self._prior = first.cov[installation.constants :, installation.constants :]
+
+    def factors(self, poses: FloatArray, ground: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
+        """All factors.
+
+        Args:
+            poses: ``(n, 3)`` of the keyframes.
+            ground: ``(n, 3)`` their height, roll and pitch.
+            theta: ``(constants,)`` installation.
+        """
+        installation = self._installation
+        for i, frame in enumerate(self._frames):
+            if not frame.motions:
+                yield ground_prior(frame.k, np.zeros(len(GROUND)), self._prior)
+                continue
+            before = np.concatenate([theta, ground[i - 1]])
+            step = step_of(frame.motions, before, installation)
+            for motion in step.motions:
+                yield installed_motion_factor(frame.k, motion, poses[i - 1], installation)
+            yield from step_factors(frame.k, step, before, installation)
+            seen = gravity(frame.motions, ground[i], before, installation)
+            if seen is not None:
+                yield gravity_factor(frame.k, seen, ground[i], before, installation)

@@ -1,15 +1,735 @@
-"""The estimator of a run, by its configuration."""
+"""The online estimators: what they share, the extended Kalman filter, and iSAM2 in a fixed lag or whole."""
 
 from __future__ import annotations
 
-from fgloc.config import Config
-from fgloc.graph.ekf import ExtendedKalmanFilter
-from fgloc.graph.estimator import Estimator
-from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import installation_of
-from fgloc.graph.isam2 import IncrementalEstimator
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from scipy.linalg.lapack import dpotri
+
+from fgloc import se2
+from fgloc.config import Config, EstimatorConfig
+from fgloc.errors import ConfigError, EstimatorError
+from fgloc.graph.factors import (
+    INSTALLATION,
+    LandmarkFactors,
+    ground_key,
+    installed_motion_factor,
+    installed_prior_factor,
+    landmark_key,
+    linear_factor,
+    motion_factor,
+    pose_key,
+    prior_factor,
+    sighting_factors,
+)
+from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
+from fgloc.graph.installation import GROUND, Installation, InstallationEstimate, installation_of
+from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.types import LandmarkMap
+from fgloc.types import (
+    FloatArray,
+    FrameMeasurement,
+    LandmarkMap,
+    LandmarkMeasurement,
+    MotionMeasurement,
+    PointMeasurement,
+)
+
+# --- What all estimators share ----------------------------------------------------------------------------------------
+
+
+class Estimator(ABC):
+    """Poses of the newest keyframes, one update a step.
+
+    Attributes:
+        factors: makes the factors of landmarks; it has what is known of the installation.
+        log: every measurement of the window (or of the run, if ``keep_all``).
+        belief: the newest pose.
+        rebuilt: how often what the estimator held had to be built again from the log.
+        contradicted: constants that left the gate of their prior, with value and sigma that they had then. They are
+            held at what was given from then on, and their prior's uncertainty stays in the covariance of the pose.
+    """
+
+    def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
+        self._config = config
+        self.factors = factors
+        self.log = MeasurementLog(config.lag_s, keep_all or config.kind == "isam2")
+        self.rebuilt = 0
+        self.belief: PoseWithCovariance | None = None
+        self._k = -1
+        self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
+        self._elapsed_s = 0.0
+        self.contradicted: dict[str, tuple[float, float]] = {}
+
+    @property
+    def elapsed_s(self) -> float:
+        """The estimator's own time: runs on through clock jumps."""
+        return self._elapsed_s
+
+    @property
+    def installation(self) -> Installation:
+        """The parameters beside the pose."""
+        return self.factors.installation
+
+    @property
+    def installed(self) -> InstallationEstimate:
+        """What is known of the installation now."""
+        return self.factors.estimated
+
+    @property
+    def k(self) -> int:
+        """Index of the newest keyframe, -1 before the first."""
+        return self._k
+
+    @property
+    def newest(self) -> Keyframe:
+        """The newest keyframe."""
+        return self.log.keyframes[self._k]
+
+    def start(
+        self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LandmarkFactor] = ()
+    ) -> PoseWithCovariance:
+        """Begin a segment: a first pose with a prior, unconnected to what was before."""
+        self._k += 1
+        self._elapsed_s += 1e-3
+        frame = Keyframe(self._k, stamp_ns, self._elapsed_s, prior, prior=prior, sightings=tuple(sightings))
+        return self._take(frame)
+
+    def predict(self, motions: Sequence[MotionMeasurement]) -> PoseWithCovariance:
+        """Where the robot is expected after the motions of one step (information-weighted), before any sighting.
+
+        Raises:
+            EstimatorError: not started, or no motion.
+        """
+        if self.belief is None or not motions:
+            raise EstimatorError("predict needs a started estimator and at least one motion measurement")
+        if not self.installation.ground:
+            return predict(self.belief, self.installed, self.factors.installation, motions)
+        predicted = predict(self.belief, self.belief.installation or self.installed, self.installation, motions)
+        assert predicted.installation is not None
+        self.factors.estimated = predicted.installation  # sightings are held against the ground as predicted
+        return predicted
+
+    def level(self, motions: Sequence[MotionMeasurement]) -> None:
+        """While no pose is known, follow roll and pitch by what gravity tells of this step."""
+        if self.installation.ground:
+            self.factors.estimated = levelled(self.installed, motions, self.installation)
+
+    def forget_ground(self) -> None:
+        """A first pose comes: height, roll and pitch there may be others than those of the newest step."""
+        if self.installation.ground:
+            self.factors.estimated = starting(self.installed, self.installation)
+
+    def update(
+        self,
+        stamp_ns: int,
+        dt: float,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[LandmarkFactor] = (),
+        rejected: Sequence[LandmarkFactor] = (),
+        predicted: PoseWithCovariance | None = None,
+    ) -> PoseWithCovariance:
+        """Add one keyframe with its measurements; return the filtered pose.
+
+        Args:
+            stamp_ns: time of the keyframe.
+            dt: time since the one before [s].
+            motions: between-factors from the one before; at least one.
+            sightings: landmark measurements, motion-compensated to this keyframe.
+            rejected: sightings that are only logged, for the cost of the batch.
+            predicted: result of `predict` for these motions, if the caller has it already.
+        """
+        predicted = predicted or self.predict(motions)
+        self._k += 1
+        self._elapsed_s += max(dt, 1e-6)
+        frame = Keyframe(
+            self._k, stamp_ns, self._elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(rejected)
+        )
+        return self._take(frame)
+
+    def revise(self, motions: Mapping[int, Sequence[MotionMeasurement]]) -> None:
+        """Replace the motion factors of keyframes that the estimator still holds; the newest belief follows.
+
+        Older ones are changed in the log alone, for the batch smoother.
+        """
+        for k, changed in motions.items():
+            self.log.keyframes[k].motions = tuple(changed)
+        if motions and self.belief is not None:
+            self._solve_again(sorted(motions))
+            self._adopt(self.newest.belief)
+
+    def correct(self, belief: PoseWithCovariance, landmark_id: int) -> None:
+        """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
+        for frame in self.log.keyframes.values():
+            of_it = tuple(s for s in frame.sightings if s.measurement.landmark_id == landmark_id)
+            if of_it:
+                frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
+                frame.rejected = (*frame.rejected, *of_it)
+        newest = self.newest
+        newest.belief, self._corrected = belief, self._k
+        self._begin_at(newest)
+        self._adopt(newest.belief)
+
+    @abstractmethod
+    def _begin_at(self, newest: Keyframe) -> None:
+        """Forget what led to the belief of this keyframe, which stands as it is."""
+
+    def _take(self, frame: Keyframe) -> PoseWithCovariance:
+        self._solve(frame)
+        frame.ground = self.ground_of(frame.belief)
+        self.log.append(frame)
+        self._adopt(frame.belief)
+        return frame.belief
+
+    def ground_of(self, belief: PoseWithCovariance) -> FloatArray | None:
+        """Height, roll and pitch ``(3,)``; None where the floor is flat."""
+        if not self.installation.ground:
+            return None
+        return (belief.installation or self.installed).mean[self.installation.constants :]
+
+    def asked(self) -> InstallationEstimate:
+        """The installation with what is held as it was when it left the gate of its prior."""
+        mean, cov = self.installed.mean.copy(), self.installed.cov.copy()
+        for name, (value, sigma) in self.contradicted.items():
+            i = self.installation.index[name]
+            cov[i], cov[:, i] = 0.0, 0.0
+            mean[i], cov[i, i] = value, sigma**2
+        return InstallationEstimate(mean, cov)
+
+    def _held(self) -> list[int]:
+        """Rows of pose and installation together that are held."""
+        return [3 + self.installation.index[name] for name in self.contradicted]
+
+    def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
+        """From now on hold what this belief has furthest beyond the gate of its prior; whether there was something.
+
+        Not all at once: what one wrong constant makes impossible pulls others along.
+        """
+        known = belief.installation
+        names = () if known is None else self.installation.beyond_gate(known)
+        new = [name for name in names if name not in self.contradicted][:1]
+        for name in new:
+            i = self.installation.index[name]
+            assert known is not None
+            self.contradicted[name] = float(known.mean[i]), math.sqrt(max(0.0, float(known.cov[i, i])))
+        return bool(new)
+
+    def _considered(self, belief: PoseWithCovariance) -> PoseWithCovariance:
+        """The belief with what is held as uncertain as its prior."""
+        if not self.contradicted or belief.installation is None:
+            return belief
+        rows, prior = self._held(), self.installation.prior()
+        held = [i - 3 for i in rows]
+        P = considered(joint_cov(belief, belief.installation), rows, prior.cov[np.ix_(held, held)])
+        found = split(belief, P)
+        assert found.installation is not None
+        found.installation.mean[held] = prior.mean[held]
+        return found
+
+    def _adopt(self, belief: PoseWithCovariance) -> None:
+        self.belief = belief
+        if belief.installation is not None:
+            self.factors.estimated = belief.installation
+
+    def _solve_again(self, changed: Sequence[int]) -> None:
+        """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
+        for k in range(max(changed[0], self._corrected + 1), self._k + 1):
+            before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
+            if before is None or frame.prior is not None:
+                continue
+            known = before.belief.installation or self.installed
+            frame.belief = predict(before.belief, known, self.factors.installation, frame.motions)
+            self._solve(frame)
+
+    @abstractmethod
+    def _solve(self, frame: Keyframe) -> None:
+        """Replace the belief of a keyframe, which is its prior or its prediction, by the filtered one."""
+
+
+# --- The extended Kalman filter, to compare with ----------------------------------------------------------------------
+
+
+class ExtendedKalmanFilter(Estimator):
+    """Predicts by the fused motion and corrects by all accepted sightings at once.
+
+    It is given the measurements of the fixed-lag smoother, after the same χ² gates. What a filter lacks remains: no
+    sighting changes an older pose. Its log serves the batch smoother.
+
+    Source: Thrun, Burgard, Fox, Probabilistic Robotics, table 7.2; on SE(2) with a right perturbation, iterated.
+    """
+
+    def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
+        """Begin without a pose.
+
+        Raises:
+            ConfigError: the map is unknown.
+        """
+        if not factors.known:
+            raise ConfigError(
+                "estimator.kind is ekf, which does not estimate landmarks: give a map with --map, or build one with "
+                "`fgloc map`"
+            )
+        super().__init__(config, factors, keep_all)
+
+    def _solve(self, frame: Keyframe) -> None:
+        known = frame.belief.installation or self.installed
+        if frame.sightings:
+            measurements = [s.measurement for s in frame.sightings]
+            before = self._exact(frame.belief, known)
+            corrected = correct(before, before.installation or known, measurements, self.factors)
+            while corrected is not None and self._hold_beyond_gate(corrected[0]):
+                before = self._exact(frame.belief, known)
+                corrected = correct(before, before.installation or known, measurements, self.factors)
+            if corrected is not None:
+                frame.belief = self._considered(corrected[0])
+        if frame.belief.installation is None:
+            frame.belief.installation = known
+
+    def _exact(self, belief: PoseWithCovariance, known: InstallationEstimate) -> PoseWithCovariance:
+        """The belief with what is held as it was given, and nothing uncertain about it."""
+        if not self.contradicted:
+            return belief
+        rows, P, prior = self._held(), joint_cov(belief, known), self.installation.prior()
+        gap = np.array([prior.mean[i - 3] - known.mean[i - 3] for i in rows])
+        shift = np.linalg.solve(P[np.ix_(rows, rows)], P[rows]).T @ gap
+        moved = InstallationEstimate(known.mean + shift[3:], known.cov)
+        pose = se2.compose(belief.pose, se2.exp(shift[:3]))
+        return split(PoseWithCovariance(pose, belief.cov, belief.cross, moved), conditioned(P, rows))
+
+    def _begin_at(self, newest: Keyframe) -> None:
+        """A filter holds nothing else."""
+
+
+# --- The two smoothers of GTSAM behind one interface ------------------------------------------------------------------
+
+_NEVER = 1e9
+
+
+class Backend(Protocol):
+    """What `IncrementalEstimator` needs of a smoother."""
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
+        """Add a keyframe; the slots of its factors, in their order."""
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        """Put factors in the place of those in these slots; their own slots."""
+
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+
+    def holds(self, k: int) -> bool:
+        """Whether a keyframe is in the window."""
+
+    def pose(self, k: int) -> FloatArray:
+        """Estimated pose ``(3,)`` of a keyframe."""
+        ...
+
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
+        """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance.
+
+        ``ground``: the installation ends with height, roll and pitch of the keyframe.
+        """
+
+
+class FixedLag:
+    """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
+
+    def __init__(self, config: EstimatorConfig, installed: int, careful: bool = False) -> None:
+        self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed, careful))
+        self._installed = False
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
+        """Add a keyframe."""
+        stamps = dict.fromkeys(values.keys(), elapsed_s)
+        self._installed |= INSTALLATION in stamps
+        if self._installed:
+            stamps[INSTALLATION] = elapsed_s
+        self._smoother.update(graph, values, stamps)  # type: ignore[arg-type]
+        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        """Put factors in the place of others."""
+        self._smoother.update(graph, gtsam.Values(), {}, slots)
+        return list(self._smoother.getISAM2Result().getNewFactorsIndices())
+
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+        self._smoother.update(graph, gtsam.Values(), {})
+
+    def holds(self, k: int) -> bool:
+        """Whether a keyframe is in the window."""
+        return bool(self._smoother.getISAM2().valueExists(pose_key(k)))
+
+    def pose(self, k: int) -> FloatArray:
+        """Estimated pose of a keyframe."""
+        return pose_vector(self._smoother.calculateEstimatePose2(pose_key(k)))
+
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
+        """Pose and installation with their joint covariance."""
+        pose = self.pose(k)
+        if ground:
+            return _joint_on_ground(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector, k, n)
+        if not n:
+            return PoseWithCovariance(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
+        return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
+
+
+class WholeRun:
+    """``ISAM2`` over the whole run: landmarks may be variables; the cost grows with the run."""
+
+    def __init__(self, config: EstimatorConfig, careful: bool = False) -> None:
+        self._isam2 = gtsam.ISAM2(isam2_params(config, careful=careful))
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
+        """Add a keyframe."""
+        return list(self._isam2.update(graph, values).getNewFactorsIndices())
+
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
+        """Put factors in the place of others."""
+        return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
+
+    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Add factors of what is there already."""
+        self._isam2.update(graph, gtsam.Values())
+
+    def holds(self, k: int) -> bool:
+        """Whether a keyframe is in the window."""
+        return bool(self._isam2.valueExists(pose_key(k)))
+
+    def pose(self, k: int) -> FloatArray:
+        """Estimated pose of a keyframe."""
+        return pose_vector(self._isam2.calculateEstimatePose2(pose_key(k)))
+
+    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
+        """Pose and installation with their joint covariance."""
+        pose = self.pose(k)
+        if ground:
+            return _joint_on_ground(self._isam2, pose, self._isam2.calculateEstimateVector, k, n)
+        if not n:
+            return PoseWithCovariance(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
+        return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
+
+
+def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
+    """Pose and installation with their joint covariance, of its square-root information: (RᵀR)⁻¹."""
+    R, _ = isam2.jointBayesNet(pose_key(k), INSTALLATION).matrix()
+    upper, failed = dpotri(R)
+    if failed:
+        raise RuntimeError("the joint information of pose and installation is singular")
+    upper = np.triu(upper)
+    P = upper + np.triu(upper, 1).T
+    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(np.asarray(theta), P[3:, 3:]))
+
+
+def _joint_on_ground(
+    isam2: gtsam.ISAM2, pose: FloatArray, estimate: Callable[[int], FloatArray], k: int, n: int
+) -> PoseWithCovariance:
+    """As `_joint`, where the installation ends with the ground's height, roll and pitch at the keyframe."""
+    keys = [pose_key(k), *([INSTALLATION] if n > len(GROUND) else []), ground_key(k)]
+    found = isam2.jointMarginalCovariance(keys)
+    P = np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys])
+    known = InstallationEstimate(np.concatenate([np.asarray(estimate(key)) for key in keys[1:]]), P[3:, 3:])
+    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], known)
+
+
+def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = False) -> gtsam.ISAM2Params:
+    """iSAM2 settings that every backend shares; see gtsam's defaults for the rest.
+
+    Args:
+        config: for the threshold.
+        installed: parameters of the installation, in which all factors are linear: relinearizing gives the same.
+        careful: by QR; Cholesky takes a third of its time, but fails where sigmas are metres apart from millimetres:
+            at a first pose that is hardly known, and after minutes without a fix.
+    """
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR" if careful else "CHOLESKY")
+    if installed:
+        thresholds = gtsam.ISAM2ThresholdMap()
+        thresholds.insert(("x", np.full(3, config.relinearize_threshold)))
+        thresholds.insert(("i", np.full(installed, _NEVER)))
+        thresholds.insert(("g", np.full(len(GROUND), _NEVER)))
+        params.setRelinearizeThreshold(thresholds)
+    else:
+        params.setRelinearizeThreshold(config.relinearize_threshold)
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    return params
+
+
+def pose_vector(pose: gtsam.Pose2) -> FloatArray:
+    """A pose as ``(3,)``."""
+    return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+# --- The incremental estimator ----------------------------------------------------------------------------------------
+
+_GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)
+
+
+class IncrementalEstimator(Estimator):
+    """The factor graph of the window, or of the run, kept solved."""
+
+    def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
+        super().__init__(config, factors, keep_all)
+        self._backend: Backend | None = None
+        self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
+        self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
+        self._fresh = True  # nothing was given to the backend yet
+        self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
+
+    def _solve(self, frame: Keyframe) -> None:
+        if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):
+            self._careful_until_s = -math.inf
+            self._backend = self._new_backend()
+            self._slots.clear()
+        initial, predicted = self._linearization(frame), frame.belief
+        try:
+            graph, values = self._graph_of(frame, initial, frame.prior)
+            self._keep_slots(frame, self._backend.update(graph, values, frame.elapsed_s))
+            frame.belief = self._newest(frame.k)
+        except _GTSAM_ERRORS:
+            frame.belief = predicted  # which the sightings have no part in
+            self._solve_carefully(frame, initial)
+            return
+        if math.isfinite(self._careful_until_s) and frame.elapsed_s > self._careful_until_s:
+            self._careful_until_s = -math.inf
+            try:
+                frame.belief = self._replayed([*self._window(frame), frame], frame.belief)
+            except _GTSAM_ERRORS:
+                self._solve_carefully(frame, frame.belief)
+
+    def _solve_carefully(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
+        """By QR, as long as the window holds what Cholesky fails at; if that fails too, the sightings are at fault."""
+        predicted = frame.belief
+        self._careful_until_s = frame.elapsed_s + self._config.lag_s
+        try:
+            frame.belief = self._replayed([*self._window(frame), frame], initial)
+        except _GTSAM_ERRORS:
+            self._rebuild(frame, predicted)
+
+    def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
+        """Where to linearize: at the prediction or, where sightings are far from linear over it, where they put it."""
+        known = frame.belief.installation or self.installed
+        near = is_level_known(known, self.installation) and is_linear(frame.belief)
+        if not frame.sightings or not self.factors.known or near:
+            return frame.belief
+        measurements = [s.measurement for s in frame.sightings]
+        corrected = correct(frame.belief, known, measurements, self.factors)
+        return frame.belief if corrected is None else corrected[0]
+
+    def _newest(self, k: int) -> PoseWithCovariance:
+        belief = self._found(k)
+        while self._hold_beyond_gate(belief):
+            assert self._backend is not None
+            self._backend.hold(self._holding())
+            belief = self._found(k)
+        return self._considered(belief)
+
+    def _found(self, k: int) -> PoseWithCovariance:
+        """As the backend has it: what is held is as good as exact."""
+        assert self._backend is not None
+        belief = self._backend.belief(k, len(self.factors.installation), self.installation.ground)
+        if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
+            raise ValueError("estimate is not finite")
+        return belief
+
+    def _holding(self) -> gtsam.NonlinearFactorGraph:
+        """What keeps the constants that left the gate of their prior at what was given."""
+        graph, constants = gtsam.NonlinearFactorGraph(), self.installation.constants
+        rows = [self.installation.index[name] for name in self.contradicted]
+        H = np.eye(constants)[rows] / EXACT
+        values = gtsam.Values()
+        values.insert(INSTALLATION, self.installation.prior().mean[:constants])
+        graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values))
+        return graph
+
+    def _solve_again(self, changed: Sequence[int]) -> None:
+        """Swap the motion factors of these keyframes, as far as the window holds them."""
+        backend = self._backend
+        if backend is None:
+            return
+        frames = [self.log.keyframes[k] for k in changed if k in self._slots]
+        newest = self.log.keyframes[self._k]
+        graph, slots = gtsam.NonlinearFactorGraph(), []
+        for frame in frames:
+            slots += self._slots[frame.k]
+            for factor in self._motion_factors(frame):
+                graph.add(factor)
+        try:
+            new = backend.swap(graph, slots) if frames else []
+            newest.belief = self._newest(newest.k)
+        except _GTSAM_ERRORS:
+            self._careful_until_s = newest.elapsed_s + self._config.lag_s
+            self._build_again()
+            return
+        for frame in frames:
+            held, new = new[: len(frame.motions)], new[len(frame.motions) :]
+            self._slots[frame.k] = held
+
+    def _begin_at(self, newest: Keyframe) -> None:
+        if self._config.kind == "fixed_lag":
+            newest.belief = self._replayed([newest], newest.belief)
+        else:
+            self._build_again()
+
+    def _build_again(self) -> None:
+        """Take the log up as it is now, in a new window."""
+        newest = self.log.keyframes[self._k]
+        initial = newest.belief
+        try:
+            newest.belief = self._replayed(self._window(newest) or [newest], initial)
+        except _GTSAM_ERRORS:  # what the window knew is in the belief
+            self.rebuilt += 1
+            newest.belief = self._replayed([newest], initial)
+
+    def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: PoseWithCovariance | None = None) -> None:
+        """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""
+        if frame.prior is None and prior is None:
+            self._slots[frame.k] = list(slots[: len(frame.motions)])
+        while self._slots and self._backend is not None and not self._backend.holds(next(iter(self._slots)) - 1):
+            del self._slots[next(iter(self._slots))]
+
+    def _window(self, frame: Keyframe) -> list[Keyframe]:
+        """Logged keyframes that are in the window together with this one: of its segment, unless all are kept."""
+        if self._config.kind != "fixed_lag":
+            return list(self.log.keyframes.values())
+        if frame.prior is not None:
+            return []
+        frames = [f for f in self.log.since(frame.elapsed_s - self._config.lag_s) if f.k >= self._corrected]
+        starts = [i for i, f in enumerate(frames) if f.prior is not None]
+        return frames[starts[-1] :] if starts else frames
+
+    def _motion_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
+        """Of a keyframe, linear about the pose before it; a kernel on the wheels needs factors that are not."""
+        before, motions = self.log.keyframes.get(frame.k - 1), frame.motions
+        if self.installation.ground and motions:
+            motions = step_of(motions, self._theta_before(frame), self.installation).motions
+        installed = self._config.motion_kernel == "none" and before is not None
+        return [
+            installed_motion_factor(frame.k, m, before.belief.pose, self.factors.installation)
+            if installed and before is not None
+            else motion_factor(frame.k, m, self._config.motion_kernel)
+            for m in motions
+        ]
+
+    def _theta_before(self, frame: Keyframe) -> FloatArray:
+        """Installation ``(n,)`` as it is known now, with height, roll and pitch at the keyframe before this one."""
+        before = self.log.keyframes.get(frame.k - 1)
+        return (self.installed if before is None else self._on_ground(before, self.installed)).mean
+
+    def _ground_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
+        if not self.installation.ground or not frame.motions:
+            return []
+        motions, theta = frame.motions, self._theta_before(frame)
+        return ground_factors(frame.k, motions, step_of(motions, theta, self.installation), theta, self.installation)
+
+    def _graph_of(
+        self, frame: Keyframe, initial: PoseWithCovariance, prior: PoseWithCovariance | None
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Factors and first values of a keyframe; of the first one in a new backend, also of the installation."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        values.insert(pose_key(frame.k), gtsam.Pose2(*initial.pose))
+        known = initial.installation or self.installed
+        constants = self.installation.constants
+        if self.installation.ground:
+            known = known if initial.installation is not None else self._on_ground(frame, known)
+            values.insert(ground_key(frame.k), known.mean[constants:])
+        if self._fresh and constants:
+            values.insert(INSTALLATION, known.mean[:constants])
+        if prior is None:
+            made = [*self._motion_factors(frame), *self._ground_factors(frame)]
+        elif len(known.mean) and self._fresh:
+            made = installed_prior_factor(frame.k, prior, self.installed, constants)
+        else:
+            made = [prior_factor(frame.k, prior.pose, prior.cov)]
+            if self.installation.ground:
+                made.append(ground_prior(frame.k, known.mean[constants:], known.cov[constants:, constants:]))
+        if self._fresh and self.contradicted:
+            graph.push_back(self._holding())
+        self._fresh = False
+        if self.factors.known and frame.sightings:
+            measurements = [s.measurement for s in frame.sightings]
+            if known is self.factors.estimated:
+                lines = self.factors.linearize(measurements, initial.pose)
+            else:
+                lines = self.factors.observe(measurements).linearize(initial.pose, known.mean)
+            kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
+            if kept:
+                sightings, ahead = zip(*kept, strict=True)
+                made += sighting_factors(frame.k, sightings, ahead, initial.pose, known.mean, constants)
+        for sighting in frame.sightings:
+            self._introduce(sighting.measurement, initial.pose, values)
+            made += sighting.factors
+        for factor in made:
+            graph.add(factor)
+        return graph, values
+
+    def _on_ground(self, frame: Keyframe, known: InstallationEstimate) -> InstallationEstimate:
+        """The installation with height, roll and pitch of this keyframe, which may not be the newest."""
+        if frame.ground is None:
+            return known
+        mean = np.concatenate([known.mean[: self.installation.constants], frame.ground])
+        return InstallationEstimate(mean, known.cov)
+
+    def _introduce(self, m: LandmarkMeasurement, pose: FloatArray, values: gtsam.Values) -> None:
+        """Give a first value to a landmark that is a variable and not yet in the graph."""
+        if self.factors.known or m.landmark_id in self._landmarks:
+            return
+        key = landmark_key(m.landmark_id)
+        if isinstance(m, PointMeasurement):
+            initial = se2.compose(
+                pose, [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), m.bearing_rad]
+            )
+            values.insert(key, initial[:2])
+        elif isinstance(m, FrameMeasurement):
+            initial = se2.compose(pose, m.pose)
+            values.insert(key, gtsam.Pose2(*initial))
+        else:
+            return
+        self._landmarks[m.landmark_id] = initial
+
+    def _rebuild(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
+        """Build the window again from the log, without the sightings of the offending step."""
+        self.rebuilt += 1
+        frame.rejected = (*frame.rejected, *frame.sightings)
+        frame.sightings = ()
+        try:
+            frame.belief = self._replayed([*self._window(frame), frame], initial)
+        except _GTSAM_ERRORS:  # an older sighting is at fault; what the window knew is in the prediction
+            frame.belief = self._replayed([frame], initial)
+
+    def _replayed(self, frames: Sequence[Keyframe], initial: PoseWithCovariance) -> PoseWithCovariance:
+        """Give these keyframes to a new backend; the belief of the last, whose pose starts at ``initial``."""
+        self._backend = backend = self._new_backend()
+        self._landmarks.clear()
+        self._slots.clear()
+        newest = frames[-1].k
+        for i, held in enumerate(frames):
+            prior = held.prior
+            if i == 0 and prior is None:  # its belief holds its sightings already
+                prior, held = held.belief, dataclasses.replace(held, sightings=())
+            start = initial if held.k == newest else PoseWithCovariance(held.belief.pose, held.belief.cov)
+            graph, values = self._graph_of(held, start, prior)
+            self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)
+        return self._newest(newest)
+
+    def _new_backend(self) -> Backend:
+        self._fresh = True
+        installed = self.installation.constants if self.factors.known else 0
+        careful = math.isfinite(self._careful_until_s)
+        if self._config.kind == "fixed_lag":
+            return FixedLag(self._config, installed, careful)
+        return WholeRun(self._config, careful)
+
+
+# --- The estimator of a run, by its configuration ---------------------------------------------------------------------
 
 
 def make_estimator(

@@ -1,4 +1,4 @@
-"""Measurements to GTSAM factors: the one place that knows both.
+"""Measurements to GTSAM factors: keys, linear factors, and the factors of motions and sightings.
 
 A known landmark enters as a unary factor; an unknown one is a variable. Motion factors are Gaussian, landmark factors
 robust (Cauchy).
@@ -10,21 +10,18 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from operator import is_not
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
-from fgloc.graph.corner_batch import MIN_DEPTH_M
-from fgloc.graph.ground import rotations
+from fgloc.frames import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
-from fgloc.graph.linear_factors import INSTALLATION as INSTALLATION
-from fgloc.graph.linear_factors import insert_installation, installation_blocks, linear_factor
-from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.noise_models import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
-from fgloc.graph.observation import Observations
+from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
+from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations, stacked
 from fgloc.sensors import registry
 from fgloc.types import (
     FloatArray,
@@ -37,6 +34,47 @@ from fgloc.types import (
     PointMeasurement,
     PoseMeasurement,
 )
+
+# --- Linear factors, and the keys of the installation in them ---------------------------------------------------------
+
+INSTALLATION = int(gtsam.symbol("i", 0))
+"""Key of the installation state: one vector."""
+
+
+def ground_key(k: int) -> int:
+    """Key of height, roll and pitch of keyframe k: one vector."""
+    return int(gtsam.symbol("g", k))
+
+
+def of_ground(pose: int) -> int:
+    """Key of height, roll and pitch of the keyframe whose pose has this key."""
+    return ground_key(gtsam.Symbol(pose).index())
+
+
+def insert_installation(k: int, theta: FloatArray, constants: int, values: gtsam.Values) -> None:
+    """Where a factor of keyframe k is linear: the installation ``(n,)``, the last rows of which may be its own."""
+    if constants:
+        values.insert(INSTALLATION, theta[:constants])
+    if len(theta) > constants:
+        values.insert(ground_key(k), theta[constants:])
+
+
+def installation_blocks(k: int, H: FloatArray, constants: int) -> dict[int, FloatArray]:
+    """Derivatives ``(d, n)`` by the installation, by key; the last of them may be keyframe k's own."""
+    blocks = {INSTALLATION: H[:, :constants]} if constants else {}
+    return blocks if H.shape[1] == constants else {**blocks, ground_key(k): H[:, constants:]}
+
+
+def linear_factor(
+    blocks: Mapping[int, FloatArray], residual: FloatArray, values: gtsam.Values
+) -> gtsam.NonlinearFactor:
+    """A factor of whitened residual ``(d,)``, linear about these values; up to three keys with their Jacobians."""
+    pairs: list[Any] = [part for key, A in blocks.items() for part in (key, A)]
+    noise = gtsam.noiseModel.Unit.Create(len(residual))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*pairs, -residual, noise), values)  # type: ignore[call-overload]
+
+
+# --- Motions, priors and sightings ------------------------------------------------------------------------------------
 
 # Usual constants, of whitened residuals. Sources: Zhang 1997, "Parameter estimation techniques"; Agarwal et al. 2013,
 # "Robust map optimization using dynamic covariance scaling".

@@ -16,9 +16,9 @@ from scipy.linalg import cho_factor, cho_solve
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate
-from fgloc.graph.linearized import Linearized, stacked
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_models import sighting_whitening
+from fgloc.graph.noise import sighting_whitening
+from fgloc.graph.observation import Linearized, stacked
 from fgloc.stats import ROUNDING
 from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
@@ -72,7 +72,7 @@ def transition(motions: Sequence[MotionMeasurement], installation: Installation)
     return se2.adjoint(se2.inverse(motion)), D
 
 
-def predict(
+def predict_on_plane(
     belief: PoseWithCovariance,
     known: InstallationEstimate,
     installation: Installation,

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, MotionReadings, Step
 
 

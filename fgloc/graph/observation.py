@@ -3,22 +3,501 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fgloc.graph.corner_batch import CornerBatch
+from fgloc import se2
+from fgloc.frames import rotations
 from fgloc.graph.installation import Installation
-from fgloc.graph.linearized import Linearized
-from fgloc.graph.planar_batch import PlanarBatch
-from fgloc.graph.pose_batch import PoseBatch
 from fgloc.types import (
     FloatArray,
+    FrameMeasurement,
     IntArray,
     Landmark,
     LandmarkMeasurement,
     PixelMeasurement,
+    PointMeasurement,
     PoseMeasurement,
 )
+
+# --- Residuals and Jacobians ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearized:
+    """Whitened residual and Jacobians of one sighting.
+
+    Attributes:
+        residual: ``(d,)`` predicted minus measured, in units of the sighting's own noise.
+        J: ``(d, 3)`` by the right perturbation of the pose.
+        columns: ``(c,)`` parameters of the installation that it depends on.
+        H: ``(d, c)`` by these.
+        shared: ``(d, s)`` square root of the covariance that comes on top of the identity: of the stamp's jitter and
+            of the motion by which the sighting was moved to its keyframe; the same for all of one image.
+        behind: whether a corner is behind the camera; the residual then means nothing.
+    """
+
+    residual: FloatArray
+    J: FloatArray
+    columns: IntArray
+    H: FloatArray
+    shared: FloatArray
+    behind: bool = False
+
+    def noise(self) -> FloatArray:
+        """Covariance ``(d, d)`` of the residual without pose and installation."""
+        return np.asarray(np.eye(len(self.residual)) + self.shared @ self.shared.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stacked:
+    """Residuals and Jacobians of sightings of one kind, whitened by their own noise.
+
+    Attributes:
+        residual: ``(m, d)``.
+        J: ``(m, d, 3)`` by the pose.
+        H: ``(m, d, c)`` by the parameters in `columns` ``(m, c)``; -1: none, then H is 0.
+        columns: see above.
+        behind: ``(m,)`` whether a corner is behind the camera.
+    """
+
+    residual: FloatArray
+    J: FloatArray
+    H: FloatArray
+    columns: IntArray
+    behind: NDArray[np.bool_]
+
+
+def landmark_block(installation: Installation, landmark_id: int, rows: int) -> int:
+    """Where the state of a landmark begins, if it has as many rows; else -1."""
+    first, count = installation.landmarks.get(landmark_id, (-1, 0))
+    return first if count >= rows else -1
+
+
+def stacked(lines: Sequence[Linearized], n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residual ``(d,)``, Jacobians ``(d, 3)`` and ``(d, n)``, noise covariance ``(d, d)`` of sightings of one image."""
+    r = np.concatenate([one.residual for one in lines])
+    J = np.vstack([one.J for one in lines])
+    H = np.zeros((len(r), n))
+    row, most = 0, max(one.shared.shape[1] for one in lines)
+    shared = np.zeros((len(r), most))
+    for one in lines:
+        d = len(one.residual)
+        H[row : row + d, one.columns] = one.H
+        shared[row : row + d, : one.shared.shape[1]] = one.shared
+        row += d
+    return r, J, H, np.eye(len(r)) + shared @ shared.T
+
+
+# --- Corners of markers in images -------------------------------------------------------------------------------------
+
+_BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
+_MOST_BLURRED = 2.0
+MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
+
+
+class CornerBatch:
+    """Corners of markers in images.
+
+    Source: pinhole camera with the distortion of Brown 1966 as OpenCV has it; perturbations on the right.
+    """
+
+    def __init__(
+        self, seen: Sequence[PixelMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
+    ) -> None:
+        held = [landmarks[m.landmark_id] for m in seen]
+        half = np.array([0.5 * landmark.size_m for landmark in held])
+        square = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+        self._local = half[:, None, None] * square  # (m, 4, 3) in the marker's frame
+        self._position = np.array([landmark.position for landmark in held])
+        self._rotation = np.array([landmark.rotation for landmark in held])
+        cameras = {id(m.camera): m.camera for m in seen}
+        order = {camera: i for i, camera in enumerate(cameras)}
+        of = np.array([order[id(m.camera)] for m in seen])
+        T = np.array([camera.T_base_cam for camera in cameras.values()])[of]
+        self._R, self._t = T[:, :3, :3], T[:, :3, 3]
+        self._K = np.array([camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras.values()])[of]
+        self._D = np.array([np.concatenate([camera.D, np.zeros(4)])[:4] for camera in cameras.values()])[of]
+        self._pixels = np.array([m.corners_px for m in seen])
+        self._sigma = np.array([m.sigma_px for m in seen])
+        self._twist = np.array([m.twist for m in seen])
+        self._tilting = np.array([(*m.tilting, 0.0) for m in seen]) if installation.ground else None
+        self._offset = np.array([m.offset_s for m in seen])
+        self._jitter = np.array([m.jitter_s for m in seen])
+        self._moved = _roots([m.motion_cov for m in seen])
+        self._outward, self._small = _shrinking(self._pixels)
+        self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
+        self._noise_px = np.hypot(self._sigma, self._blur_px)
+        self.rows = [8] * len(seen)
+        first = installation.blocks.get("camera")
+        self._camera = None if first is None else np.arange(first[0], first[0] + 12)
+        marker = np.array([landmark_block(installation, m.landmark_id, 6) for m in seen])
+        self._columns = np.full((len(seen), 18), -1)
+        if self._camera is not None:
+            self._columns[:, :12] = self._camera
+        self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
+        self._constants = installation.constants
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time.
+
+        On uneven ground the poses are ``(m, 6)``, with height, roll and pitch at the end, and so are the Jacobians by
+        them; of poses ``(m, 3)`` those are at the end of the installation, and so are the Jacobians.
+        """
+        if self._tilting is None or poses.shape[1] > 3:
+            return self._evaluate(poses, theta, by_installation)
+        ground = np.broadcast_to(theta[self._constants :], (len(poses), 3))
+        stack = self._evaluate(np.column_stack([poses, ground]), theta, by_installation)
+        return self._ground_in_installation(stack, by_installation)
+
+    def _evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool) -> Stacked:
+        n = len(poses)
+        camera = np.zeros(12) if self._camera is None else theta[self._camera]
+        marker = np.append(theta, 0.0)[self._columns[:, 12:]]
+        # 1. Corners in the map, in the base frame, at the exposure, in the camera
+        turned = _cross(marker[:, None, 3:], self._local)
+        local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
+        P = (self._position + marker[:, :3])[:, None] + local @ self._rotation.transpose(0, 2, 1)
+        Rz, tilt = _map_base(poses)
+        P[:, :, :2] -= poses[:, None, :2]
+        if tilt is not None:
+            P[:, :, 2] -= poses[:, None, 3]
+        q = P @ Rz
+        flow = self._flow(q)
+        late = camera[11] - self._offset
+        mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
+        X = mounted - camera[:3] - _cross(camera[3:6], mounted)
+        behind = (X[:, :, 2] < MIN_DEPTH_M).any(axis=1)
+        # 2. Image, with its derivatives by the point in the camera, (m, 4, 2, 3), and by the lens
+        predicted, A, by_lens = self._project(X, camera, by_installation)
+        # 3. Derivatives
+        # by the point in the base frame at the exposure
+        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]
+        by_time = (B @ flow[..., None])[..., 0]
+        turn = (late * self._twist[:, 2])[:, None, None]
+        B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
+        if self._tilting is not None:
+            B = B + late[:, None, None, None] * _cross(B, self._tilting[:, None, None])
+        scale = 1.0 / self._noise_px
+        J: FloatArray = np.stack(
+            [-B[..., 0], -B[..., 1], B[..., 0] * q[..., None, 1] - B[..., 1] * q[..., None, 0]], axis=-1
+        )
+        residual = ((predicted - self._pixels) * scale[:, None, None]).reshape(n, 8)
+        if tilt is not None:
+            J = _by_tilted_pose(B, q, tilt, poses[:, 4])
+        J = (J * scale[:, None, None, None]).reshape(n, 8, -1)
+        if not by_installation:
+            return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
+        assert by_lens is not None
+        H: FloatArray = np.empty((n, 4, 2, 18))
+        H[..., :3] = -A
+        H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
+        H[..., 6:11] = by_lens
+        H[..., 11] = by_time
+        self._by_marker(H, B @ Rz.transpose(0, 2, 1)[:, None], local)
+        H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
+        return Stacked(residual, J, H, self._columns, behind)
+
+    def _flow(self, q: FloatArray) -> FloatArray:
+        """How points ``(m, 4, 3)`` in the base frame move by a later stamp [m/s]."""
+        flow = np.zeros_like(q)
+        flow[:, :, 0] = self._twist[:, None, 0] - self._twist[:, None, 2] * q[:, :, 1]
+        flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
+        return flow if self._tilting is None else flow + _cross(self._tilting[:, None], q)
+
+    def _by_marker(self, H: FloatArray, M: FloatArray, local: FloatArray) -> None:
+        """Fill in derivatives by the marker, from those by a point in the map ``(m, 4, 2, 3)``; 0 what is no state."""
+        H[..., 12:15] = M
+        H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
+        H[..., :12] *= self._camera is not None
+        H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
+
+    def _ground_in_installation(self, stack: Stacked, by_installation: bool) -> Stacked:
+        """Derivatives by height, roll and pitch as the last ones by the installation."""
+        n, J = len(stack.J), stack.J[:, :, :3]
+        H, columns = stack.H, stack.columns
+        if by_installation:
+            H = np.concatenate([H, stack.J[:, :, 3:]], axis=2)
+            last = np.broadcast_to(self._constants + np.arange(3), (n, 3))
+            columns = np.concatenate([columns, last], axis=1)
+        return Stacked(stack.residual, J, H, columns, stack.behind)
+
+    def _project(
+        self, X: FloatArray, camera: FloatArray, with_lens: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Pixels of points in the camera's frame.
+
+        Args:
+            X: ``(m, 4, 3)`` [m].
+            camera: ``(12,)`` what camera and clock are off by.
+            with_lens: whether the derivatives by the lens are needed.
+
+        Returns:
+            Pixels ``(m, 4, 2)``, their derivatives by the points ``(m, 4, 2, 3)``, and those by focal length,
+            principal point, k1 and k2 ``(m, 4, 2, 5)``.
+        """
+        Z = np.maximum(X[:, :, 2], MIN_DEPTH_M)
+        x, y = X[:, :, 0] / Z, X[:, :, 1] / Z
+        k1, k2 = self._D[:, None, 0] + camera[9], self._D[:, None, 1] + camera[10]
+        p1, p2 = self._D[:, None, 2], self._D[:, None, 3]
+        r2 = x * x + y * y
+        radial = 1.0 + k1 * r2 + k2 * r2 * r2
+        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        f = self._K[:, None, :2] * (1.0 + camera[6])
+        image = np.stack([xd, yd], axis=2)
+        predicted = f * image + self._K[:, None, 2:] + camera[7:9]
+        dr = k1 + 2.0 * k2 * r2
+        by_ray = np.empty((len(X), 4, 2, 2))
+        by_ray[..., 0, 0] = radial + 2.0 * x * x * dr + 2.0 * p1 * y + 6.0 * p2 * x
+        by_ray[..., 0, 1] = by_ray[..., 1, 0] = 2.0 * x * y * dr + 2.0 * p1 * x + 2.0 * p2 * y
+        by_ray[..., 1, 1] = radial + 2.0 * y * y * dr + 6.0 * p1 * y + 2.0 * p2 * x
+        by_ray *= f[:, :, :, None]
+        A = np.empty((len(X), 4, 2, 3))
+        A[..., :2] = by_ray / Z[..., None, None]
+        A[..., 2] = -(by_ray[..., 0] * x[..., None] + by_ray[..., 1] * y[..., None]) / Z[..., None]
+        if not with_lens:
+            return predicted, A, None
+        by_lens = np.empty((len(X), 4, 2, 5))
+        by_lens[..., 0] = f * image / (1.0 + camera[6])
+        by_lens[..., 1:3] = np.eye(2)
+        by_lens[..., 3] = f * np.stack([x, y], axis=2) * r2[..., None]
+        by_lens[..., 4] = by_lens[..., 3] * r2[..., None]
+        return predicted, A, by_lens
+
+    def _speed(self, size_m: FloatArray) -> FloatArray:
+        """How fast the corners move in the image ``(m,)`` [px/s] where they were seen, whatever marker it is.
+
+        Not where they are expected: a marker that was misread may be expected near the image plane, where all is fast.
+        """
+        f = self._K[:, 0]
+        side = np.linalg.norm(self._pixels - np.roll(self._pixels, 1, axis=1), axis=2).max(axis=1)
+        off = np.linalg.norm((self._pixels.mean(axis=1) - self._K[:, 2:]) / self._K[:, :2], axis=1)
+        depth = f * np.maximum(size_m, 1e-3) / np.maximum(side, 1.0)
+        along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
+        return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
+
+    def shared_all(self, stack: Stacked) -> FloatArray:
+        """`shared` of all sightings ``(m, 8, s)``; columns that one lacks are 0."""
+        shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
+        jitter = self._jitter[:, None] * stack.H[:, :, 11]
+        common = np.stack([shrunk, jitter], axis=2)
+        if all(moved is None for moved in self._moved):
+            return common
+        roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
+        return np.concatenate([common, stack.J[:, :, :3] @ roots], axis=2)
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it, of one sighting."""
+        shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
+        common = [shrunk, self._jitter[i] * H[:, 11:12]]
+        moved = self._moved[i]
+        if moved is not None:
+            common.append(J @ moved)
+        return np.hstack(common)
+
+
+def _map_base(poses: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """R_map_base ``(m, 3, 3)`` of poses ``(m, 3)``; of ``(m, 6)`` of a base that is not level, and how it is tilted."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    Rz = np.zeros((len(poses), 3, 3))
+    Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
+    tilt = rotations(poses[:, 4:6]) if poses.shape[1] > 3 else None
+    return (Rz, None) if tilt is None else (Rz @ tilt, tilt)
+
+
+def _by_tilted_pose(B: FloatArray, q: FloatArray, tilt: FloatArray, roll: FloatArray) -> FloatArray:
+    """Derivatives ``(m, 4, 2, 6)`` by x, y, yaw (right perturbation), z, roll and pitch.
+
+    Args:
+        B: ``(m, 4, 2, 3)`` by the point in the base's axes.
+        q: ``(m, 4, 3)`` that point.
+        tilt: ``(m, 3, 3)`` ``Ry(pitch) Rx(roll)``.
+        roll: ``(m,)`` [rad].
+    """
+    zero = np.zeros_like(roll)
+    axes = np.stack(
+        [tilt[:, 2], np.stack([zero + 1.0, zero, zero], 1), np.stack([zero, np.cos(roll), -np.sin(roll)], 1)]
+    )
+    moved = [-tilt[:, i, None].repeat(4, axis=1) for i in range(2)]  # by x, y: minus those axes, as the base has them
+    turned = [-_cross(axis[:, None], q) for axis in axes]  # by yaw, roll, pitch
+    by = np.stack([*moved, turned[0], -tilt[:, 2, None].repeat(4, axis=1), *turned[1:]], axis=3)  # (m, 4, 3, 6)
+    return np.asarray(B @ by)
+
+
+def _shrinking(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors ``(m, 8)`` by which all four corners ``(m, 4, 2)`` move outwards, and how much a marker shrinks.
+
+    Blur draws in the edges of a marker whose cells are not much wider than it.
+    """
+    outward = pixels - pixels.mean(axis=1, keepdims=True)
+    side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
+    unit = outward / np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
+    return unit.reshape(len(pixels), 8), np.minimum((_BLURRED_SIDE_PX / np.maximum(side, 1.0)) ** 2, _MOST_BLURRED)
+
+
+def _crossed(A: FloatArray, X: FloatArray) -> FloatArray:
+    """``A [X]×``, rows of A ``(..., 2, 3)`` and points X ``(..., 3)``: derivative of ``-A (φ × X)`` by φ."""
+    return _cross(A, X[..., None, :])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product along the last axis; a third of numpy's time for few points."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def _roots(covs: Sequence[FloatArray | None]) -> list[FloatArray | None]:
+    """Square roots of covariances ``(3, 3)`` that may be singular; of one that several share, once."""
+    kept = {id(cov): cov for cov in covs if cov is not None}
+    if not kept:
+        return [None] * len(covs)
+    values, vectors = np.linalg.eigh(np.array(list(kept.values())))
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    by_id: dict[int, FloatArray] = dict(zip(kept, roots, strict=True))
+    return [None if cov is None else by_id[id(cov)] for cov in covs]
+
+
+# --- Ranges and bearings, poses of markers ----------------------------------------------------------------------------
+
+_MOST_LOG_SCALE = 3.0  # of ranges: an estimate that diverges goes on to be refused, not to overflow
+
+
+class PlanarBatch:
+    """Ranges with bearings, as points in the base frame, and marker poses."""
+
+    def __init__(
+        self,
+        seen: Sequence[PointMeasurement | FrameMeasurement],
+        landmarks: Mapping[int, Landmark],
+        installation: Installation,
+    ) -> None:
+        poses = [m.pose if isinstance(m, FrameMeasurement) else None for m in seen]
+        self.rows = [2 if pose is None else 3 for pose in poses]
+        self._whole = np.array([pose is not None for pose in poses])
+        self._yaw = np.array([0.0 if pose is None else pose[2] for pose in poses])
+        self._place = np.array([landmarks[m.landmark_id].planar for m in seen])
+        self._point = np.zeros((len(seen), 2))
+        self._whitening = np.zeros((len(seen), 3, 3))  # of the residual in the base frame
+        for i, m in enumerate(seen):
+            if isinstance(m, FrameMeasurement):
+                self._point[i] = m.pose[:2]
+                c, s = np.cos(m.pose[2]), np.sin(m.pose[2])
+                turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+                self._whitening[i] = np.linalg.inv(np.linalg.cholesky(m.cov)) @ turn
+            else:
+                self._point[i], cov = cartesian(m)
+                self._whitening[i, :2, :2] = np.linalg.inv(np.linalg.cholesky(cov))
+        self._twist = np.array([m.twist for m in seen])
+        self._offset = np.array([m.offset_s for m in seen])
+        first = installation.blocks.get("sightings")
+        self._sensor = None if first is None else np.arange(first[0], first[0] + 3)
+        self._up = np.array([landmarks[m.landmark_id].rotation[2] for m in seen])
+        place = np.array([landmark_block(installation, m.landmark_id, 2) for m in seen])
+        turn = np.array([landmark_block(installation, m.landmark_id, 6) for m in seen])
+        self._columns = np.full((len(seen), 8), -1)  # sensor, place, rotation of the landmark
+        if self._sensor is not None:
+            self._columns[:, :3] = self._sensor
+        self._columns[:, 3:5] = np.where(place[:, None] >= 0, place[:, None] + np.arange(2), -1)
+        self._columns[:, 5:] = np.where(turn[:, None] >= 0, turn[:, None] + np.arange(3, 6), -1)
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
+        n = len(poses)
+        held = np.append(theta, 0.0)
+        sensor = np.zeros(3) if self._sensor is None else theta[self._sensor]
+        place = self._place[:, :2] + held[self._columns[:, 3:5]]
+        facing = self._place[:, 2] + np.einsum("ni,ni->n", self._up, held[self._columns[:, 5:]])
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        R = np.stack([np.stack([c, s], 1), np.stack([-s, c], 1)], 1)  # R_base_map
+        q = np.einsum("nij,nj->ni", R, place - poses[:, :2])
+        w = self._twist[:, 2]
+        flow = np.stack([self._twist[:, 0] - w * q[:, 1], self._twist[:, 1] + w * q[:, 0], w], 1)
+        late = sensor[2] - self._offset
+        co, so = np.cos(sensor[1]), np.sin(sensor[1])
+        scale = np.exp(np.clip(sensor[0], -_MOST_LOG_SCALE, _MOST_LOG_SCALE))
+        seen = scale * self._point @ np.array([[co, so], [-so, co]]).T
+        residual = np.zeros((n, 3))
+        predicted = q + late[:, None] * flow[:, :2]
+        residual[:, :2] = predicted - seen
+        turn = np.zeros((n, 2, 2))  # of the point by a later stamp
+        turn[:, 0, 0] = turn[:, 1, 1] = 1.0
+        turn[:, 0, 1], turn[:, 1, 0] = -late * w, late * w
+        yaw = se2.wrap_array(facing - poses[:, 2] + late * w - self._yaw + sensor[1])
+        residual[:, 2] = np.where(self._whole, yaw, 0.0)
+        J = np.zeros((n, 3, 3))
+        J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
+        J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
+        J[:, :2] = turn @ J[:, :2]
+        H = np.zeros((n, 3, 8))  # by scale and bearing of the predicted point: the noise of the measured one would bias
+        H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -predicted, -predicted[:, 1], predicted[:, 0], 1.0
+        H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, turn @ R, self._up
+        H = np.where(self._columns[:, None] >= 0, H, 0.0)
+        W = self._whitening
+        return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
+
+    def shared_all(self, stack: Stacked) -> FloatArray:
+        """`shared` of all sightings ``(m, 3, 0)``."""
+        return np.zeros((*stack.residual.shape, 0))
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it: the noise of these sightings has all in it."""
+        return np.zeros((len(J), 0))
+
+
+def cartesian(m: PointMeasurement) -> tuple[FloatArray, FloatArray]:
+    """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
+
+    The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
+    bearing's sigma, which is exact enough below 0.2 rad. The true range, which may be off by its sigma, makes the
+    sigma across: it does not vanish right at a landmark.
+    """
+    c, s = np.cos(m.bearing_rad), np.sin(m.bearing_rad)
+    r, lever = m.range_m, np.sqrt(m.range_m**2 + m.cov[1, 1])
+    J = np.array([[-lever * s, c], [lever * c, s]])  # columns: bearing, range
+    cov = J @ m.cov @ J.T
+    return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
+
+
+# --- Measurements of registered sensors -------------------------------------------------------------------------------
+
+
+class PoseBatch:
+    """Measurements of any dimensions; see `PoseMeasurement`."""
+
+    def __init__(self, seen: Sequence[PoseMeasurement]) -> None:
+        self._seen = seen
+        self.rows = [len(m.cov) for m in seen]
+        self._whitening = [np.asarray(np.linalg.inv(np.linalg.cholesky(m.cov))) for m in seen]
+        self._columns = np.zeros((len(seen), 0), dtype=np.int64)
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """All measurements, each at its own pose ``(m, 3)``; rows beyond a measurement's own are 0."""
+        n, most = len(poses), max(self.rows)
+        residual, J = np.zeros((n, most)), np.zeros((n, most, 3))
+        for i, (m, W, d) in enumerate(zip(self._seen, self._whitening, self.rows, strict=True)):
+            r, by_pose = m.residual_at_keyframe(poses[i])
+            residual[i, :d], J[i, :d] = W @ r, W @ by_pose
+        return Stacked(residual, J, np.zeros((n, most, 0)), self._columns, np.zeros(n, dtype=np.bool_))
+
+    def shared_all(self, stack: Stacked) -> None:
+        """None: these are of different dimensions."""
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """As `Linearized` has it: of the motion by which the measurement was moved to its keyframe."""
+        m = self._seen[i]
+        if m.motion_cov is None:
+            return np.zeros((len(J), 0))
+        values, vectors = np.linalg.eigh(m.motion_cov)
+        return np.asarray(J @ se2.adjoint(m.T_keyframe_then) @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+
+
+# --- Sightings of any kind --------------------------------------------------------------------------------------------
 
 
 class Observations:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from fgloc.graph.batch_solve import with_deep_stack
+from fgloc.graph.batch import with_deep_stack
 from fgloc.types import FloatArray, IntArray
 
 _HUBER = 1.345  # sigmas: 95 % efficiency for Gaussian noise (Huber 1981)

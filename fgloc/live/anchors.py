@@ -13,7 +13,7 @@ from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, RateSensor
 from fgloc.types import Estimate, FloatArray, Mode, Step
 

@@ -15,9 +15,9 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.ground import predict, spatial
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import NoiseBudget
-from fgloc.graph.uneven import predict, spatial
+from fgloc.graph.noise import NoiseBudget
 from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose

@@ -26,7 +26,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.joint import FAR_M2, LINEAR_M, LINEAR_RAD, MOST_JOINT, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_models import repetition
+from fgloc.graph.noise import repetition
 from fgloc.relocalization.beacon_geometry import RING, SeenBeacons, log_density, moments, residuals, ring
 from fgloc.relocalization.pose_consensus import MAX_SIGMA
 from fgloc.robust.landmark_modes import MOST_HYPOTHESES

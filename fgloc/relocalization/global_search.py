@@ -14,7 +14,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import FAR_M2, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.relocalization.gaussian_sum import Displacement, GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
 from fgloc.sensors.motion_compensation import compensated

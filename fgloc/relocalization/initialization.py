@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from fgloc.graph.estimator import Estimator
+from fgloc.graph.estimators import Estimator
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.relocalization.global_search import InitialPose
 from fgloc.relocalization.recorder import Recorder

@@ -11,7 +11,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, MOST_STEPS
-from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.relocalization.beacon_geometry import RING
 from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose

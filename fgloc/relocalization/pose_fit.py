@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc import se2
-from fgloc.graph.corner_batch import CornerBatch
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.graph.linearized import Stacked
-from fgloc.graph.planar_batch import PlanarBatch
-from fgloc.graph.pose_batch import PoseBatch
+from fgloc.graph.observation import CornerBatch, PlanarBatch, PoseBatch, Stacked
 from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.graph.ground import spatial
 from fgloc.graph.measurement_log import Keyframe
-from fgloc.graph.uneven import spatial
 from fgloc.relocalization.tracking_state import Tracking
 from fgloc.robust.decision_log import mode_decisions, segment_decision
 from fgloc.robust.motion_judge import MotionJudge

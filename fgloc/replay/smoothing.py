@@ -9,8 +9,8 @@ from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.graph.batch import BatchSmoother, Smoothed
 from fgloc.graph.contradictions import Contradiction, as_given, smoothed_within_priors, spread
+from fgloc.graph.ground import ground_at
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.uneven import ground_at
 from fgloc.types import (
     Estimate,
     Ground,

@@ -11,7 +11,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.noise_models import repetition
+from fgloc.graph.noise import repetition
 from fgloc.relocalization.pose_consensus import apart
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.robust.landmark_modes import LandmarkModes

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 from fgloc.robust.motion_faults import FaultVerdict
 from fgloc.sensors import registry
 from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings

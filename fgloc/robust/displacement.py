@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fgloc.graph.linearized import Linearized
+from fgloc.graph.observation import Linearized
 from fgloc.types import FloatArray
 
 MOVED = 0.5  # m, rad: prior sigma of a displacement, on each axis, and of a marker's rotation with it

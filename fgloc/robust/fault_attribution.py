@@ -10,9 +10,9 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.estimator import Estimator
+from fgloc.graph.estimators import Estimator
 from fgloc.graph.measurement_log import Keyframe
-from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.relocalization.pose_fit import Fit, fit_pose
 from fgloc.sensors import registry
 from fgloc.stats import chi2_bound

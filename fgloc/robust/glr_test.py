@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import WeightsConfig
-from fgloc.graph.noise_budget import COVARIANCE_FACTOR
+from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import FloatArray
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgloc.graph.joint import MOST_JOINT
-from fgloc.graph.linearized import Linearized
+from fgloc.graph.observation import Linearized
 from fgloc.stats import chi2_bound
 from fgloc.types import FloatArray
 

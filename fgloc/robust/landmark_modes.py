@@ -24,7 +24,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.graph.noise_models import repetition, sighting_whitening
+from fgloc.graph.noise import repetition, sighting_whitening
 from fgloc.graph.observation import Observations
 from fgloc.robust.displacement import MOVED, Explained, by_displacement, explain, rotation_cov
 from fgloc.stats import chi2_bound, evidence_bound

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import WeightsConfig
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 from fgloc.robust.fault_attribution import Contradicted, FaultAttribution
 from fgloc.robust.glr_test import GlrResult, GlrTest
 from fgloc.robust.motion_sources import MotionSources

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fgloc.config import Config
-from fgloc.graph.estimator import Estimator
+from fgloc.graph.estimators import Estimator
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.graph.noise_budget import COVARIANCE_FACTOR, NoiseBudget
+from fgloc.graph.noise import COVARIANCE_FACTOR, NoiseBudget
 from fgloc.robust.decision_log import flag_notes, motion_decisions
 from fgloc.robust.fault_attribution import FaultAttribution
 from fgloc.robust.lift import LiftMonitor

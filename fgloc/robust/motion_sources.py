@@ -14,7 +14,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import planar_turn
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import FusionRules, with_yaw
+from fgloc.graph.noise import FusionRules, with_yaw
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.graph.estimator import Estimator
+from fgloc.graph.estimators import Estimator
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.relocalization.global_search import InitialPose
 from fgloc.relocalization.tracking_state import CONTRADICTS, Tracking

@@ -14,8 +14,8 @@ from test_graph import corner_sighting, wall_map
 from fgloc.ablation.records import attempts, log_attempt, only_sweep, read_record, record_path
 from fgloc.config import Config, EstimatorConfig
 from fgloc.errors import OutputError
+from fgloc.graph.estimators import IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.runner import run
 from fgloc.types import MotionMeasurement

@@ -8,9 +8,8 @@ import pytest
 
 from benchmarks.steps import Chain, World
 from fgloc.config import BatchConfig
-from fgloc.graph import batch_solve
-from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.batch_solve import elimination_order
+from fgloc.graph import batch
+from fgloc.graph.batch import BatchSmoother, elimination_order
 from fgloc.graph.factors import INSTALLATION, pose_key
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 
@@ -37,7 +36,7 @@ def test_the_tree_is_as_deep_as_the_logarithm_of_the_length(count):
 
 
 def test_covariances_are_those_in_the_order_of_gtsam(monkeypatch):
-    monkeypatch.setattr(batch_solve, "_KEYFRAMES_KEPT", 7)
+    monkeypatch.setattr(batch, "_KEYFRAMES_KEPT", 7)
     chain = Chain(World(), keep_all=True, with_model=False)
     for _ in chain.updates(World().events(4.0)):
         pass

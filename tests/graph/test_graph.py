@@ -14,14 +14,13 @@ from fgloc import se2
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.ekf import ExtendedKalmanFilter
+from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key
 from fgloc.graph.installation import Installation
-from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
-from fgloc.graph.noise_models import gaussian
-from fgloc.graph.planar_batch import cartesian
+from fgloc.graph.noise import gaussian
+from fgloc.graph.observation import cartesian
 from fgloc.robust.association import Association
 from fgloc.sensors.motion_compensation import compensated
 from fgloc.types import (

@@ -12,13 +12,11 @@ from test_observation import scene
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import quaternion_matrix, rpy_matrix, rpy_quaternion
-from fgloc.graph.ground import GRAVITY, driven, gravity, ground_step, planar_turn
+from fgloc.graph.ground import GRAVITY, driven, gravity, ground_step, levelled, planar_turn, predict, spatial
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
-from fgloc.graph.joint import fuse_installed
-from fgloc.graph.joint import predict as predict_on_plane
+from fgloc.graph.joint import fuse_installed, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.observation import Observations
-from fgloc.graph.uneven import levelled, predict, spatial
 from fgloc.types import InertialReading, MotionMeasurement
 
 IMU = ("gyro.bias_x", "gyro.bias_y", "gyro.roll_rad", "gyro.pitch_rad", "gyro.level_x_rad", "gyro.level_y_rad")

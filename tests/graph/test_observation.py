@@ -11,11 +11,10 @@ from exact import exact
 from robot_world import config, standing
 
 from fgloc import se2
-from fgloc.graph.corner_batch import MIN_DEPTH_M
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import CAMERA, MARKER, SENSOR, Installation, installation_of
-from fgloc.graph.noise_models import sighting_whitening
-from fgloc.graph.observation import Observations
+from fgloc.graph.noise import sighting_whitening
+from fgloc.graph.observation import MIN_DEPTH_M, Observations
 from fgloc.types import (
     Camera,
     FrameMeasurement,

@@ -15,10 +15,11 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.ground import predict
 from fgloc.graph.installation import Installation
-from fgloc.graph.joint import fuse, predict
+from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.graph.noise_budget import NoiseBudget
+from fgloc.graph.noise import NoiseBudget
 from fgloc.robust.decision_log import motion_decisions
 from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources

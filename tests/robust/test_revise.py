@@ -7,10 +7,8 @@ import pytest
 
 from fgloc import se2
 from fgloc.config import EstimatorConfig
-from fgloc.graph.ekf import ExtendedKalmanFilter
-from fgloc.graph.estimator import Estimator
+from fgloc.graph.estimators import Estimator, ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.isam2 import IncrementalEstimator
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, PointMeasurement
 

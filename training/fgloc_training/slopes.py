@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgloc.graph.ground import rotations
+from fgloc.frames import rotations
 from fgloc.types import FloatArray
 
 _LEVEL_RAD = 0.01  # a positioning system measures roll and pitch no better; below, the floor is flat
