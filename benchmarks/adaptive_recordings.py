@@ -29,10 +29,9 @@ from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
 from fgloc_datasets.sim.record import describe, is_recorded, robot_settings
 from fgloc_datasets.sim.scenario import Scenario
@@ -51,7 +50,7 @@ DURATION_S = 80.0
 _ROOT = Path(__file__).resolve().parent.parent
 _CAMERA_HZ = 5.0
 _LOOK_EVERY = 50  # messages of the truth: 1 s
-_DETECTOR = [f"fgloc/sensors/markers/{name}.py" for name in ("dictionaries", "edges", "images", "detector")]
+_DETECTOR = [f"fgloc/sensors/markers/{name}.py" for name in ("edges", "images", "detector")]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,8 @@ from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import Estimate, Event, LandmarkMap, RunResult, Step, Trajectory
 
 Changes = Mapping[str, Any]

@@ -16,7 +16,7 @@ from fgloc.ablation.failures.kidnap import Kidnap
 from fgloc.ablation.failures.sightings import MovedMarker
 from fgloc.config import Config
 from fgloc.evaluation.metrics import Metrics, compute_metrics
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Decision, Event, FloatArray, Mode, RunResult
 
 _NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave

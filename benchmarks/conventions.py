@@ -36,8 +36,8 @@ from fgloc.errors import FglocError
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import recorded_setup
-from fgloc.sensors.marker_pose.events import MarkerPose
-from fgloc.sensors.range_bearing.events import RangeBearing
+from fgloc.sensors.marker_pose import MarkerPose
+from fgloc.sensors.range_bearing import RangeBearing
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Event, Finding, InertialEvent, Severity, SightingsEvent, TruthEvent
 

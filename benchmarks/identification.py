@@ -29,9 +29,9 @@ from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
-from fgloc.sensors.learned import MotionModel, load_model, save_model
 from fgloc.sensors.learned.card import Kinematics, Split
-from fgloc.sensors.learned.load import model_of, read_model
+from fgloc.sensors.learned.network import MotionModel
+from fgloc.sensors.learned.sensor import load_model, model_of, read_model, save_model
 from fgloc.types import ControlEvent, FloatArray
 from fgloc_datasets import mrclam
 from fgloc_training.adapt import adapted

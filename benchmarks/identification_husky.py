@@ -20,8 +20,8 @@ from fgloc.config import load_config
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_pose
-from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Input, Split
+from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import Event, TruthEvent
 from fgloc_datasets import drive
 from fgloc_training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig

@@ -16,7 +16,7 @@ import numpy as np
 from fgloc.config import Config
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.metrics import match_result
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Decision, Event, FloatArray, IntArray, LandmarkMap, Mode, RunResult
 
 Found = Mapping[str, tuple[float, float]]

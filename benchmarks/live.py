@@ -34,7 +34,7 @@ from fgloc.live import Live, LivePose
 from fgloc.recording.cdr import Messages
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import Storage
-from fgloc.sensors.markers.events import ImageEvent
+from fgloc.sensors.markers.images import ImageEvent
 from fgloc.types import Estimate, Event, FloatArray, IntArray, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"

@@ -32,7 +32,7 @@ from benchmarks.live_streams import (
 from fgloc.config import Config, Role
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Camera, Event, LandmarkMap, Step
 
 _MILLION = 1_000_000

@@ -14,9 +14,9 @@ from fgloc.config import Config
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
 from fgloc.live.facts import role_of
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import Event, FloatArray, Landmark, LandmarkMap
 

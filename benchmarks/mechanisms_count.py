@@ -23,8 +23,8 @@ DECIDING = (
     "stats.py",
     "robust/*.py",
     "relocalization/*.py",
-    "sensors/learned/joint.py",
-    "sensors/gyro/rate.py",
+    "sensors/learned/network.py",
+    "sensors/gyro.py",
     *(f"graph/{name}.py" for name in ("batch", "estimators", "joint", "noise")),
 )
 SECTIONS = ("WeightsConfig", "GateConfig", "EstimatorConfig")

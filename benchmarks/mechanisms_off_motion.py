@@ -114,9 +114,9 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "gyro_bias",
         "The gyro's bias is learned while the wheels stand, and between two fixes of the yaw.",
-        ("sensors/gyro/rate.py",),
-        (Switch("fgloc.sensors.gyro.rate:Gyro._learn", Returns(None)),),
-        Probe("fgloc.sensors.gyro.rate:Gyro._learn", called),
+        ("sensors/gyro.py",),
+        (Switch("fgloc.sensors.gyro:Gyro._learn", Returns(None)),),
+        Probe("fgloc.sensors.gyro:Gyro._learn", called),
         batch=True,
         case="dark60",
     ),

@@ -44,10 +44,10 @@ from fgloc.evaluation.matching import match
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, Event, Step, Trajectory, TruthEvent

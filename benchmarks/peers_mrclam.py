@@ -28,7 +28,7 @@ from fgloc.config import Config, load_config
 from fgloc.recording.files import find_beside
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, FloatArray, LandmarkMap, Step, Trajectory
 from fgloc_datasets import mrclam

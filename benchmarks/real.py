@@ -22,9 +22,9 @@ from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import PointMeasurement, RunResult
 from fgloc_datasets import mrclam, pioneer, turtlebot3
 

@@ -33,13 +33,11 @@ from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.learned import load_model
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.markers.images import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, ControlEvent, Event, FloatArray, Landmark, LandmarkMap

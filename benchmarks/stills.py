@@ -27,14 +27,11 @@ from benchmarks.common import Row, main, not_run
 from benchmarks.equal import SAMPLES
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.detection import use_one_thread
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector, TrackingDetector, use_one_thread
 from fgloc.sensors.markers.edges import refine_all
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import GrayImage, decode
-from fgloc.sensors.markers.tracking import TrackingDetector
+from fgloc.sensors.markers.images import GrayImage, ImageEvent, decode
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 
 _ID = "stills.missed_ids"
@@ -168,7 +165,7 @@ def _timed(seconds: FloatArray, search_s: FloatArray, which: int) -> Iterator[No
 
     with (
         patch("fgloc.sensors.markers.detector.refine_all", timed),
-        patch("fgloc.sensors.markers.coarse.refine_all", timed),
+        patch("fgloc.sensors.markers.edges.refine_all", timed),
     ):
         start = time.thread_time()
         yield

@@ -27,10 +27,9 @@ import gtsam
 import numpy as np
 
 from fgloc import se2
-from fgloc.sensors.cameras import pinhole, undistort_points
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.pnp import marker_pose_candidates
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, Estimate, FloatArray, LandmarkMap, Step
 

@@ -18,9 +18,8 @@ from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.detection import SensorDetector
-from fgloc.sensors.equipment import MotionPredictor, MotionSensors, Odometer, PoseSensors
-from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.equipment import LandmarkSensor, MotionPredictor, MotionSensors, Odometer, PoseSensors
+from fgloc.sensors.markers.detector import SensorDetector
 from fgloc.types import Camera, LandmarkMap
 
 

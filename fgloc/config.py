@@ -16,7 +16,7 @@ from fgloc.extensions import outside_sensors
 from fgloc.files.section import SHIPPED
 from fgloc.files.section import Section as Section
 from fgloc.files.settings_file import Settings
-from fgloc.sensors import registry
+from fgloc.sensors.settings import MOTION_SOURCES, SensorSections, shipped_name
 from fgloc.stats import GATE
 
 _Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
@@ -39,8 +39,8 @@ def _known_role(role: str) -> str:
 
 
 def _known_source(name: str) -> str:
-    if name not in registry.motion_names():
-        raise ValueError(f"expected one of {', '.join(registry.motion_names())}")
+    if name not in MOTION_SOURCES:
+        raise ValueError(f"expected one of {', '.join(MOTION_SOURCES)}")
     return name
 
 
@@ -217,7 +217,7 @@ class TruthConfig(Section):
     max_gap_s: float = Field(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
 
 
-class Config(registry.SensorSections):
+class Config(SensorSections):
     """Everything. ``robot.yaml`` holds the parts that differ from these defaults."""
 
     recording: RecordingConfig = RecordingConfig()
@@ -284,7 +284,7 @@ def yaml_of(config: Config, folder: Path) -> str:
     for section, key in files_of(type(config)):
         path = getattr(getattr(config, section), key)
         if path is not None:
-            data[section][key] = registry.motion_model().shipped_name(path) or os.path.relpath(path, folder)
+            data[section][key] = shipped_name(path) or os.path.relpath(path, folder)
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
 
 

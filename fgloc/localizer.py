@@ -14,8 +14,7 @@ from fgloc.relocalization.recorder import Recorder
 from fgloc.relocalization.tracking_state import Tracking
 from fgloc.robust.motion_judge import MotionJudge
 from fgloc.robust.sighting_judge import SightingJudge
-from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.motion_compensation import MotionCompensation
+from fgloc.sensors.equipment import MotionCompensation, MotionSensors, PoseSensors
 from fgloc.types import Estimate, LandmarkMap, LandmarkMeasurement, MotionReadings, Step
 
 

@@ -16,9 +16,9 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
-from fgloc.sensors.detection import SensorDetector
 from fgloc.sensors.equipment import MotionPredictor
 from fgloc.sensors.maps import configured_map
+from fgloc.sensors.markers.detector import SensorDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

@@ -21,7 +21,7 @@ MODULES = sorted(path for name, folder in PACKAGES.items() for path in (folder /
 BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats", "rounding"}
 UPWARD = {
     ("types", "fgloc.evaluation.report"),  # RunResult.write, imported when it is called
-    ("config", "fgloc.sensors"),  # the registry: sensors bring their sections
+    ("config", "fgloc.sensors.settings"),  # sections of the built-in sensors
 }
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}

@@ -29,11 +29,10 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.relocalization.pose_fit import fit_pose
-from fgloc.sensors.learned import load_model, save_model
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.source import LearnedMotion
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.motion_compensation import compensated
+from fgloc.sensors.equipment import compensated
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.settings import MotionConfig
 from fgloc.types import LandmarkMap, Mode, PixelMeasurement
 
 MAPS = {"corners": room, "beacons": beacons}

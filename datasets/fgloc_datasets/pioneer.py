@@ -33,7 +33,7 @@ from fgloc.config import RecordingConfig, TopicsConfig
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.marker_pose import MarkerPosesEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 from fgloc_datasets.bag import BagWriter

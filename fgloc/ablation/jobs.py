@@ -34,8 +34,8 @@ from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors import registry
-from fgloc.sensors.detection import DetectionError
 from fgloc.sensors.maps import configured_map, write_map
+from fgloc.sensors.markers.images import ImageError
 from fgloc.types import Mode, RawEvent, RunResult, TruthEvent
 
 _TRACK_POINTS = 200
@@ -192,7 +192,7 @@ def detect(job: Job, out: Path) -> None:
             memory = setup.detector.remembering(setup.detector, detections_path(out, job), None)
             for event in recording.events():
                 if isinstance(event, RawEvent):
-                    with suppress(DetectionError):
+                    with suppress(ImageError):
                         memory.detect(event)
     except FglocError:
         pass

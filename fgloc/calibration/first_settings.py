@@ -21,7 +21,7 @@ from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
-from fgloc.sensors.first_settings import FirstLook, FirstSection
+from fgloc.sensors.base import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
 _UNCALIBRATED = {"range_scale_sigma": 0.03, "bearing_bias_sigma_rad": 0.02, "time_offset_sigma_s": 0.05}

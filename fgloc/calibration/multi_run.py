@@ -15,7 +15,7 @@ from fgloc.recording.files import find_beside
 from fgloc.replay.options import Progress
 from fgloc.runner import run
 from fgloc.sensors import registry
-from fgloc.sensors.roles import with_values
+from fgloc.sensors.base import with_values
 from fgloc.types import InstallationFound, RunResult, Setting
 
 _ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before

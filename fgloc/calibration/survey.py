@@ -30,11 +30,9 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay.options import Progress
 from fgloc.replay.smoothing import smooth_run
 from fgloc.sensors import registry
-from fgloc.sensors.detection import detect_stream
-from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.motion_compensation import MotionCompensation
-from fgloc.sensors.pnp import marker_pose_candidates
+from fgloc.sensors.cameras import marker_pose_candidates
+from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors
+from fgloc.sensors.markers.detector import detect_stream
 from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement, RawEvent, SightingsEvent
 
 # --- Drives, replayed without a map -----------------------------------------------------------------------------------

@@ -24,10 +24,9 @@ from fgloc.diagnosis.signals import Path, Signals
 from fgloc.frames import rotation_of
 from fgloc.robust.lift import LiftMonitor
 from fgloc.sensors import registry
-from fgloc.sensors.equipment import AttitudeSensor, Odometer
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.pnp import up_in_base
-from fgloc.sensors.rest import commanded_to_move, is_standing
+from fgloc.sensors.cameras import up_in_base
+from fgloc.sensors.equipment import AttitudeSensor, LandmarkSensor, Odometer
+from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
 from fgloc.types import (
     FloatArray,
     InertialEvent,

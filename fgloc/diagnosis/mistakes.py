@@ -27,9 +27,9 @@ from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors import registry
-from fgloc.sensors.detection import RememberingDetector
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.roles import with_values
+from fgloc.sensors.base import with_values
+from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.markers.detector import RememberingDetector
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
 # --- Stamps of another clock ------------------------------------------------------------------------------------------

@@ -27,8 +27,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
-from fgloc.sensors.equipment import Odometer, RateSensor
-from fgloc.sensors.landmarks import LandmarkSensor
+from fgloc.sensors.equipment import LandmarkSensor, Odometer, RateSensor
 from fgloc.types import (
     Camera,
     Estimate,

@@ -22,9 +22,9 @@ from fgloc.graph.observation import CornerBatch
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
-from fgloc.sensors.cameras import pinhole, undistort_points
-from fgloc.sensors.detection import DetectionError, Detector
-from fgloc.sensors.pnp import marker_pose_candidates
+from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
+from fgloc.sensors.markers.detector import Detector
+from fgloc.sensors.markers.images import ImageError
 from fgloc.types import (
     Camera,
     Event,
@@ -192,7 +192,7 @@ def _corners(event: RawEvent | SightingsEvent, detector: Detector | None) -> Sig
     try:
         found: SightingsEvent = detector.detect(event)
         return found
-    except DetectionError:
+    except ImageError:
         return None
 
 

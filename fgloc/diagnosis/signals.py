@@ -18,8 +18,8 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors import registry
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.pnp import marker_pose_candidates
+from fgloc.sensors.cameras import marker_pose_candidates
+from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.types import (
     Event,
     FloatArray,

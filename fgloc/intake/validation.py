@@ -13,7 +13,7 @@ import numpy as np
 from fgloc.config import Config, GateConfig
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
-from fgloc.sensors.field_checks import EMPTIED, Changes, FieldChecks
+from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
 from fgloc.types import Event, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates

@@ -7,7 +7,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
 
-from fgloc.sensors.detection import DetectionError, Detector, use_one_thread
+from fgloc.sensors.markers.detector import Detector, use_one_thread
+from fgloc.sensors.markers.images import ImageError
 from fgloc.types import Event, RawEvent, SightingsEvent
 
 
@@ -113,7 +114,7 @@ class DetectionWorker:
             reason = ""
             try:
                 found = detector.detect(event)
-            except DetectionError as error:
+            except ImageError as error:
                 reason = error.reason
             except Exception as error:  # told by whoever feeds this thread
                 self.error = error

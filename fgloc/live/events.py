@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from fgloc.config import RecordingConfig, Role
 from fgloc.sensors import registry
-from fgloc.sensors.base import When
-from fgloc.sensors.event_input import SENSOR
+from fgloc.sensors.base import SENSOR, When
 from fgloc.types import CameraInfoEvent, FloatArray, TransformEvent
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.config import Config, Role
 from fgloc.sensors import registry
-from fgloc.sensors.topic_checks import Collector, Table, TimingOnly, count, finite_rows, unit_length
+from fgloc.sensors.checks import Collector, Table, TimingOnly, count, finite_rows, unit_length
 from fgloc.types import CameraInfoEvent, Event, FloatArray, TruthEvent
 
 

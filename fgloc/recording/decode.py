@@ -13,8 +13,7 @@ import numpy as np
 
 from fgloc.config import RecordingConfig, Role
 from fgloc.sensors import registry
-from fgloc.sensors.base import Converter, When
-from fgloc.sensors.messages import matrix, nanoseconds, vector, xyz, xyzw
+from fgloc.sensors.base import Converter, When, matrix, nanoseconds, vector, xyz, xyzw
 from fgloc.types import CameraInfoEvent, Event, TransformEvent, TruthEvent
 
 TF_TYPES = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})

@@ -16,7 +16,7 @@ from fgloc.frames import BASE_NAMES
 from fgloc.recording.checks import CameraInfoChecks, collector
 from fgloc.recording.reader import Recording
 from fgloc.recording.topic_report import Times, TopicReport, early_clocks, int64, plural, report_topic
-from fgloc.sensors.topic_checks import Collector, RawChecks, SightingsChecks
+from fgloc.sensors.checks import Collector, RawChecks, SightingsChecks
 from fgloc.types import Event, Finding, MotionEvent, Severity, note
 
 _KINDS = {"ros1": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)", "mcap": "rosbag2 (MCAP)"}

@@ -17,7 +17,7 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.relocalization.gaussian_sum import Displacement, GaussianSum
 from fgloc.relocalization.place_search import PlaceSearch
-from fgloc.sensors.motion_compensation import compensated
+from fgloc.sensors.equipment import compensated
 from fgloc.stats import ROUNDING
 from fgloc.types import (
     LandmarkMap,

@@ -15,7 +15,7 @@ from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.relocalization.beacon_geometry import RING
 from fgloc.relocalization.pose_consensus import WHOLE_SHARE, PoseConsensus, apart
 from fgloc.relocalization.pose_fit import Fit, PoseFit, fit_pose
-from fgloc.sensors.pnp import planar_base_candidates
+from fgloc.sensors.cameras import planar_base_candidates
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,

@@ -17,7 +17,7 @@ from fgloc.robust.decision_log import mode_decisions, segment_decision
 from fgloc.robust.motion_judge import MotionJudge
 from fgloc.robust.sensor_measurements import kind_of
 from fgloc.robust.sighting_judge import SightingJudge
-from fgloc.sensors.motion_compensation import MotionCompensation
+from fgloc.sensors.equipment import MotionCompensation
 from fgloc.types import Decision, Estimate, FloatArray, Ground, Mode, Step
 
 

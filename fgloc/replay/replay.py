@@ -12,7 +12,7 @@ from fgloc.intake.topic_clocks import TopicClocks
 from fgloc.recording.reader import Recording
 from fgloc.recording.truth import TruthTrack
 from fgloc.replay.options import EventFilter, Progress, RunOptions
-from fgloc.sensors.detection import Detector, detect_stream
+from fgloc.sensors.markers.detector import Detector, detect_stream
 from fgloc.types import Decision, Estimate, Event, RawEvent, SensorEvent, SightingsEvent, Step, TopicTimes, TruthEvent
 
 

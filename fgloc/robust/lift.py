@@ -20,7 +20,7 @@ from collections import deque
 
 import numpy as np
 
-from fgloc.sensors.rest import commanded_to_move, is_standing
+from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
 from fgloc.stats import alarm_bound
 from fgloc.types import Decision, FloatArray, MotionReadings, Step
 

@@ -18,7 +18,7 @@ from fgloc.graph.noise import FusionRules, with_yaw
 from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.rest import commanded_to_move
+from fgloc.sensors.wheels.motion import commanded_to_move
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings, Step
 

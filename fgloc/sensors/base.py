@@ -11,17 +11,157 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, Self
 
-from fgloc.sensors.field_checks import FieldChecks
-from fgloc.sensors.first_settings import FirstSettings
-from fgloc.sensors.topic_checks import Collector, TimingOnly
-from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, PoseMeasurement, Setting
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, FiniteFloat
+
+from fgloc.files.section import Section
+from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
+from fgloc.sensors.settings import NoiseDensity
+from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, MotionEvent, PoseMeasurement, Setting
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, GateConfig, Section
-    from fgloc.sensors.channels import Channel
-    from fgloc.sensors.roles import MotionSource, RawLandmarksRole
+    from fgloc.config import Config, GateConfig
+    from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, Odometer, RateSensor
+    from fgloc.sensors.markers.detector import SensorDetector
+
+
+# --- signals over time ------------------------------------------------------------------------------------------------
+
+MAX_GAP_S = 0.25  # a signal without a sample for longer has a gap
+_FOREVER_S = 1e4  # the first and the last values hold on; the caller decides whether to use them
+
+
+class Signal:
+    """One or more channels over time, integrated once so that any mean is two look-ups per channel."""
+
+    def __init__(self, times_s: FloatArray, integrals: FloatArray) -> None:
+        """Take the integrals.
+
+        Args:
+            times_s: ``(n,)`` increasing, at least two.
+            integrals: ``(c, n)`` of the channels up to these times; between them each channel is constant.
+        """
+        n = len(times_s)
+        self._times = np.empty(n + 2)
+        self._times[1:-1] = times_s
+        self._times[0], self._times[-1] = times_s[0] - _FOREVER_S, times_s[-1] + _FOREVER_S
+        self._integrals = np.empty((len(integrals), n + 2))
+        self._integrals[:, 1:-1] = integrals
+        first = (integrals[:, 1] - integrals[:, 0]) / (times_s[1] - times_s[0])
+        last = (integrals[:, -1] - integrals[:, -2]) / (times_s[-1] - times_s[-2])
+        self._integrals[:, 0] = integrals[:, 0] - _FOREVER_S * first
+        self._integrals[:, -1] = integrals[:, -1] + _FOREVER_S * last
+
+    @classmethod
+    def of_samples(cls, times_s: FloatArray, values: FloatArray) -> Signal:
+        """From samples ``(c, n)``, joined by straight lines."""
+        integrals = np.zeros(values.shape)
+        np.cumsum(0.5 * (values[:, 1:] + values[:, :-1]) * np.diff(times_s), axis=1, out=integrals[:, 1:])
+        return cls(times_s, integrals)
+
+    def integrals(self, times_s: FloatArray) -> FloatArray:
+        """Integrals of the channels ``(c, ...)`` up to times ``(...)``."""
+        return np.array([np.interp(times_s, self._times, channel) for channel in self._integrals])
+
+    def covers(self, start_s: float, end_s: float) -> bool:
+        """Whether no moment between these times is farther than `MAX_GAP_S` from a sample."""
+        times = self._times[1:-1]
+        first = max(0, int(np.searchsorted(times, start_s, "right")) - 1)
+        inside = times[first : int(np.searchsorted(times, end_s, "left")) + 1]
+        if not len(inside) or inside[0] > start_s + MAX_GAP_S or inside[-1] < end_s - MAX_GAP_S:
+            return False
+        return bool((np.diff(inside) <= MAX_GAP_S).all())
+
+    def means(self, limits_s: FloatArray) -> FloatArray:
+        """Means ``(..., m - 1, c)`` between neighboring limits ``(..., m)``, strictly monotonic along the last axis."""
+        means = np.diff(self.integrals(limits_s)) / np.diff(limits_s)
+        return np.ascontiguousarray(np.moveaxis(means, 0, -1))
+
+
+def of_stamps(stamps: Sequence[int], values: FloatArray, origin_ns: int) -> Signal | None:
+    """From samples ``(c, n)`` at stamps [ns], joined by straight lines; None if they are fewer than two."""
+    return Signal.of_samples(seconds(stamps, origin_ns), values) if len(stamps) > 1 else None
+
+
+def seconds(stamps: Sequence[int], origin_ns: int) -> FloatArray:
+    """Stamps [ns] as times ``(n,)`` [s] since an origin."""
+    return np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
+
+
+# --- parts of ROS messages --------------------------------------------------------------------------------------------
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Of a ``builtin_interfaces/Time``."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def xyz(v: Any) -> FloatArray:
+    """A vector or point ``(3,)``."""
+    return np.array((v.x, v.y, v.z), dtype=float)
+
+
+def xyzw(q: Any) -> FloatArray:
+    """A quaternion ``(4,)``."""
+    return np.array((q.x, q.y, q.z, q.w), dtype=float)
+
+
+def vector(values: Any) -> FloatArray:
+    """Numbers ``(n,)``."""
+    return np.asarray(values, dtype=float)
+
+
+def matrix(values: Any, n: int) -> FloatArray:
+    """Numbers ``(n, n)``, row by row."""
+    return np.asarray(values, dtype=float).reshape(n, n)
+
+
+def byte_array(values: Any) -> NDArray[np.uint8]:
+    """Bytes ``(n,)``."""
+    return np.asarray(values, dtype=np.uint8)
+
+
+# --- the first settings of a robot ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FirstLook:
+    """What a recording of an unknown robot holds.
+
+    Attributes:
+        roles: topic by role.
+        events: by class, of the classes that the sensor asked for.
+        recording: opened.
+        has_map: a map lies beside it.
+    """
+
+    roles: Mapping[str, str]
+    events: Mapping[type[Event], Sequence[Event]]
+    recording: Any
+    has_map: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FirstSection:
+    """Lines of ``robot.yaml``, and sentences on what the recording does not tell."""
+
+    lines: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FirstSettings:
+    """How a sensor takes part: the events it wants to see, and what it makes of them."""
+
+    events: tuple[type[Event], ...]
+    section: Callable[[FirstLook], FirstSection]
+
+
+# --- sensors ----------------------------------------------------------------------------------------------------------
 
 When = tuple[int, int, str]
 """``stamp_ns``, ``received_ns`` and topic: the first three fields of an event."""
@@ -277,3 +417,249 @@ class Sensor(Protocol):
     def notes(self) -> tuple[str, ...]:
         """See above."""
         ...
+
+
+# --- inputs of motion models ------------------------------------------------------------------------------------------
+
+_Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+class WheelJoints(Section):
+    """Joints of two driven wheels, and their geometry."""
+
+    left: str | None = Field(None, description="joint of the left wheel; None: the one named so")
+    right: str | None = None
+    left_radius: _Positive | None = Field(None, description="m; the input wheels needs it")
+    right_radius: _Positive | None = None
+    track: _Positive | None = None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the geometry is known."""
+        return None not in (self.left_radius, self.right_radius, self.track)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """What a channel may need to know of the robot.
+
+    Attributes:
+        joints: of the wheels; None: not known.
+        gyro_bias: one number, or one for each inertial event [rad/s].
+        imu_up: ``(3,)`` the base's z axis in the axes of the inertial unit.
+    """
+
+    joints: WheelJoints | None = None
+    gyro_bias: ArrayLike = 0.0
+    imu_up: ArrayLike = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One input of a motion model, as a sensor measures it.
+
+    Attributes:
+        name: in the card of a model.
+        width: how many numbers it has at one time.
+        rank: its place among the channels that a network reads. Model files depend on it.
+        event: class of the events that it is made of.
+        signal: of events in order of stamp, since a time [ns]; None where they do not give it.
+        role: of the motion source whose motion it is: a model that reads it depends on that; None: of none.
+        needs_joints: whether it takes the names of the wheels' joints.
+        needs_geometry: whether it takes their geometry too.
+    """
+
+    name: str
+    width: int
+    rank: int
+    event: type[MotionEvent]
+    signal: Callable[[Sequence[Any], int, Mounting], Signal | None]
+    role: MotionRole | None = None
+    needs_joints: bool = False
+    needs_geometry: bool = False
+
+
+# --- events from plain numbers ----------------------------------------------------------------------------------------
+
+BASE, SENSOR = "base_link", "sensor"
+"""Frames of what is given without a frame: the robot's base, and the sensor of landmarks."""
+
+
+class EventInput:
+    """Base of the classes whose methods make a sensor's events; `Live` is all of them together."""
+
+    def _deliver(self, event: Event) -> None:
+        """Take an event that was made."""
+        raise NotImplementedError
+
+    def _when(self, role: str, stamp_ns: int) -> When:
+        """Stamp as the configuration corrects it, receive time and topic of a role."""
+        raise NotImplementedError
+
+
+# --- roles ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class OdometerErrors:
+    """Error model of the odometer, as it is configured.
+
+    Attributes:
+        noise: white, by distance, rotation and time.
+        scale_sigma: of the distance, as a share.
+        turn_scale_sigma: of the rotation, as a share.
+        yaw_per_m_sigma: rad/m.
+        time_offset_sigma_s: of the clock.
+    """
+
+    noise: NoiseDensity
+    scale_sigma: float
+    turn_scale_sigma: float
+    yaw_per_m_sigma: float
+    time_offset_sigma_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class RateErrors:
+    """Error model of the rate sensor, as it is configured.
+
+    Attributes:
+        yaw_per_sqrt_s: white noise of the integrated rate [rad/√s].
+        scale_sigma: as a share.
+        bias_sigma: rad/s, before anything is known of the bias.
+    """
+
+    yaw_per_sqrt_s: float
+    scale_sigma: float
+    bias_sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetupMistake:
+    """What an excerpt of a recording shows to be wrong with the odometer's settings.
+
+    Attributes:
+        kind: ``radius``, ``track``, ``odometry_frame``, ``exchanged``, ``reversed`` or ``both_reversed``.
+        factor: of radius and track: true over given.
+        turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
+        source: of its motion, as `Odometer.source` has it.
+    """
+
+    kind: str
+    factor: float
+    turned: FloatArray
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class OdometerRole:
+    """Measures every step; what others are compared to.
+
+    Attributes:
+        installation: what it is off by.
+        build: the odometer of one run; `ConfigError` where its settings do not fit together.
+        errors: its error model.
+        freed: settings with wide priors on its gains, to be calibrated; those for it alone, and, in this order where
+            several are to be tried, those for control inputs in its place.
+        distance_gain: the setting that sightings determine wherever the robot moves.
+        correct: the sentence and the values that undo a mistake.
+        by_angles: keys of ``wheels`` with their values, with which the wheels' angles among these events are used;
+            None: the events do not determine them.
+    """
+
+    kind: ClassVar[MotionRole] = MotionRole.ODOMETER
+    installation: MotionInstallation
+    build: Callable[[Config], Odometer]
+    errors: Callable[[Config], OdometerErrors]
+    freed: Callable[[Config], tuple[Config, ...]]
+    distance_gain: str
+    correct: Callable[[SetupMistake, Config], RawMistake]
+    by_angles: Callable[[Sequence[Event]], dict[str, Any] | None]
+
+
+class AttitudeNames(NamedTuple):
+    """Parameters of the installation that roll and pitch depend on, on uneven ground; each about x and y."""
+
+    biases: tuple[str, str]  # of the rates [rad/s], in the axes of the base
+    tilts: tuple[str, str]  # of the mounting, beside the given one [rad]
+    levels: tuple[str, str]  # tilt that the accelerometer's bias makes [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class RateRole:
+    """Measures the turn alone.
+
+    Attributes:
+        installation: what it is off by.
+        build: the sensor of one run, from all settings and the base's z axis ``(3,)`` in its frame.
+        errors: its error model.
+        is_used: whether it is to be used.
+        scale: true over reported rate.
+        attitude: what measures roll and pitch, from all settings and its mounting ``T_base_imu (4, 4)``.
+        attitude_names: of the parameters that those depend on.
+    """
+
+    kind: ClassVar[MotionRole] = MotionRole.RATE
+    installation: MotionInstallation
+    build: Callable[[Config, FloatArray], RateSensor]
+    errors: Callable[[Config], RateErrors]
+    is_used: Callable[[Config], bool]
+    scale: Callable[[Config], float]
+    attitude: Callable[[Config, FloatArray], AttitudeSensor]
+    attitude_names: AttitudeNames
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRole:
+    """Predicts the motion from control inputs.
+
+    Attributes:
+        installation: what it is off by.
+        build: the model of one run, from all settings and what gives the base's z axis ``(3,)`` in the frame of the
+            rate sensor (None: that is mounted level). None: no model is used. `ModelError` where it cannot be used.
+        correlation: how the errors of odometer and model go together; None: they are taken as independent.
+        given: settings with another model; `pydantic.ValidationError` where there is none of this name.
+        without: settings by which none is used.
+        left_out: what to tell the user where sightings contradicted the model for so long [s].
+        shipped_name: ``shipped:NAME`` of a file that comes with the package; None for others.
+    """
+
+    kind: ClassVar[MotionRole] = MotionRole.MODEL
+    installation: MotionInstallation
+    build: Callable[[Config, Callable[[], FloatArray] | None], MotionPredictor | None]
+    correlation: Callable[[Config, MotionPredictor], ErrorCorrelation | None]
+    given: Callable[[Config, Path], Config]
+    without: Callable[[Config], Config]
+    left_out: Callable[[float], str]
+    shipped_name: Callable[[Path], str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class RawLandmarksRole:
+    """Finds landmarks in raw data.
+
+    Attributes:
+        size: of landmarks for which the map gives none [m]; None: not known.
+        dictionary: of the landmarks that are detected; None: the map's.
+        given: settings with another dictionary and size; None: as they are.
+        ids: how many ids a dictionary has; `ConfigError` where there is none of this name.
+        sigma_px: noise of a corner, on each axis.
+        detector: of one run; `ConfigError` where settings and map do not say what is to be detected.
+        fitting_dictionary: the dictionary that fits the raw data of a recording; None if none does.
+    """
+
+    size: Callable[[Config], float | None]
+    dictionary: Callable[[Config], str | None]
+    given: Callable[[Config, str | None, float | None], Config]
+    ids: Callable[[str], int]
+    sigma_px: Callable[[Config], float]
+    detector: Callable[[Config, LandmarkMap | None], SensorDetector]
+    fitting_dictionary: Callable[[Any], str | None]
+
+
+MotionSource = OdometerRole | RateRole | ModelRole
+
+
+def with_values(config: Config, section: str, values: Mapping[str, Any]) -> Config:
+    """Settings with other values in one section."""
+    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})

@@ -10,13 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fgloc.config import Config
-from fgloc.sensors.base import BuiltIn, Stream, When
-from fgloc.sensors.field_checks import FieldChecks
-from fgloc.sensors.topic_checks import Table, spikes
+from fgloc.sensors.base import BuiltIn, EventInput, Stream, When
+from fgloc.sensors.checks import FieldChecks, Table, spikes
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
     from fgloc.sensors.failures import Carriage
+
+
+class CommandInput(EventInput):
+    """What the robot is commanded."""
+
+    def command(self, stamp_ns: int, v: float, omega: float) -> None:
+        """Forward speed [m/s] and yaw rate [rad/s] that the robot was commanded."""
+        self._deliver(ControlEvent(*self._when("command", stamp_ns), float(v), float(omega)))
 
 
 def from_twist(message: Any, when: When) -> Event:

@@ -1,17 +1,84 @@
-"""The sensors of one run: those of the motion, and those whose measurements depend on the robot's pose."""
+"""The sensors of one run: those of motion and of landmarks, and sightings moved from their exposure to the keyframe."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections import Counter
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.frames import rotation_of
+from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor, Turn
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.types import FloatArray, InertialEvent, InertialReading, MotionEvent, MotionMeasurement, Step
+from fgloc.sensors.landmarks import SightingContext
+from fgloc.types import (
+    Camera,
+    FloatArray,
+    FrameMeasurement,
+    InertialEvent,
+    InertialReading,
+    LandmarkMap,
+    LandmarkMeasurement,
+    LandmarkSighting,
+    MotionEvent,
+    MotionMeasurement,
+    PixelMeasurement,
+    PoseMeasurement,
+    SightingsEvent,
+    Step,
+)
+
+
+class LandmarkSensor:
+    """Turns sightings into measurements, by the sensor that they are of.
+
+    Two sightings of one id in one message: both are dropped, as nothing shows which one is false.
+
+    ``rejections`` counts what was not used: "sightings.duplicate_id", ".unknown_id", ".beyond_max" (more markers than
+    ``markers.max_sightings``, the smallest go), ".no_size", ".undistortable", ".no_pose", ".range", ".bearing_bound".
+    """
+
+    def __init__(
+        self, config: Config, landmark_map: LandmarkMap | None, camera: Camera | None, T_base_sensor: FloatArray | None
+    ) -> None:
+        """Prepare the conversion.
+
+        Args:
+            config: all settings.
+            landmark_map: the known map; None if landmarks are estimated.
+            camera: of corners; None if there is none.
+            T_base_sensor: ``(4, 4)`` takes coordinates as the sensor reports them (optical axes included) to the base;
+                None: they are in the base frame.
+        """
+        place = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
+        self._context = SightingContext(config, landmark_map, camera, place)
+        self._measure: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = registry.measurers(self._context)
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """See above."""
+        return self._context.rejections
+
+    @property
+    def sees_corners(self) -> bool:
+        """Whether sightings are corners in images."""
+        return self._context.camera is not None
+
+    def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
+        """What one message measured of the landmarks.
+
+        Raises:
+            CameraError: marker corners, but no camera.
+            ConfigError: marker corners without map, and no marker size.
+        """
+        return tuple(self._measure[type(event)](event))
 
 
 class Odometer(Protocol):
@@ -203,3 +270,122 @@ class PoseSensors:
 
     landmarks: LandmarkSensor
     registered: Sequence[Sensor] = ()
+
+
+_SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
+
+
+def compensated(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
+    """Move a sighting to the keyframe.
+
+    Args:
+        m: the sighting, as made from the base at its own time.
+        motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
+        cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+    """
+    if isinstance(m, PoseMeasurement):
+        known = np.zeros((3, 3)) if m.motion_cov is None else m.motion_cov
+        moved = se2.compose_cov(cov, m.T_keyframe_then, known)
+        return dataclasses.replace(m, T_keyframe_then=se2.compose(motion, m.T_keyframe_then), motion_cov=moved)
+    ad = se2.adjoint(motion)
+    if isinstance(m, PixelMeasurement):
+        x, y, yaw = motion
+        T = np.eye(4)
+        T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        T[:2, 3] = x, y
+        camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
+        spread = cov if m.motion_cov is None else cov + m.motion_cov
+        return dataclasses.replace(m, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ m.twist)
+    if isinstance(m, FrameMeasurement):
+        pose = se2.compose(motion, m.pose)
+        return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
+    x, y = m.point
+    px, py, _ = se2.compose(motion, (x, y, 0.0))
+    r, bearing = math.hypot(px, py), math.atan2(py, px)
+    added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
+    return dataclasses.replace(m, range_m=r, bearing_rad=bearing, cov=m.cov + added, twist=ad @ m.twist)
+
+
+def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
+    """Covariance ``(2, 2)`` (bearing, range) that an uncertain motion adds to a sighted point."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    R = np.array([[c, -s], [s, c]])
+    J_point = np.column_stack([R, R @ np.array([-point[1], point[0]])])  # of motion ∘ point, by right perturbation
+    cb, sb = math.cos(bearing), math.sin(bearing)
+    J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
+    J = J_polar @ J_point
+    return np.asarray(J @ cov @ J.T)
+
+
+def _tilted(seen: Sequence[LandmarkMeasurement], rates: FloatArray, seconds: float) -> list[LandmarkMeasurement]:
+    """Corners as the base sees them that has not yet tilted, or has tilted, by the rates ``(2,)`` about x and y."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_of((*(rates * (seconds if abs(seconds) < 1e-9 * _SHORT_NS else 0.0)).tolist(), 0.0))
+    moved: list[LandmarkMeasurement] = []
+    for m in seen:
+        if isinstance(m, PixelMeasurement):
+            camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
+            m = dataclasses.replace(m, camera=camera, tilting=rates)
+        moved.append(m)
+    return moved
+
+
+class MotionCompensation:
+    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn."""
+
+    def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
+        """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
+        self._landmarks, self._jitter_s = poses.landmarks, jitter_s
+        self._wheels, self._gyro, self._attitude = motion.wheels, motion.gyro, motion.attitude
+        self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
+
+    def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
+        """All sightings of a step as if made at its end.
+
+        Args:
+            step: the newest one.
+            offset_s: how late stamps of sightings are, as far as is known; what is left of it, the residual sees with
+                the speed at the exposure.
+        """
+        measured: list[LandmarkMeasurement] = []
+        for event in step.sightings:
+            found = self._landmarks.measure(event)
+            if not found:
+                continue
+            exposure_ns = event.stamp_ns - round(offset_s * 1e9)
+            twist = self.twist(step, exposure_ns)
+            late: list[LandmarkMeasurement] = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
+            late = [
+                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
+            ]
+            if self._attitude is not None and step.inertial:
+                rates = self._attitude.rates_at(step.inertial, exposure_ns)[:2]
+                late = _tilted(late, rates, (exposure_ns - step.stamp_ns) * 1e-9)
+            if exposure_ns != step.stamp_ns:
+                motion, cov = self._wheels.motion_between(step, step.stamp_ns, exposure_ns)
+                if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
+                    motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
+                late = [compensated(m, motion, cov) for m in late]
+            measured.extend(late)
+        for sensed in step.sensed:
+            now: list[LandmarkMeasurement] = list(self._sensor_of[type(sensed)].measure(sensed))
+            if now and sensed.stamp_ns != step.stamp_ns:
+                motion, cov = self._motion_to(step, sensed.stamp_ns)
+                now = [compensated(m, motion, cov) for m in now]
+            measured.extend(now)
+        return measured
+
+    def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
+        """``T_keyframe_then`` for another time, with its covariance."""
+        motion, cov = self._wheels.motion_between(step, step.stamp_ns, at_ns)
+        if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
+            turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
+            motion = np.array([*motion[:2], turned])
+        return motion, cov
+
+    def twist(self, step: Step, at_ns: int) -> FloatArray:
+        """Of the base at a time near the step's end."""
+        twist = self._wheels.twist(step, at_ns)
+        if self._gyro is not None and step.inertial:
+            twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]
+        return twist

@@ -8,34 +8,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from fgloc.config import Config, Section
-from fgloc.sensors import registry
 from fgloc.types import Event, LandmarkMap
-
-
-def _known_sensor(name: str) -> str:
-    events_of(name)
-    return name
-
-
-Sensor = Annotated[str, AfterValidator(_known_sensor)]
-
-
-def events_of(sensor: str) -> tuple[type[Event], ...]:
-    """Kinds of events of a sensor, by the name that failures have for it.
-
-    Raises:
-        ValueError: there is no sensor of this name.
-    """
-    known = registry.events_by_sensor()
-    if sensor not in known:
-        raise ValueError(f"expected one of {', '.join(known)}")
-    return known[sensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.sensors import registry
-from fgloc.types import (
-    Camera,
-    FloatArray,
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    LandmarkSighting,
-    PointMeasurement,
-    Sighting,
-    SightingsEvent,
-)
+from fgloc.types import Camera, FloatArray, FrameMeasurement, Landmark, LandmarkMap, PointMeasurement, Sighting
+
+
+def planar_yaw(R_base_marker: FloatArray, landmark: Landmark | None) -> float:
+    """Yaw by the rule of Landmark.planar; the map, if known, says whether the marker stands or lies."""
+    standing = abs((R_base_marker if landmark is None else landmark.rotation)[2, 2]) < 0.7
+    axis = R_base_marker[:, 2] if standing else R_base_marker[:, 0]
+    return math.atan2(axis[1], axis[0])
+
 
 MIN_RANGE_M = 1e-3
 _S = TypeVar("_S", bound=Sighting)
@@ -97,48 +94,3 @@ class SightingContext:
         cov = se2.rotate_cov(cov, -yaw)
         pose, cov = np.array([*place, se2.wrap(yaw)]), np.asarray(0.5 * (cov + cov.T))
         return FrameMeasurement(stamp_ns, landmark_id, pose, cov, cauchy_k=self.config.landmarks.cauchy_k)
-
-
-class LandmarkSensor:
-    """Turns sightings into measurements, by the sensor that they are of.
-
-    Two sightings of one id in one message: both are dropped, as nothing shows which one is false.
-
-    ``rejections`` counts what was not used: "sightings.duplicate_id", ".unknown_id", ".beyond_max" (more markers than
-    ``markers.max_sightings``, the smallest go), ".no_size", ".undistortable", ".no_pose", ".range", ".bearing_bound".
-    """
-
-    def __init__(
-        self, config: Config, landmark_map: LandmarkMap | None, camera: Camera | None, T_base_sensor: FloatArray | None
-    ) -> None:
-        """Prepare the conversion.
-
-        Args:
-            config: all settings.
-            landmark_map: the known map; None if landmarks are estimated.
-            camera: of corners; None if there is none.
-            T_base_sensor: ``(4, 4)`` takes coordinates as the sensor reports them (optical axes included) to the base;
-                None: they are in the base frame.
-        """
-        place = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
-        self._context = SightingContext(config, landmark_map, camera, place)
-        self._measure: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = registry.measurers(self._context)
-
-    @property
-    def rejections(self) -> Counter[str]:
-        """See above."""
-        return self._context.rejections
-
-    @property
-    def sees_corners(self) -> bool:
-        """Whether sightings are corners in images."""
-        return self._context.camera is not None
-
-    def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
-        """What one message measured of the landmarks.
-
-        Raises:
-            CameraError: marker corners, but no camera.
-            ConfigError: marker corners without map, and no marker size.
-        """
-        return tuple(self._measure[type(event)](event))

@@ -26,9 +26,72 @@ from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
-from fgloc.sensors import registry
-from fgloc.sensors.map_sigmas import KEYS, read_cov, sigma_fields
+from fgloc.sensors.markers.detector import load_dictionary
 from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
+
+KEYS = ("cov", "sigma_m", "sigma_rad")
+_OF = {2: "x, y", 3: "x, y, z", 6: "x, y, z and the rotation about the marker's axes"}
+
+
+def read_cov(item: Item, turned: bool) -> FloatArray | None:
+    """Covariance of an entry's pose: ``(2, 2)``, ``(3, 3)`` or ``(6, 6)`` as `Landmark` has it; None if not given.
+
+    Args:
+        item: the entry; ``sigma_m`` [m] is one number or one for each of x, y, z, ``sigma_rad`` likewise about the
+            marker's axes, ``cov`` a matrix of x, y, of x, y, z, or of these and the rotation [m, rad].
+        turned: whether the landmark has an orientation.
+
+    Raises:
+        MapError: a sigma that is not positive, a matrix that is no covariance, or both given.
+    """
+    matrix, m, rad = (item.get(key) for key in KEYS)
+    if matrix is not None:
+        if m is not None or rad is not None:
+            raise matrix.fail("give either cov or sigma_m and sigma_rad, not both")
+        return _cov(matrix, (2, 3, 6) if turned else (2, 3))
+    if rad is not None and not turned:
+        raise rad.fail("sigma_rad of a landmark without an orientation; give one, or leave sigma_rad out")
+    if rad is not None and m is None:
+        raise rad.fail("sigma_rad without sigma_m; give both, or neither")
+    if m is None:
+        return None
+    sigmas = [_sigmas(part) for part in (m, rad) if part is not None]
+    return np.diag(np.concatenate(sigmas) ** 2)
+
+
+def sigma_fields(landmark: Landmark) -> list[str]:
+    """What `read_cov` reads back, as ``key: value``; sigmas where nothing is correlated."""
+    cov = landmark.cov
+    if cov is None:
+        return []
+    if len(cov) == 2 or np.count_nonzero(cov - np.diag(np.diag(cov))):
+        return [f"cov: [{', '.join(_row(row) for row in cov)}]"]
+    sigmas = np.sqrt(np.diag(cov))
+    fields = [f"sigma_m: {_row(sigmas[:3])}"]
+    return fields if len(cov) == 3 else [*fields, f"sigma_rad: {_row(sigmas[3:])}"]
+
+
+def _sigmas(item: Item) -> FloatArray:
+    values = item.numbers(3) if item.is_sequence else np.full(3, item.number())
+    if (values <= 0.0).any():
+        raise item.fail(f"sigma {values.tolist()}, expected more than 0")
+    return values
+
+
+def _cov(item: Item, sizes: tuple[int, ...]) -> FloatArray:
+    rows = [row.numbers() for row in item.entries()]
+    n = len(rows)
+    cov = np.array(rows) if n in sizes and all(len(row) == n for row in rows) else np.zeros((1, 1))
+    if len(cov) != n or np.abs(cov - cov.T).max() > 1e-9 * np.abs(cov).max() or np.linalg.eigvalsh(cov)[0] <= 0.0:
+        wanted = " or ".join(f"{k} by {k} (of {_OF[k]})" for k in sizes)
+        shown = [row.tolist() for row in rows]
+        raise item.fail(f"cov {shown} is not a covariance: expected {wanted}, symmetric, positive definite")
+    return cov
+
+
+def _row(values: FloatArray) -> str:
+    return f"[{', '.join(repr(float(v)) for v in values)}]"
+
 
 _MAX_SIZE_M = 5.0
 _MAX_POSITION_M = 1e6
@@ -36,6 +99,11 @@ _QUATERNION_TOLERANCE = 0.05
 _ORIENTATIONS = ("facing", "rpy", "quaternion")
 _WPILIB_SIZE_M = 0.1651  # 6.5 inches, FRC since 2024
 _WPILIB_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # our axes in WPILib's: x out of the face
+
+
+def _ids(dictionary: str) -> int:
+    """Number of ids of a marker dictionary."""
+    return len(load_dictionary(dictionary).bytesList)
 
 
 class _Builder:
@@ -85,7 +153,7 @@ class _Builder:
         if not self.landmarks:
             raise root.fail("no landmarks in the map")
         if dictionary:
-            capacity = registry.raw_landmarks().ids(dictionary)
+            capacity = _ids(dictionary)
             beyond = [i for i in self.landmarks if i >= capacity]
             if beyond:
                 notes.append(f"{path}: {dictionary} has ids below {capacity}; {beyond} will never be seen.")
@@ -135,7 +203,7 @@ def configured_map(path: Path, config: Config, default_size_m: float | None = No
     Raises:
         MapError: as `load_map` has it.
     """
-    size = default_size_m or registry.raw_landmarks().size(config)
+    size = default_size_m or config.markers.default_size_m
     return load_map(path, size, config.map.scale, config.map.size_scale)
 
 
@@ -167,7 +235,7 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
     dictionary = "" if named is None else named.text()
     if named is not None:
         try:
-            registry.raw_landmarks().ids(dictionary)
+            _ids(dictionary)
         except ConfigError as error:
             raise named.fail(str(error)) from error
     if size is not None:
@@ -295,7 +363,3 @@ def _size(item: Item, scale: float) -> float:
             f"marker size {size:g} m is too large; sizes are in metres: if it is {size:g} {unit}, write {metres:g}"
         )
     return size
-
-
-def _row(values: FloatArray) -> str:
-    return f"[{', '.join(repr(float(v)) for v in values)}]"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+
+from pydantic import AfterValidator
 
 from fgloc.extensions import outside_sensors
 from fgloc.files.section import Section
@@ -12,64 +14,47 @@ from fgloc.sensors.base import (
     BuiltIn,
     Context,
     Converter,
+    FirstSettings,
     Joined,
+    ModelRole,
     MotionInstallation,
     MotionRole,
+    OdometerRole,
     Parameter,
+    RateRole,
+    RawLandmarksRole,
     RawMistake,
     Sensor,
     Stream,
 )
-from fgloc.sensors.command_input import CommandInput
-from fgloc.sensors.first_settings import FirstSettings
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.input import GyroInput
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.input import MarkersInput
-from fgloc.sensors.range_bearing.input import RangeBearingInput
-from fgloc.sensors.roles import ModelRole, OdometerRole, RateRole, RawLandmarksRole
-from fgloc.sensors.sighting_config import CameraConfig, LandmarksConfig
-from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.sensors.wheels.input import WheelsInput
+from fgloc.sensors.commands import COMMANDS, CommandInput
+from fgloc.sensors.gyro import GYRO, GyroInput
+from fgloc.sensors.learned.sensor import LEARNED
+from fgloc.sensors.marker_pose import MARKER_POSE
+from fgloc.sensors.markers.sensor import MARKERS, MarkersInput
+from fgloc.sensors.range_bearing import RANGE_BEARING, RangeBearingInput
+from fgloc.sensors.wheels.events import WheelsInput
+from fgloc.sensors.wheels.sensor import WHEELS
 from fgloc.types import Event, LandmarkSighting, RawEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config
-    from fgloc.sensors.channels import Channel
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
 
 _Role = TypeVar("_Role", OdometerRole, RateRole, ModelRole)
 
 
-class SensorSections(Section):
-    """Settings of the built-in sensors, by their keys of ``robot.yaml``: one line each."""
-
-    wheels: WheelsConfig = WheelsConfig()
-    gyro: GyroConfig = GyroConfig()
-    camera: CameraConfig = CameraConfig()
-    markers: MarkersConfig = MarkersConfig()
-    landmarks: LandmarksConfig = LandmarksConfig()
-    motion: MotionConfig = MotionConfig()
-
-
 class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):
     """Methods that make the events of the built-in sensors from plain numbers."""
 
 
-@cache
-def built_in() -> tuple[BuiltIn, ...]:
-    """The built-in sensors: one line each."""
-    from fgloc.sensors.commands import COMMANDS
-    from fgloc.sensors.gyro.sensor import GYRO
-    from fgloc.sensors.learned.sensor import LEARNED
-    from fgloc.sensors.marker_pose.sensor import MARKER_POSE
-    from fgloc.sensors.markers.sensor import MARKERS
-    from fgloc.sensors.range_bearing.sensor import RANGE_BEARING
-    from fgloc.sensors.wheels.sensor import WHEELS
+_BUILT_IN = (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
 
-    return (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
+
+def built_in() -> tuple[BuiltIn, ...]:
+    """The built-in sensors."""
+    return _BUILT_IN
 
 
 def sensors() -> tuple[type[Sensor], ...]:
@@ -124,6 +109,26 @@ def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
         name = sensor.failing_as or sensor.name
         found[name] = (*found.get(name, ()), *(stream.event for stream in sensor.streams))
     return found | {s.name: tuple(stream.event for stream in s.streams) for s in sensors()}
+
+
+def _known_sensor(name: str) -> str:
+    events_of(name)
+    return name
+
+
+SensorName = Annotated[str, AfterValidator(_known_sensor)]
+
+
+def events_of(sensor: str) -> tuple[type[Event], ...]:
+    """Classes of the events of a sensor, by the name that failures have for it.
+
+    Raises:
+        ValueError: there is no sensor of this name.
+    """
+    known = events_by_sensor()
+    if sensor not in known:
+        raise ValueError(f"expected one of {', '.join(known)}")
+    return known[sensor]
 
 
 def failures() -> tuple[type[Section], ...]:
@@ -200,17 +205,6 @@ def raw_landmarks() -> RawLandmarksRole:
 
 def _with_role(kind: type[_Role]) -> _Role:
     return next(sensor.motion for sensor in built_in() if isinstance(sensor.motion, kind))
-
-
-def channels() -> Mapping[str, Channel]:
-    """Inputs that the sensors offer to motion models, by name, in the order in which a network reads them."""
-    return _channels()
-
-
-@cache
-def _channels() -> dict[str, Channel]:
-    offered = [channel for sensor in built_in() for channel in sensor.channels]
-    return {channel.name: channel for channel in sorted(offered, key=lambda channel: channel.rank)}
 
 
 def first_settings() -> tuple[FirstSettings, ...]:

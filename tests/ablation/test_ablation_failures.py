@@ -14,10 +14,10 @@ from fgloc import se2
 from fgloc.ablation.failures import AnyFailure, Scene, corrupt, generators
 from fgloc.config import Config
 from fgloc.frames import quaternion_yaw
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import decode
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.range_bearing import RangeBearingEvent
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Landmark, LandmarkMap, TruthEvent
 

@@ -28,9 +28,9 @@ from benchmarks.installed_scores import (
 )
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.config import Config
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Camera, Decision, Landmark, LandmarkMap, Mode, RunResult, Step, Trajectory, by_class
 

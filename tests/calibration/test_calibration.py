@@ -15,7 +15,7 @@ from fgloc.calibration.multi_run import calibrate
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
-from fgloc.sensors.learned.config import model_path
+from fgloc.sensors.settings import model_path
 from fgloc.types import Setting
 from fgloc_datasets.bag import BagWriter
 

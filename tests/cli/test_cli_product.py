@@ -19,7 +19,7 @@ from fgloc.evaluation.metrics import compute_metrics
 from fgloc.evaluation.warnings import all_findings
 from fgloc.instrumentation import progress
 from fgloc.runner import run
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.types import Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config

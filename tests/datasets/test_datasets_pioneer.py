@@ -16,7 +16,7 @@ from fgloc.config import load_config
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.marker_pose.events import MarkerPosesEvent
+from fgloc.sensors.marker_pose import MarkerPosesEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Trajectory, TruthEvent
 from fgloc_datasets.mounting import sensor_mounting

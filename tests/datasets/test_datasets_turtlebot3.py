@@ -16,7 +16,7 @@ from fgloc.errors import MapError, RecordingError
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
 from fgloc_datasets.bag import BagWriter

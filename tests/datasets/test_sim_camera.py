@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
 from fgloc_datasets.sim.mjcf import camera_rotation, intrinsics

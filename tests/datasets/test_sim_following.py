@@ -16,8 +16,8 @@ from fgloc import run, se2
 from fgloc.config import Config, load_config
 from fgloc.errors import ConfigError
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
 from fgloc_datasets.bag import BagWriter

@@ -10,8 +10,8 @@ import pytest
 from sim_bags import messages
 
 from fgloc.frames import quaternion_matrix
-from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, Landmark
 from fgloc_datasets.sim.camera import Renderer, RenderError, frames, pose_at
 from fgloc_datasets.sim.installation import Installation

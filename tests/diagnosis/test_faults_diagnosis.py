@@ -33,10 +33,10 @@ from fgloc.recording.files import find_beside
 from fgloc.recording.roles import TopicInfo, select_roles
 from fgloc.runner import run
 from fgloc.sensor_setup import given_pose
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Finding, LandmarkMap, Severity
 from fgloc_datasets import mrclam, pioneer, turtlebot3

@@ -10,7 +10,7 @@ import pytest
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.frames import rpy_matrix
 from fgloc.graph.ground import GRAVITY
-from fgloc.sensors.pnp import up_in_base
+from fgloc.sensors.cameras import up_in_base
 from fgloc.types import Camera, InertialReading, Landmark, Step
 
 SECOND = 1_000_000_000

@@ -24,10 +24,10 @@ from fgloc.frames import rpy_matrix, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import base_up
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.sensors.wheels.roll_over import roll_over
+from fgloc.sensors.wheels.sensor import roll_over
 from fgloc.types import LandmarkMap, TruthEvent
 
 SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"

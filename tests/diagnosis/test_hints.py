@@ -12,8 +12,7 @@ from fgloc.config import Config, RecordingConfig
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import decode
+from fgloc.sensors.markers.images import ImageEvent, decode
 from fgloc_datasets.bag import BagWriter
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"

@@ -12,13 +12,10 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, posit
 
 from fgloc.config import BatchConfig
 from fgloc.graph.batch import BatchSmoother
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned import load_model, save_model
+from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.card import Kinematics
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
+from fgloc.sensors.settings import GyroConfig, MotionConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 
 TRACK = 0.3

@@ -12,7 +12,7 @@ from fgloc.errors import ConfigError, FglocError, MapError, TrajectoryError
 from fgloc.files.documents import HostileError, parse, plain
 from fgloc.recording.outputs import read_tum
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.dictionaries import load_dictionary
+from fgloc.sensors.markers.detector import load_dictionary
 from tests.fuzz.hostile_yaml import SYNTAX, numeric_cases, numeric_keys
 
 ACCEPTED = {"date", "date of year 0", "long float", "escaped NUL", "no noise at all", "topic of control characters"}

@@ -93,7 +93,7 @@ def model_case(place: Path, seed: int) -> Case:
         import numpy as np
 
         from fgloc.errors import FglocError
-        from fgloc.sensors.learned import load_model
+        from fgloc.sensors.learned.sensor import load_model
 
         try:
             model = load_model(path)

@@ -19,7 +19,7 @@ from fgloc.files.documents import parse, plain
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.decode import converters_of
 from fgloc.recording.messages import default_typestore
-from fgloc.sensors.learned import load_model
+from fgloc.sensors.learned.sensor import load_model
 from tests.fuzz import zygote
 from tests.fuzz.cases import recording_cases
 from tests.fuzz.mutate import MUTATIONS, mutated

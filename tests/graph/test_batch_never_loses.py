@@ -12,7 +12,7 @@ from world_bags import write_world
 from fgloc import se2
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Mode
 from fgloc_datasets.bag import BagWriter

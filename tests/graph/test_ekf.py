@@ -11,8 +11,8 @@ from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import ConfigError
 from fgloc.graph.batch import BatchSmoother
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 
 MAPS = {"corners": room, "beacons": beacons}
 GAUSSIAN = {"cauchy_k": 1000.0}

@@ -22,7 +22,7 @@ from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovari
 from fgloc.graph.noise import gaussian
 from fgloc.graph.observation import cartesian
 from fgloc.robust.association import Association
-from fgloc.sensors.motion_compensation import compensated
+from fgloc.sensors.equipment import compensated
 from fgloc.types import (
     Camera,
     FrameMeasurement,

@@ -34,10 +34,9 @@ from fgloc.graph.joint import correct, fuse_installed, joint_cov
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.gyro import Gyro, ImuEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.settings import GyroConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, PointMeasurement, Step, by_class

@@ -24,7 +24,7 @@ from fgloc import se2
 from fgloc.config import GateConfig
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 
 

@@ -21,8 +21,8 @@ from event_makers import (
     times,
 )
 
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent
 

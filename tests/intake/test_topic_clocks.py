@@ -7,7 +7,7 @@ import pytest
 from event_makers import command, imu, joints, ns, odometry
 
 from fgloc.intake.topic_clocks import TopicClocks
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 
 RESET_S = 10.0
 

@@ -24,10 +24,10 @@ from fgloc.live import Live
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.tracking import TrackingDetector
-from fgloc.sensors.roles import with_values
+from fgloc.sensors.base import with_values
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.markers.detector import TrackingDetector
+from fgloc.sensors.markers.images import ImageEvent
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Mode, TransformEvent, TruthEvent
 

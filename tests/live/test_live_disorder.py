@@ -9,7 +9,7 @@ from robot_world import START_NS, World, beacons, config, room
 
 from fgloc.config import Config, LiveConfig
 from fgloc.live import Live
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Mode
 

@@ -22,7 +22,7 @@ from fgloc.live.status import LiveStatus
 from fgloc.live.wire.node import described
 from fgloc.localizer import Localizer
 from fgloc.recording.standard_messages import diagnostics
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Finding, Mode, Severity, SightingsEvent, Step
 

@@ -18,7 +18,7 @@ from robot_world import START_NS, World, beacons, config, nees, room
 from fgloc.errors import OutputError
 from fgloc.live import Live
 from fgloc.live.state import fingerprint, read_state
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Mode
 

@@ -30,8 +30,8 @@ from fgloc.live.wire.recent import SPAN_S, RecentPoses
 from fgloc.live.wire.teller import Teller
 from fgloc.recording.storage import Storage
 from fgloc.runner import run
+from fgloc.sensors.base import with_values
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.roles import with_values
 from fgloc.types import Mode, TransformEvent
 from fgloc_datasets.bag import BagWriter
 

@@ -18,8 +18,8 @@ from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc_datasets.bag import BagWriter
 from tests.fuzz.hostile_yaml import SYNTAX
 

@@ -17,8 +17,7 @@ from fgloc.recording.definition_limits import DefinitionError, check_sizes, plai
 from fgloc.recording.definitions import Decoder
 from fgloc.recording.limits import Budget, TooLargeError, check_sqlite, decompressed
 from fgloc.recording.messages import default_typestore
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, ImageEvent, decode
 from tests.fuzz.hostile_bags import make_all, mcap_bomb, megabytes
 from tests.fuzz.processes import run
 

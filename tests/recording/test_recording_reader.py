@@ -21,9 +21,9 @@ from fgloc.errors import RecordingError
 from fgloc.recording.info import format_info, inspect
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.marker_pose.events import MarkerPosesEvent
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.marker_pose import MarkerPosesEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Event, TransformEvent, TruthEvent
 from fgloc_datasets.bag import BagWriter

@@ -12,7 +12,7 @@ from fgloc.config import Config
 from fgloc.localizer import Localizer
 from fgloc.relocalization.pose_fit import fit_pose
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Estimate,

@@ -14,7 +14,7 @@ from fgloc.config import Config, RecordingConfig
 from fgloc.errors import CameraError, ConfigError, MapError, RecordingError
 from fgloc.recording.reader import open_recording
 from fgloc.sensor_setup import given_pose
-from fgloc.sensors.learned.load import save_model
+from fgloc.sensors.learned.sensor import save_model
 from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000

@@ -6,7 +6,7 @@ import fgloc
 from fgloc.config import load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.runner import run
-from fgloc.sensors.roles import with_values
+from fgloc.sensors.base import with_values
 
 MODEL = Path(fgloc.__file__).parent / "sensors" / "learned" / "models" / "mrclam" / "all.safetensors"
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"

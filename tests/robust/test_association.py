@@ -11,8 +11,8 @@ from robot_world import START_NS, Chain, polar, project, standing
 
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.robust import association
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.types import Decision, Landmark, LandmarkMap, Step
 
 SURE, UNSURE = (0.001, 0.001, 0.001), (0.7, 0.7, 0.3)  # sigmas of the given pose: m, m, rad

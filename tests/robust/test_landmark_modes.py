@@ -12,8 +12,8 @@ from robot_world import Chain, World, beacons, config, position_error, room
 
 from fgloc import se2
 from fgloc.frames import rpy_matrix
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import Event, LandmarkMap
 
 COARSE = {"range_sigma_m": 0.2, "bearing_sigma_rad": 0.05}  # of which one sighting cannot show half a metre

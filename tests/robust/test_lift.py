@@ -14,7 +14,7 @@ from test_ablation_failures import apply, driving, make, of
 from fgloc.ablation.failures import corrupt
 from fgloc.robust.lift import LiftMonitor
 from fgloc.sensors.failures import Scene
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Mode, MotionMeasurement, MotionReadings, Step, by_class
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from robot_world import START_NS, Chain, World, config, position_error, room, standing
 
-from fgloc.sensors.markers.events import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Landmark
 
 SHARE = 0.4

@@ -25,13 +25,10 @@ from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
 from fgloc.robust.motion_sources import MotionSources
 from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned import load_model, save_model
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.joint import JointCalibration
-from fgloc.sensors.learned.source import LearnedMotion
+from fgloc.sensors.gyro import Gyro, ImuEvent
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
+from fgloc.sensors.settings import GyroConfig, MotionConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import ControlEvent, MotionMeasurement, MotionReadings, Step, by_class

@@ -7,9 +7,8 @@ import pytest
 
 from fgloc.frames import rpy_matrix
 from fgloc.graph.ground import GRAVITY
-from fgloc.sensors.gyro.attitude import Attitude
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.gyro import Attitude, ImuEvent
+from fgloc.sensors.settings import GyroConfig
 from fgloc.types import Step, by_class
 
 START = 10**18

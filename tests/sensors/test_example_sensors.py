@@ -24,8 +24,8 @@ from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.runner import run
 from fgloc.sensors.base import Context
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.motion_compensation import compensated
+from fgloc.sensors.equipment import compensated
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
 from fgloc_datasets.sim.positioning import geodetic

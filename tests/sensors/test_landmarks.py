@@ -14,11 +14,11 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import CameraError, ConfigError
 from fgloc.frames import rpy_matrix
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
+from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.marker_pose import MarkerPose, MarkerPosesEvent
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,

@@ -10,11 +10,7 @@ from marker_scenes import base_transform, forward_camera, project, standing, tra
 
 from fgloc import se2
 from fgloc.frames import rpy_matrix
-from fgloc.sensors.pnp import (
-    marker_pose_candidates,
-    marker_pose_cov,
-    planar_base_candidates,
-)
+from fgloc.sensors.cameras import marker_pose_candidates, marker_pose_cov, planar_base_candidates
 from fgloc.types import Camera, FloatArray, Landmark
 
 LENSES = [

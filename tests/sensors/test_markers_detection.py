@@ -12,11 +12,15 @@ import pytest
 from marker_scenes import forward_camera, image_event, project, render, standing, texture
 
 from fgloc.errors import ConfigError
-from fgloc.sensors.detection import detect_stream
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector, suggest_dictionary
-from fgloc.sensors.markers.dictionaries import dictionary_names, load_dictionary
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.sensors.markers.detector import (
+    MarkerDetector,
+    detect_stream,
+    dictionary_names,
+    load_dictionary,
+    suggest_dictionary,
+)
+from fgloc.sensors.markers.images import CornersEvent, ImageEvent
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import ControlEvent, Event
 
 CAMERA = forward_camera()

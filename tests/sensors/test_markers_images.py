@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import ImageError, decode
+from fgloc.sensors.markers.images import ImageError, ImageEvent, decode
 
 
 def message(data: Any, encoding: str, width: int = 0, height: int = 0, step: int = 0, big: bool = False) -> ImageEvent:

@@ -8,14 +8,10 @@ import pytest
 
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.markers.coarse import CoarseSearch
-from fgloc.sensors.markers.codes import Codes
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.dictionaries import load_dictionary
-from fgloc.sensors.markers.events import ImageEvent
-from fgloc.sensors.markers.images import decode
-from fgloc.sensors.markers.tracking import TrackingDetector
+from fgloc.sensors.markers.detector import MarkerDetector, TrackingDetector, load_dictionary
+from fgloc.sensors.markers.edges import CoarseSearch, Codes
+from fgloc.sensors.markers.images import ImageEvent, decode
+from fgloc.sensors.settings import MarkersConfig
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
 

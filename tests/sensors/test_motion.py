@@ -12,20 +12,17 @@ from motion_models import make_card, make_tensors
 
 from fgloc import se2
 from fgloc.errors import ModelError
-from fgloc.sensors.learned import (
+from fgloc.sensors.learned.card import Kind
+from fgloc.sensors.learned.network import (
+    CommandHistory,
     DisplacementModel,
-    LearnedMotion,
     MotionModel,
     NaiveModel,
     VelocityModel,
-    load_model,
-    save_model,
+    noise_density,
 )
-from fgloc.sensors.learned.card import Kind
-from fgloc.sensors.learned.commands import CommandHistory
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.forms import noise_density
-from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
+from fgloc.sensors.settings import MotionConfig, NoiseDensity
 from fgloc.types import ControlEvent, Step, by_class
 
 SECOND = 1_000_000_000

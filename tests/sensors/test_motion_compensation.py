@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgloc import se2
-from fgloc.sensors.motion_compensation import compensated
+from fgloc.sensors.equipment import compensated
 from fgloc.types import FrameMeasurement, PointMeasurement
 
 MOTION = np.array([-0.3, 0.1, 0.4])

@@ -15,7 +15,8 @@ from motion_models import make_card, make_tensors
 from safetensors.numpy import save_file
 
 from fgloc.errors import ModelError
-from fgloc.sensors.learned import ModelCard, load_model, save_model
+from fgloc.sensors.learned.card import ModelCard
+from fgloc.sensors.learned.sensor import load_model, save_model
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 import torch
 from synthetic_robot import synthetic
 
-from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import FAMILIES, Kind, Split
+from fgloc.sensors.learned.sensor import load_model
 from fgloc_training import train as training
 from fgloc_training.config import CalibrationConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from fgloc_training.evaluate import Figures, evaluate

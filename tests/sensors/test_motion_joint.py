@@ -7,7 +7,7 @@ import pytest
 
 from fgloc import se2
 from fgloc.errors import CovarianceError
-from fgloc.sensors.learned import JointCalibration
+from fgloc.sensors.learned.network import JointCalibration
 from fgloc.types import FloatArray, MotionMeasurement
 
 

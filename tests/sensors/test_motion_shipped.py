@@ -9,8 +9,8 @@ import pytest
 from real_data import real_data
 
 import fgloc.sensors.learned
-from fgloc.sensors.learned import load_model
 from fgloc.sensors.learned.card import Kinematics
+from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import ControlEvent
 from fgloc_datasets import mrclam
 from fgloc_training.config import DataConfig

@@ -11,12 +11,11 @@ from motion_models import make_card, make_tensors
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
-from fgloc.sensors.base import MotionRole
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.learned import LearnedMotion, load_model, save_model
-from fgloc.sensors.learned.config import MotionConfig
-from fgloc.sensors.learned.signals import SignalReader, Signals
-from fgloc.sensors.signals import Signal
+from fgloc.sensors.base import MotionRole, Signal
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.learned.card import SignalReader, Signals
+from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
+from fgloc.sensors.settings import MotionConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, InertialEvent, MotionEvent, Step, by_class
 

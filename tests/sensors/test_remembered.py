@@ -10,10 +10,9 @@ from marker_scenes import forward_camera, render, standing
 from fgloc.ablation.jobs import execute, make_jobs
 from fgloc.ablation.records import read_record
 from fgloc.ablation.suite import Suite, expand
-from fgloc.sensors.markers.config import MarkersConfig
-from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector, RememberedDetections
 from fgloc.sensors.markers.images import ImageError
-from fgloc.sensors.markers.remembered import RememberedDetections
+from fgloc.sensors.settings import MarkersConfig
 from fgloc_datasets import SAMPLE
 
 DICTIONARY = "DICT_4X4_50"

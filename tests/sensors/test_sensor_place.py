@@ -7,7 +7,7 @@ import pytest
 from fgloc.assembly import Assembly, assemble
 from fgloc.config import Config
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000

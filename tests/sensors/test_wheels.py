@@ -9,10 +9,9 @@ from event_makers import command, corners, in_order_of_receipt, joints, ns, odom
 
 from fgloc import se2
 from fgloc.errors import ConfigError
-from fgloc.sensors.noise_density import NoiseDensity
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.settings import NoiseDensity, WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.sensors.wheels.timeline import TwistTimeline
+from fgloc.sensors.wheels.tracks import TwistTimeline
 
 GEOMETRY = dict(left_radius=0.05, right_radius=0.06, track=0.3)
 

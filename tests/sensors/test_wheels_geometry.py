@@ -2,7 +2,7 @@
 
 import pytest
 
-from fgloc.sensors.wheels.geometry import WheelPair, wheel_pair
+from fgloc.sensors.wheels.sensor import WheelPair, wheel_pair
 
 
 @pytest.mark.parametrize(

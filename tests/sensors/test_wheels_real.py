@@ -11,7 +11,7 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from fgloc.config import GateConfig, KeyframesConfig
 from fgloc.intake.keyframing import KeyframeBuilder
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.marker_pose.events import MarkerPose, MarkerPosesEvent
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.marker_pose import MarkerPose, MarkerPosesEvent
+from fgloc.sensors.markers.images import CornersEvent, ImageEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Event, Step
 

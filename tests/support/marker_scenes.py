@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc.frames import rpy_matrix
-from fgloc.sensors.markers.events import ImageEvent
+from fgloc.sensors.markers.images import ImageEvent
 from fgloc.types import Camera, FloatArray, Landmark
 
 # Optical axes in body axes: z forward, x right, y down (REP 103).

@@ -14,10 +14,9 @@ from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer
-from fgloc.sensors.equipment import MotionSensors, PoseSensors
-from fgloc.sensors.landmarks import LandmarkSensor
-from fgloc.sensors.markers.events import CornersEvent, MarkerCorners
-from fgloc.sensors.range_bearing.events import RangeBearing, RangeBearingEvent
+from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, ControlEvent, Estimate, Event, Landmark, LandmarkMap

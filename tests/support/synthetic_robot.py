@@ -8,8 +8,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, Event, FloatArray
 from fgloc_datasets.bag import BagWriter

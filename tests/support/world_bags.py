@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from fgloc import se2
 from fgloc.sensors.maps import write_map
-from fgloc.sensors.markers.events import CornersEvent
-from fgloc.sensors.range_bearing.events import RangeBearingEvent
+from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
 from fgloc_datasets.bag import BagWriter

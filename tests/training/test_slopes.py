@@ -8,9 +8,9 @@ import pytest
 from fgloc import se2
 from fgloc.frames import rpy_matrix
 from fgloc.graph.ground import GRAVITY, driven
-from fgloc.sensors import registry
-from fgloc.sensors.channels import Mounting
-from fgloc.sensors.gyro.events import ImuEvent
+from fgloc.sensors.base import Mounting
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.learned.card import CHANNELS
 from fgloc_training.slopes import in_robots_plane
 
 
@@ -38,7 +38,7 @@ def test_a_flat_floor_is_left_as_it_is() -> None:
 @pytest.mark.parametrize("mounted", [np.eye(3), rpy_matrix(np.pi, 0.0, 0.0), rpy_matrix(0.0, 0.3, 0.0)])
 def test_models_may_read_the_direction_of_gravity(mounted) -> None:
     """Nose up by 10 degrees, left side up by 5; the IMU may be upside down, or nod."""
-    channel = registry.channels()["gravity"]
+    channel = CHANNELS["gravity"]
     force = rpy_matrix(np.radians(5.0), -np.radians(10.0), 0.7).T @ np.array([0.0, 0.0, GRAVITY])
     events = [
         ImuEvent(i * 10**7, i * 10**7, "/imu", "imu", np.zeros(3), mounted.T @ force, np.zeros((3, 3)))
@@ -53,4 +53,4 @@ def test_models_may_read_the_direction_of_gravity(mounted) -> None:
 
 
 def test_the_order_of_channels_that_models_were_trained_with_is_kept() -> None:
-    assert list(registry.channels()) == ["gyro", "effort", "wheels", "gravity"]
+    assert list(CHANNELS) == ["gyro", "effort", "wheels", "gravity"]

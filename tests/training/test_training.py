@@ -16,9 +16,8 @@ from synthetic_robot import SECOND, sensing, synthetic, write_bag
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
 from fgloc.sensors.base import MotionRole
-from fgloc.sensors.learned import load_model, save_model
 from fgloc.sensors.learned.card import Input, Kind, Split
-from fgloc.sensors.learned.load import read_model
+from fgloc.sensors.learned.sensor import load_model, read_model, save_model
 from fgloc_training import evaluate as evaluation
 from fgloc_training import optimize
 from fgloc_training import train as training

@@ -15,7 +15,7 @@ from fgloc import se2
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.recording.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
-from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import ControlEvent, Trajectory
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs

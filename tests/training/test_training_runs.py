@@ -12,9 +12,9 @@ from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, se
 
 from fgloc.config import Config
 from fgloc.errors import RecordingError
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.learned import load_model
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.learned.sensor import load_model
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Event
 from fgloc_datasets.bag import BagWriter

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from fgloc.errors import RecordingError
 from fgloc.sensors.learned.card import ModelCard
-from fgloc.sensors.learned.load import Tensors, model_of
+from fgloc.sensors.learned.sensor import Tensors, model_of
 from fgloc.types import FloatArray
 from fgloc_training.config import AdaptationConfig
 from fgloc_training.data import Run

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, Row
-from fgloc.sensors.learned.forms import calibrated
-from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.sensors.learned.network import calibrated
+from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import FloatArray
 from fgloc_training.config import CalibrationConfig
 from fgloc_training.data import Run

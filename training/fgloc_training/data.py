@@ -22,7 +22,7 @@ from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up
-from fgloc.sensors.learned.commands import CommandHistory
+from fgloc.sensors.learned.network import CommandHistory
 from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
 from fgloc_training.config import DataConfig
 from fgloc_training.sensor_record import SensorRecord

@@ -17,7 +17,7 @@ from scipy.stats import chi2, norm
 
 from fgloc.recording.outputs import write_text
 from fgloc.sensors.learned.card import Kinematics, ModelCard
-from fgloc.sensors.learned.load import load_model
+from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import FloatArray
 from fgloc_training.calibrate import nis
 from fgloc_training.config import DataConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgloc.sensors.learned.card import ModelCard, Split
-from fgloc.sensors.learned.load import Tensors
+from fgloc.sensors.learned.sensor import Tensors
 from fgloc_training.config import TrainConfig
 from fgloc_training.models import DisplacementNet, MotionNet, VelocityNet
 from fgloc_training.recurrent import Trunk

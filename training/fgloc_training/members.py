@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from fgloc.errors import RecordingError
+from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, Split
-from fgloc.sensors.signals import Signal
 from fgloc_training.calibrate import fit_kinematics, fit_lag
 from fgloc_training.checkpoint import Checkpoints, Curve
 from fgloc_training.config import NetworkConfig, TrainConfig

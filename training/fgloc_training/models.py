@@ -10,11 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from fgloc.errors import RecordingError
-from fgloc.sensors import registry
-from fgloc.sensors.learned.card import Kinematics, Lag
-from fgloc.sensors.learned.displacement import measured_twists, signal_features
-from fgloc.sensors.learned.forms import calibrated
-from fgloc.sensors.learned.signals import Signals
+from fgloc.sensors.learned.card import CHANNELS, Kinematics, Lag, Signals
+from fgloc.sensors.learned.network import calibrated, measured_twists, signal_features
 from fgloc.types import FloatArray
 from fgloc_training.config import NetworkConfig
 from fgloc_training.data import Run
@@ -62,7 +59,7 @@ class DisplacementNet(nn.Module):
         super().__init__()
         self.config, self.kinematics, self.wheel_kinematics = config, kinematics, wheel_kinematics
         self.joints = runs[0].sensors.joints
-        self.measured = tuple(name for name in registry.channels() if name in config.inputs)
+        self.measured = tuple(name for name in CHANNELS if name in config.inputs)
         self._gyro_columns = self._columns("gyro")
         features = np.concatenate([self._features(run) for run in runs])
         base = np.concatenate([self._base(run) for run in runs])
@@ -95,7 +92,7 @@ class DisplacementNet(nn.Module):
         found, first = [], 0
         for ages, channels in [
             (len(self.config.edges_s) - 1, 2),
-            *((len(self.config.signal_edges_s), registry.channels()[name].width) for name in self.measured),
+            *((len(self.config.signal_edges_s), CHANNELS[name].width) for name in self.measured),
         ]:
             found += [(i, i + channels) for i in range(first, first + (ages - 1) * channels)]
             first += ages * channels
@@ -125,7 +122,7 @@ class DisplacementNet(nn.Module):
         """Columns of the features that hold a measured input; empty if it is not read."""
         first, ages = 2 * (len(self.config.edges_s) - 1), len(self.config.signal_edges_s)
         for other in self.measured:
-            width = registry.channels()[other].width * ages
+            width = CHANNELS[other].width * ages
             if other == name:
                 return slice(first, first + width)
             first += width

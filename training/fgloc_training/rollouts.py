@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.errors import ModelError
-from fgloc.sensors.learned.card import ErrorMemory, Kinematics
-from fgloc.sensors.learned.forms import MotionModel, calibrated
-from fgloc.sensors.learned.signals import SignalReader
+from fgloc.sensors.learned.card import ErrorMemory, Kinematics, SignalReader
+from fgloc.sensors.learned.network import MotionModel, calibrated
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import FloatArray
 from fgloc_training.data import Run

@@ -11,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config
 from fgloc.intake.event_buffer import EventBuffer
-from fgloc.sensors.channels import Mounting, WheelJoints
-from fgloc.sensors.gyro.config import GyroConfig
-from fgloc.sensors.gyro.events import ImuEvent
-from fgloc.sensors.gyro.rate import Gyro
-from fgloc.sensors.learned.signals import Signals, signals_of
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.base import Mounting, WheelJoints
+from fgloc.sensors.gyro import Gyro, ImuEvent
+from fgloc.sensors.learned.card import Signals, signals_of
+from fgloc.sensors.settings import GyroConfig, WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, MotionEvent, Step

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgloc.errors import ConfigError
 from fgloc.sensors.learned.card import ModelCard, Split
-from fgloc.sensors.learned.load import Tensors, load_model, model_of, read_model, save_model
+from fgloc.sensors.learned.sensor import Tensors, load_model, model_of, read_model, save_model
 from fgloc_training.adapt import adapted
 from fgloc_training.calibrate import fit_joint, fit_noise, fit_variance, noise_covs
 from fgloc_training.checkpoint import Checkpoints, Curve

@@ -21,8 +21,8 @@ from rosbags.highlevel import AnyReader
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.maps import load_map
-from fgloc.sensors.markers.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, LandmarkMap
 from fgloc_datasets.sim.ground import make_ground, outline
 from fgloc_datasets.sim.scenario import Scenario

@@ -8,7 +8,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from fgloc.sensors.failures import Change, EventFailure, Failure, Scene, Sensor, by_receipt, events_of
+from fgloc.sensors.failures import Change, EventFailure, Failure, Scene, by_receipt
+from fgloc.sensors.registry import SensorName, events_of
 from fgloc.types import Event
 
 
@@ -16,7 +17,7 @@ class Dropout(EventFailure):
     """A sensor has no messages: they are lost."""
 
     kind: Literal["dropout"] = "dropout"
-    sensor: Sensor
+    sensor: SensorName
 
     def targets(self) -> tuple[type[Event], ...]:
         """Messages of the sensor."""
@@ -31,7 +32,7 @@ class ClockOffset(EventFailure):
     """A sensor's clock is ahead by ``offset_s`` and gains ``drift_ppm``: its stamps are wrong, its arrival is not."""
 
     kind: Literal["clock_offset"] = "clock_offset"
-    sensor: Sensor
+    sensor: SensorName
     offset_s: float = Field(0.1, description="s; negative: behind")
     drift_ppm: float = Field(0.0, description="µs gained per second since the start")
 
@@ -58,7 +59,7 @@ class Latency(Failure):
     """
 
     kind: Literal["latency"] = "latency"
-    sensor: Sensor
+    sensor: SensorName
     delay_s: float = Field(0.0, ge=0, description="s")
     jitter_s: float = Field(0.0, ge=0, description="s, at most")
     stamped_on_arrival: bool = False
@@ -85,7 +86,7 @@ class DuplicatedMessages(Failure):
     """A sensor's messages arrive twice, the copy ``after_s`` later with the same stamp."""
 
     kind: Literal["duplicated_messages"] = "duplicated_messages"
-    sensor: Sensor
+    sensor: SensorName
     after_s: float = Field(0.0, ge=0, description="s")
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from fgloc.config import Section
-from fgloc.sensors import registry
-from fgloc.sensors.base import MotionRole
-from fgloc.sensors.channels import WheelJoints
-from fgloc.sensors.noise_density import NoiseDensity
+from fgloc.sensors.base import MotionRole, Mounting, Signal, WheelJoints
+from fgloc.sensors.gyro import CHANNELS as _GYRO_CHANNELS
+from fgloc.sensors.settings import NoiseDensity
+from fgloc.sensors.wheels.sensor import CHANNELS as _WHEEL_CHANNELS
+from fgloc.types import MotionEvent, Step
 
 FORMAT = "fgloc-motion"
 VERSION = 1
+CHANNELS = {c.name: c for c in sorted((*_GYRO_CHANNELS, *_WHEEL_CHANNELS), key=lambda c: c.rank)}
+"""What a model may read beside commands, by name, in the order in which a network reads it."""
 _OWN_INPUTS = ("commands", "velocity")  # others are channels that sensors bring
 
 
 def _known_input(name: str) -> str:
-    if name not in (known := (*_OWN_INPUTS, *registry.channels())):
+    if name not in (known := (*_OWN_INPUTS, *CHANNELS)):
         raise ValueError(f"expected one of {', '.join(known)}")
     return name
 
@@ -164,17 +172,17 @@ class ModelCard(Section):
         """Width of the network's input that this card implies; 0 if there is no network."""
         if self.family != "displacement":
             return 0 if self.kind in ("naive", "lag") else 5
-        measured = len(self.signal_edges_s) * sum(registry.channels()[name].width for name in self.measured)
+        measured = len(self.signal_edges_s) * sum(CHANNELS[name].width for name in self.measured)
         return 2 * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
 
     @property
     def measured(self) -> tuple[str, ...]:
         """Inputs that sensors measure during the step, in the network's order."""
-        return tuple(name for name in registry.channels() if name in self.inputs)
+        return tuple(name for name in CHANNELS if name in self.inputs)
 
     def reads(self, role: MotionRole) -> bool:
         """Whether the model reads the motion by a motion source: its faults then stay unseen by the model."""
-        return any(registry.channels()[name].role == role for name in self.measured)
+        return any(CHANNELS[name].role == role for name in self.measured)
 
     @property
     def n_outputs(self) -> int:
@@ -200,7 +208,7 @@ class ModelCard(Section):
             raise ValueError(f"a {self.kind} model needs {_needs(self.kind)}; the card does not fit")
         if self.members > 1 and self.kind != "displacement":
             raise ValueError(f"a {self.kind} model has one network, the card says {self.members}")
-        for channel in (registry.channels()[name] for name in self.measured):
+        for channel in (CHANNELS[name] for name in self.measured):
             if channel.needs_joints and self.joints is None:
                 raise ValueError(f"the input {channel.name} needs the card's joints; it names none")
             if channel.needs_geometry and (self.joints is None or not self.joints.measured):
@@ -218,3 +226,98 @@ class ModelCard(Section):
             if len(values) != wanted:
                 raise ValueError(f"normalization {name} has {len(values)} values, the inputs and outputs need {wanted}")
         return self
+
+
+EventsOf = Callable[[type[MotionEvent]], Sequence[MotionEvent]]
+"""Events of a class, in order of stamp."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """What was measured around a step. Times are seconds since ``origin_ns``.
+
+    Attributes:
+        origin_ns: time zero.
+        by_name: signal of each channel that was wanted and is known.
+    """
+
+    origin_ns: int
+    by_name: Mapping[str, Signal] = field(default_factory=dict)
+
+    def named(self, name: str) -> Signal | None:
+        """By the name that a card's inputs use."""
+        return self.by_name.get(name)
+
+    def of_role(self, role: MotionRole) -> Signal | None:
+        """The motion by a motion source; None if it is not known."""
+        return next((self.by_name[name] for name in self.by_name if CHANNELS[name].role == role), None)
+
+
+class SignalReader:
+    """Keeps of the steps' events what a model reads, for as long as it looks back, and makes signals of it.
+
+    Steps that do not continue the last one, by stamp or segment, begin anew: before the first event of a signal its
+    first value is taken to have held.
+    """
+
+    def __init__(self, card: ModelCard, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Read what the card's model needs; ``imu_up`` is the base's z axis in the IMU's frame."""
+        self._mounting = Mounting(card.joints, imu_up=np.asarray(imu_up, dtype=float))
+        self._wanted = card.measured
+        self._back_ns = round((card.signal_edges_s[-1] + card.wheel_kinematics.delay_s) * 1e9)
+        self._reached: tuple[int, int] | None = None
+        self._events: dict[type[MotionEvent], list[MotionEvent]] = {CHANNELS[name].event: [] for name in self._wanted}
+
+    @property
+    def back_ns(self) -> int:
+        """How far before a step the events reach that are read; 0: none are read."""
+        return self._back_ns if self._wanted else 0
+
+    def fork(self, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]) -> SignalReader:
+        """A copy that may read on without changing this one, with these events in place of its own."""
+        forked = copy.copy(self)
+        forked._events = {kind: list(events.get(kind, ())) for kind in self._events}
+        return forked
+
+    def read(self, step: Step, gyro_bias: float = 0.0) -> Signals | str:
+        """Signals over the step and what the model wants before it; else the name of the first one with a hole."""
+        if not self._wanted:
+            return Signals(step.start_ns)
+        continued = self._reached == (step.segment, step.start_ns)
+        self._reached = (step.segment, step.stamp_ns)
+        oldest = step.start_ns - self._back_ns
+        for kind, events in self._events.items():
+            if not continued:
+                events.clear()
+            _follow(events, step.of(kind), oldest)
+        mounting = replace(self._mounting, gyro_bias=gyro_bias)
+        found = signals_of(self._wanted, self._events.__getitem__, step.start_ns, mounting)
+        for name in self._wanted:
+            signal = found.named(name)
+            if signal is None or not signal.covers(0.0, step.dt):
+                return name
+        return found
+
+
+def signals_of(wanted: Sequence[str], events_of: EventsOf, origin_ns: int, mounting: Mounting) -> Signals:
+    """The wanted signals, as far as the events hold them.
+
+    Args:
+        wanted: names of channels.
+        events_of: the events by class.
+        origin_ns: time zero of the signals.
+        mounting: what the channels need to know of the robot.
+    """
+    channels = [CHANNELS[name] for name in wanted]
+    made = {channel.name: channel.signal(events_of(channel.event), origin_ns, mounting) for channel in channels}
+    return Signals(origin_ns, {name: signal for name, signal in made.items() if signal is not None})
+
+
+def _follow(events: list[MotionEvent], new: Sequence[MotionEvent], oldest_ns: int) -> None:
+    """Add what is new and drop what is older than the last one at or before a time."""
+    last_ns = events[-1].stamp_ns if events else -1
+    events.extend(e for e in new if e.stamp_ns > last_ns)
+    first = 0
+    while first + 1 < len(events) and events[first + 1].stamp_ns <= oldest_ns:
+        first += 1
+    del events[:first]

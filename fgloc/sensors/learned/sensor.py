@@ -2,7 +2,361 @@
 
 from __future__ import annotations
 
-from fgloc.sensors.base import BuiltIn
-from fgloc.sensors.learned.role import ROLE
+import copy
+import json
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from fgloc import se2
+from fgloc.errors import CovarianceError, ModelError
+from fgloc.files.atomic import atomic_file
+from fgloc.sensors.base import (
+    BuiltIn,
+    FoundRow,
+    InstallationState,
+    ModelRole,
+    MotionInstallation,
+    MotionRole,
+    Parameter,
+    Rank,
+    with_values,
+)
+from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard, SignalReader
+from fgloc.sensors.learned.network import (
+    Answering,
+    Cell,
+    DisplacementModel,
+    MotionModel,
+    NaiveModel,
+    Network,
+    RecurrentNetwork,
+    VelocityModel,
+)
+from fgloc.sensors.settings import MotionConfig, shipped_name
+from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Setting, Step
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+    from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor
+
+
+_CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+_MAX_BYTES = 64 << 20
+_REMEDY = "export it again with fgloc train"
+Tensors = dict[str, NDArray[np.float32]]
+
+
+def load_model(path: Path) -> MotionModel:
+    """Read a model and check that its parts fit each other.
+
+    Raises:
+        ModelError: the file is missing, is not safetensors (a pickle, say), is damaged, is of another kind or version,
+            or its card, shapes or numbers do not fit; both sides are named.
+    """
+    return model_of(*read_model(path), path)
+
+
+def model_of(tensors: Tensors, card: ModelCard, path: Path = Path("model")) -> MotionModel:
+    """The model of weights and card; errors as in `load_model`, which name ``path``."""
+    _check(tensors, card, path)
+    try:
+        if card.family == "naive":
+            return NaiveModel(card)
+        if card.family == "displacement":
+            return DisplacementModel(card, _network(tensors, card))
+        return VelocityModel(card, None if card.kind == "lag" else _network(tensors, card))
+    except CovarianceError as error:
+        raise ModelError(f"{path}: its joint calibration cannot be used: {error}; {_REMEDY}") from error
+
+
+def read_model(path: Path) -> tuple[Tensors, ModelCard]:
+    """Raw weights by name and the checked card; errors as in `load_model`."""
+    try:
+        if path.exists() and not path.is_file():
+            raise ModelError(f"{path}: not a regular file; give a .safetensors file")
+        size = path.stat().st_size
+        if size > _MAX_BYTES:
+            raise ModelError(f"{path}: {size} bytes, expected a motion model of at most {_MAX_BYTES}")
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror or error}); give a .safetensors file") from error
+    except (SafetensorError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{path}: not a sound safetensors file ({error}); other formats, pickles above all, are refused; {_REMEDY}"
+        ) from error
+    return tensors, _card(metadata, path)
+
+
+def save_model(path: Path, tensors: Tensors, card: ModelCard) -> None:
+    """Write a model file that `load_model` accepts, atomically."""
+    metadata = {"card": card.model_dump_json()}  # one entry: the order of several would differ from run to run
+    data = save(tensors, metadata=metadata)
+    with TemporaryDirectory(prefix="fgloc-") as folder:
+        (Path(folder) / path.name).write_bytes(data)
+        load_model(Path(folder) / path.name)
+    with atomic_file(path, binary=True) as file:
+        file.write(data)
+
+
+def _card(metadata: dict[str, str], path: Path) -> ModelCard:
+    try:
+        fields = json.loads(metadata["card"])
+    except KeyError:
+        raise ModelError(f"{path}: has no card (inputs, normalization, noise) in its header; {_REMEDY}") from None
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{path}: its card is not JSON ({error}); {_REMEDY}") from error
+    found = (fields.get("format"), fields.get("version")) if isinstance(fields, dict) else fields
+    if found != (FORMAT, VERSION):
+        raise ModelError(
+            f"{path}: format and version are {found!r}, this program reads {(FORMAT, VERSION)!r}; {_REMEDY}"
+        )
+    try:
+        return ModelCard.model_validate(fields)
+    except ValidationError as error:
+        lines = "; ".join(
+            f"{'.'.join(str(p) for p in e['loc']) or 'card'}: {e['msg']}"
+            + ("" if isinstance(e["input"], dict) else f" (got {e['input']!r})")
+            for e in error.errors()
+        )
+        raise ModelError(f"{path}: its card does not fit: {lines}; {_REMEDY}") from error
+
+
+def _network(tensors: Tensors, card: ModelCard) -> Answering:
+    """The network with its normalization; the outputs of a displacement model come out scaled."""
+    layers = [(tensors[f"layer{i}.weight"], tensors[f"layer{i}.bias"]) for i in range(len(_widths(card)) - 1)]
+    mean, std = np.array(card.input_mean), np.array(card.input_std)
+    if card.family == "velocity":
+        return Network(layers, mean, std)
+    scale = np.array([*card.output_scale, 1.0, 1.0, 1.0])
+    offset = np.array([0.0, 0.0, 0.0, *np.log(card.variance_scale)])
+    if card.kind == "displacement":
+        return Network(layers, mean, std, scale, offset)
+    width = _widths(card)[0]
+    head = Network(layers, np.zeros(width), np.ones(width), scale, offset)
+    cell = Cell(*(tensors[f"gru.{name}"] for name in _CELL))
+    return RecurrentNetwork(cell, head, len(card.edges_s) - 1, mean, std)
+
+
+def _widths(card: ModelCard) -> list[int]:
+    """Of the layers, from input to output."""
+    if card.kind in ("naive", "lag"):
+        return []
+    if card.kind == "gru":
+        return [card.hidden[0] + card.n_inputs - 2 * (len(card.edges_s) - 1), *card.hidden[1:], card.n_outputs]
+    return [card.n_inputs, *card.hidden, card.n_outputs]
+
+
+def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
+    """Refuse weights that are not those of the card's network."""
+    expected: dict[str, tuple[int, ...]] = {}
+    stack = (card.members,) if card.members > 1 else ()
+    for i, (n_in, n_out) in enumerate(pairwise(_widths(card))):
+        expected[f"layer{i}.weight"] = (*stack, n_out, n_in)
+        expected[f"layer{i}.bias"] = (*stack, n_out)
+    if card.kind == "gru":
+        h = card.hidden[0]
+        expected |= {
+            f"gru.{name}": shape
+            for name, shape in zip(_CELL, ((3 * h, 2), (3 * h, h), (3 * h,), (3 * h,)), strict=True)
+        }
+    if set(tensors) != set(expected):
+        raise ModelError(f"{path}: holds the tensors {sorted(tensors)}, its card needs {sorted(expected)}; {_REMEDY}")
+    for name, shape in expected.items():
+        tensor = tensors[name]
+        if tensor.shape != shape:
+            raise ModelError(
+                f"{path}: {name} has shape {tensor.shape}, its card ({card.kind}, inputs {', '.join(card.inputs)}) "
+                f"needs {shape}; {_REMEDY}"
+            )
+        if tensor.dtype != np.float32:
+            raise ModelError(f"{path}: {name} is {tensor.dtype}, expected float32; {_REMEDY}")
+        if not np.isfinite(tensor).all():
+            raise ModelError(f"{path}: {name} holds NaN or infinite weights, expected finite ones; {_REMEDY}")
+
+
+def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+    """With their priors."""
+    return (
+        Parameter(
+            "learned.scale",
+            config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0,
+            Rank.MODEL,
+            ("length",),
+            lengthens=True,
+        ),
+    )
+
+
+def _found_rows(config: Config) -> tuple[FoundRow, ...]:
+    """Rows of ``metrics.json``."""
+    return (FoundRow("learned.scale", "learned.scale", 1.0, 1.0),)
+
+
+def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
+    """Lines of ``robot.yaml``."""
+    scale = config.motion.scale
+    now = scale * (1.0 + state.value("learned.scale"))
+    yield from state.setting("motion.scale", scale, now, {"learned.scale": scale})
+
+
+def _derivatives(motion: FloatArray) -> dict[str, FloatArray]:
+    """Derivative ``(3,)`` of a motion (right perturbation) by each parameter."""
+    rho_x, rho_y, _ = se2.log(motion)
+    return {"learned.scale": np.array([rho_x, rho_y, 0.0])}
+
+
+INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, {"motion.scale": "motion.scale_sigma"})
+
+
+class LearnedMotion:
+    """Turns the commands of a step into a `MotionMeasurement` of source "learned".
+
+    Between contiguous steps it carries the model's own velocity; a gap or a new segment forgets it, and the model
+    starts from the commands before the step.
+
+    Attributes:
+        rejections: steps without a measurement, by reason: ``learned.no_commands``, ``learned.stale_commands``,
+            ``learned.non_finite``, and ``learned.no_gyro``, ``learned.no_effort`` or ``learned.no_wheels`` where a
+            signal that the model reads has a gap.
+    """
+
+    def __init__(self, model: MotionModel, config: MotionConfig, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Take a loaded model.
+
+        Args:
+            model: the model.
+            config: whether it is used.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+        """
+        self.model = model
+        self.rejections: Counter[str] = Counter()
+        self._use = config.use
+        self._scale = config.scale
+        self._reader = SignalReader(model.card, imu_up)
+        self._velocity: FloatArray | None = None
+        self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
+
+    @property
+    def signals_back_ns(self) -> int:
+        """How far before a step the measured signals reach that the model reads; 0: it reads none."""
+        return self._reader.back_ns
+
+    def fork(
+        self, model: MotionModel | None, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]
+    ) -> LearnedMotion:
+        """A copy that may predict beyond the newest step without changing this one.
+
+        Args:
+            model: a copy of this one's, for use in another thread: a model writes into buffers of its own. None: to be
+                forked again with one.
+            events: of each class, those of the last `signals_back_ns` before the newest step's end.
+        """
+        forked = copy.copy(self)
+        if model is None:
+            del forked.model
+        else:
+            forked.model = model
+        forked._reader, forked.rejections = self._reader.fork(events), Counter()
+        return forked
+
+    def measure(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
+        """Predict the step.
+
+        Args:
+            step: its commands must reach ``model.card.history_s`` back for a start from nothing.
+            gyro_bias: to be taken out of the IMU's yaw rate [rad/s].
+
+        Returns:
+            None if the model is not used or cannot predict; the reason is counted in `rejections`.
+        """
+        if not self._use:
+            return None
+        if reason := self._unusable(step):
+            self._reject(reason)
+            return None
+        signals = self._reader.read(step, gyro_bias)
+        if isinstance(signals, str):
+            self._reject(f"learned.no_{signals}")
+            return None
+        velocity = self._velocity if self._reached == (step.segment, step.start_ns) else None
+        prediction = self.model.predict(step.controls, step.start_ns, step.stamp_ns, velocity, signals)
+        if prediction is None:
+            self._reject("learned.non_finite")
+            return None
+        self._velocity = prediction.velocity
+        self._reached = (step.segment, step.stamp_ns)
+        return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
+
+    def measure_scaled(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
+        """As `measure`, for this robot: distances are ``motion.scale`` times the model's."""
+        m, scale = self.measure(step, gyro_bias), self._scale
+        if m is None or scale == 1.0:
+            return m
+        return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a motion of this source by what it is off by."""
+        return _derivatives(motion)
+
+    def _unusable(self, step: Step) -> str:
+        for command in reversed(step.controls):
+            if command.stamp_ns <= step.stamp_ns:
+                stale = (step.stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
+                return "learned.stale_commands" if stale else ""
+        return "learned.no_commands"
+
+    def _reject(self, reason: str) -> None:
+        self.rejections[reason] += 1
+        self._velocity = self._reached = None
+
+
+def _build(config: Config, up: Callable[[], FloatArray] | None) -> MotionPredictor | None:
+    if not config.motion.use or config.motion.model is None:
+        return None
+
+    model = load_model(config.motion.model)
+    return LearnedMotion(model, config.motion, (0.0, 0.0, 1.0) if up is None else up())
+
+
+def _correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrelation | None:
+    joint: ErrorCorrelation | None = predictor.model.joint
+    return joint if config.motion.correlation == "joint" else None
+
+
+def _given(config: Config, model: Path) -> Config:
+    motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
+    return config.model_copy(update={"motion": motion})
+
+
+def _left_out(seconds: float) -> str:
+    return (
+        f"The motion model was left out for {seconds:.1f} s: sightings contradict it. It may be of another robot or "
+        "floor: train one of this robot (fgloc train), or set motion.use: false."
+    )
+
+
+ROLE = ModelRole(
+    installation=INSTALLATION,
+    build=_build,
+    correlation=_correlation,
+    given=_given,
+    without=lambda config: with_values(config, "motion", {"use": False}),
+    left_out=_left_out,
+    shipped_name=shipped_name,
+)
+
 
 LEARNED = BuiltIn(name="learned", title="learned motion", motion=ROLE)

@@ -2,30 +2,388 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from fgloc.sensors.base import BuiltIn, Stream
-from fgloc.sensors.markers import messages, validation
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
-from fgloc.sensors.markers.first_settings import FIRST_SETTINGS
-from fgloc.sensors.markers.role import ROLE
-from fgloc.sensors.topic_checks import RawChecks, SightingsChecks
-from fgloc.types import LandmarkSighting, PixelMeasurement
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from fgloc.errors import CameraError, ConfigError, RecordingError
+from fgloc.sensors.base import (
+    SENSOR,
+    BuiltIn,
+    EventInput,
+    FirstLook,
+    FirstSection,
+    FirstSettings,
+    RawLandmarksRole,
+    Stream,
+    When,
+    byte_array,
+    with_values,
+)
+from fgloc.sensors.cameras import marker_pose_candidates, marker_pose_cov, pinhole, undistort_points
+from fgloc.sensors.checks import FieldChecks, RawChecks, SightingsChecks
+from fgloc.sensors.failures import Change, EventFailure, Scene
+from fgloc.sensors.landmarks import planar_yaw
+from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners, decode
+from fgloc.types import (
+    Camera,
+    Event,
+    FloatArray,
+    Landmark,
+    LandmarkMap,
+    LandmarkSighting,
+    PixelMeasurement,
+    RawEvent,
+    SightingsEvent,
+)
 
 if TYPE_CHECKING:
-    from fgloc.config import Section
+    from fgloc.config import Config, Section
     from fgloc.sensors.landmarks import SightingContext
+    from fgloc.sensors.markers.detector import SensorDetector
+
+
+_OPENCV_ORDER = (1, 0, 3, 2)
+_OPENCV_SHIFT_PX = -0.5
+
+
+def from_image(m: Any, when: When) -> Event:
+    """From ``sensor_msgs/Image``."""
+    data = byte_array(m.data)
+    return ImageEvent(
+        *when, m.header.frame_id, m.encoding, False, m.width, m.height, m.step, bool(m.is_bigendian), data
+    )
+
+
+def from_compressed_image(m: Any, when: When) -> Event:
+    """From ``sensor_msgs/CompressedImage``."""
+    return ImageEvent(*when, m.header.frame_id, m.format, True, 0, 0, 0, False, byte_array(m.data))
+
+
+def from_apriltags(m: Any, when: When) -> Event:
+    """From ``apriltag_msgs/AprilTagDetectionArray``."""
+    sightings = []
+    for tag in m.detections:
+        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_OPENCV_ORDER)] + _OPENCV_SHIFT_PX
+        sightings.append(MarkerCorners(int(tag.id), corners))
+    return CornersEvent(*when, m.header.frame_id, tuple(sightings))
+
+
+_MAX_PIXEL = 1e5
+
+
+def image_validator(checks: FieldChecks) -> Callable[[ImageEvent], Event | str]:
+    """Validator of images."""
+
+    def validate(event: ImageEvent) -> Event | str:
+        size = len(event.data)
+        if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
+            return "empty"
+        return "truncated" if not event.compressed and size < event.height * event.step else event
+
+    return validate
+
+
+def corners_validator(checks: FieldChecks) -> Callable[[CornersEvent], Event | str]:
+    """Validator of corners."""
+
+    def judge(topic: str, sighting: MarkerCorners) -> MarkerCorners | str:
+        return judge_corners(sighting.corners_px, checks.config.min_marker_side_px) or sighting
+
+    return lambda event: checks.sift(event, judge)
+
+
+def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
+    """Reason why four corners ``(4, 2)`` are no marker, or "": finite, convex and not too small."""
+    if corners_px.shape != (4, 2):
+        return "corners_degenerate"
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners_px.tolist()
+    spread = abs(ax) + abs(ay) + abs(bx) + abs(by) + abs(cx) + abs(cy) + abs(dx) + abs(dy)
+    if not spread <= 8.0 * _MAX_PIXEL:  # also NaN
+        return "non_finite"
+    abx, aby, bcx, bcy, cdx, cdy, dax, day = bx - ax, by - ay, cx - bx, cy - by, dx - cx, dy - cy, ax - dx, ay - dy
+    side = (math.hypot(abx, aby) + math.hypot(bcx, bcy) + math.hypot(cdx, cdy) + math.hypot(dax, day)) / 4.0
+    turns = (abx * bcy - aby * bcx, bcx * cdy - bcy * cdx, cdx * day - cdy * dax, dax * aby - day * abx)
+    flat = 1e-3 * side * side
+    if not (min(turns) > flat or max(turns) < -flat):  # crossed, dented, or on a line
+        return "corners_degenerate"
+    return "corners_small" if side < min_side_px else ""
+
+
+class MarkersInput(EventInput):
+    """What a camera sees."""
+
+    def image(self, stamp_ns: int, image: NDArray[np.uint8] | bytes, frame_id: str = SENSOR) -> None:
+        """An image: grey ``(h, w)``, colour ``(h, w, 3)`` in OpenCV's order (blue first), or encoded (JPEG, PNG).
+
+        Raises:
+            RecordingError: an array of another shape or type.
+        """
+        when = self._when("image", stamp_ns)
+        if isinstance(image, bytes | bytearray | memoryview):
+            data = np.frombuffer(image, dtype=np.uint8)
+            kind = "png" if bytes(image[:4]) == b"\x89PNG" else "jpeg"
+            return self._deliver(ImageEvent(*when, frame_id, kind, True, 0, 0, 0, False, data))
+        shape = image.shape
+        if image.dtype != np.uint8 or len(shape) not in (2, 3) or shape[2:] not in ((), (3,)):
+            raise RecordingError(
+                f"image of shape {shape} and type {image.dtype}; expected uint8, (h, w) grey or (h, w, 3) blue first, "
+                "or the bytes of a JPEG or PNG"
+            )
+        encoding = "mono8" if len(shape) == 2 else "bgr8"
+        step = shape[1] * (1 if len(shape) == 2 else 3)
+        data = np.ascontiguousarray(image).reshape(-1).copy()  # the caller's buffer may be used again
+        self._deliver(ImageEvent(*when, frame_id, encoding, False, shape[1], shape[0], step, False, data))
+
+    def corners(self, stamp_ns: int, markers: Mapping[int, ArrayLike], frame_id: str = SENSOR) -> None:
+        """Markers that were found in an image: corners ``(4, 2)`` [px] by id, clockwise from its top left."""
+        found = tuple(MarkerCorners(int(i), np.asarray(c, dtype=float).reshape(4, 2)) for i, c in markers.items())
+        self._deliver(CornersEvent(*self._when("sightings", stamp_ns), frame_id, found))
+
+
+def _first_section(look: FirstLook) -> FirstSection:
+    """Dictionary and size, as far as the images show them."""
+    if "image" not in look.roles:
+        return FirstSection()
+    from fgloc.sensors.markers.detector import fitting_dictionary
+
+    lines, missing = ["markers:"], []
+    dictionary = fitting_dictionary(look.recording)
+    if dictionary is not None:
+        lines.append(f"  dictionary: {dictionary}  # what is seen in the images fits it")
+    else:
+        lines.append("  # dictionary: DICT_4X4_50")
+        missing.append("the dictionary of the markers: no marker was found in the images (markers.dictionary)")
+    if look.has_map:
+        lines.append("  # default_size_m:  # the map beside the bag has the sizes")
+    else:
+        lines.append("  # default_size_m: 0.16  # side of the black square; every distance follows from it")
+        missing.append(
+            "the size of the markers: measure the side of the black square and give it (markers.default_size_m)"
+        )
+    lines.append("  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes")
+    if "camera_info" not in look.roles:
+        lines += [
+            "",
+            "# The recording has no CameraInfo:",
+            "# camera: {file: camera.yaml}  # as camera_calibration writes it",
+        ]
+    return FirstSection(tuple(lines), tuple(missing))
+
+
+FIRST_SETTINGS = FirstSettings((), _first_section)
+
+
+class Darkness(EventFailure):
+    """Images get darker by the factor ``gain`` and noisy by ``noise`` gray levels (standard deviation, of 255)."""
+
+    pixels: ClassVar[bool] = True
+    kind: Literal["darkness"] = "darkness"
+    gain: float = Field(0.1, ge=0, le=1, description="brightness that is left, as a share")
+    noise: float = Field(2.0, ge=0, description="read noise [gray levels of 255]")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Images."""
+        return (ImageEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Darken, add noise, round."""
+
+        def darken(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+            noise = scene.rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.noise)
+            return np.clip(np.rint(image * np.float32(self.gain) + noise), 0, 255).astype(np.uint8)
+
+        return _on_pixels(darken)
+
+
+class MirroredImage(EventFailure):
+    """Images are flipped left to right, as by a wrong setting of the driver."""
+
+    pixels: ClassVar[bool] = True
+    kind: Literal["mirrored_image"] = "mirrored_image"
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Images."""
+        return (ImageEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Flip."""
+        return _on_pixels(lambda image: image[:, ::-1])
+
+
+class FrameRate(EventFailure):
+    """The camera gives at most ``max_hz`` messages a second; the others are dropped."""
+
+    kind: Literal["frame_rate"] = "frame_rate"
+    max_hz: float = Field(1.0, gt=0, description="Hz")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Everything that a camera reports."""
+        return (RawEvent, SightingsEvent)
+
+    def begin(self, scene: Scene) -> Change:
+        """Drop what follows the last one too soon (5 % of jitter is let through)."""
+        last_ns: dict[str, int] = {}
+        period_ns = 0.95e9 / self.max_hz
+
+        def change(event: Event) -> Event | None:
+            if event.received_ns - last_ns.get(event.topic, -(10**19)) < period_ns:
+                return None
+            last_ns[event.topic] = event.received_ns
+            return event
+
+        return change
+
+
+def _on_pixels(work: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Change:
+    """Decode, change, and pass on uncompressed; what cannot be decoded stays as it is."""
+
+    def change(event: Event) -> Event | None:
+        assert isinstance(event, ImageEvent)
+        try:
+            gray = work(decode(event))
+        except ImageError:
+            return event
+        height, width = gray.shape
+        pixels = np.ascontiguousarray(gray).reshape(-1)
+        return replace(event, encoding="mono8", compressed=False, width=width, height=height, step=width, data=pixels)
+
+    return change
+
+
+_CLEAR_RATIO = 2.0  # a marker's pose is unambiguous if the mirrored one explains its corners this much worse
+_MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
+
+
+class CornerMeasurer:
+    """Corners of markers; see `fgloc.sensors.landmarks.LandmarkSensor` for what it rejects."""
+
+    def __init__(self, context: SightingContext) -> None:
+        self._context = context
+        self._pinhole = None if context.camera is None else pinhole(context.camera)
+
+    def __call__(self, event: CornersEvent) -> Iterator[LandmarkSighting]:
+        """Those of one message."""
+        if self._context.camera is None or self._pinhole is None:
+            raise CameraError(
+                f"{event.topic}: marker corners, but no calibration; record sensor_msgs/CameraInfo or set camera.file"
+            )
+        usable = self._context.usable(event.sightings)
+        usable.sort(key=lambda s: -_area(s.corners_px))
+        most = self._context.config.markers.max_sightings
+        if len(usable) > most:
+            self._context.rejections["sightings.beyond_max"] += len(usable) - most
+        for seen in usable[:most]:
+            landmark = self._context.landmark(seen.landmark_id)
+            if landmark is None or landmark.size_m == 0.0:
+                measured = self._single_view(event, seen, self._context.camera, landmark)
+            else:
+                measured = self._corner(event, seen, self._context.camera, self._pinhole)
+            if measured is not None:
+                yield measured
+
+    def _corner(
+        self, event: CornersEvent, seen: MarkerCorners, camera: Camera, ideal: Camera
+    ) -> PixelMeasurement | None:
+        corners = undistort_points(camera, seen.corners_px)
+        if not np.isfinite(corners).all():
+            self._context.reject("undistortable")
+            return None
+        section = self._context.config.markers
+        return PixelMeasurement(
+            event.stamp_ns,
+            seen.landmark_id,
+            corners,
+            section.sigma_px,
+            ideal,
+            blur_s=section.blur_s,
+            cauchy_k=section.cauchy_k,
+        )
+
+    def _single_view(
+        self, event: CornersEvent, seen: MarkerCorners, camera: Camera, landmark: Landmark | None
+    ) -> LandmarkSighting | None:
+        """What one view of a marker with no known place gives, with the covariance that its corners give."""
+        size = self._context.config.markers.default_size_m
+        if size is None and landmark is None:
+            raise ConfigError(
+                f"{event.topic}: marker corners without a map need their size: set markers.default_size_m"
+            )
+        if size is None:
+            self._context.reject("no_size")
+            return None
+        sigma_px = self._context.config.markers.sigma_px
+        candidates = marker_pose_candidates(camera, seen.corners_px, size)
+        if not candidates:
+            self._context.reject("no_pose")
+            return None
+        T, rms = candidates[0]
+        cov = marker_pose_cov(camera, T, size, sigma_px)
+        R = camera.T_base_cam[:3, :3]
+        in_base = camera.T_base_cam @ T
+        cov_xy = (R @ cov[:3, :3] @ R.T)[:2, :2]
+        clear = len(candidates) == 1 or candidates[1][1] > _CLEAR_RATIO * max(rms, sigma_px)
+        floor = self._context.config.landmarks.yaw_sigma_rad
+        if floor is None or landmark is not None:
+            return self._context.polar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy)
+        # Of a marker that may be mirrored the yaw is worth little; without it, it would be another kind of variable.
+        yaw_var = max(floor if clear else _MIRRORED_SIGMA, math.sqrt((R @ cov[3:, 3:] @ R.T)[2, 2])) ** 2
+        yaw = planar_yaw(in_base[:3, :3], None)
+        return self._context.planar(event.stamp_ns, seen.landmark_id, in_base[:2, 3], cov_xy, yaw, yaw_var)
+
+
+def _area(corners: FloatArray) -> float:
+    """Of a quadrilateral ``(4, 2)``."""
+    (ax, ay), (bx, by) = corners[2] - corners[0], corners[3] - corners[1]
+    return 0.5 * abs(float(ax * by - ay * bx))
+
+
+def _detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetector:
+    from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
+
+    return configured_detector(config, landmark_map)
+
+
+def _given(config: Config, dictionary: str | None, size_m: float | None) -> Config:
+    now = config.markers
+    values = {"dictionary": dictionary or now.dictionary, "default_size_m": size_m or now.default_size_m}
+    return with_values(config, "markers", values)
+
+
+def _ids(dictionary: str) -> int:
+    from fgloc.sensors.markers.detector import load_dictionary
+
+    return len(load_dictionary(dictionary).bytesList)
+
+
+def _fitting_dictionary(recording: Any) -> str | None:
+    from fgloc.sensors.markers.detector import fitting_dictionary
+
+    return fitting_dictionary(recording)
+
+
+ROLE = RawLandmarksRole(
+    size=lambda config: config.markers.default_size_m,
+    dictionary=lambda config: config.markers.dictionary,
+    given=_given,
+    ids=_ids,
+    sigma_px=lambda config: config.markers.sigma_px,
+    detector=_detector,
+    fitting_dictionary=_fitting_dictionary,
+)
 
 
 def _failures() -> tuple[type[Section], ...]:
-    from fgloc.sensors.markers.failures import Darkness, FrameRate, MirroredImage
 
     return (Darkness, FrameRate, MirroredImage)
 
 
 def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSighting]]:
-    from fgloc.sensors.markers.measure import CornerMeasurer
 
     return CornerMeasurer(context)
 
@@ -37,18 +395,18 @@ MARKERS = BuiltIn(
         Stream(
             "image",
             ImageEvent,
-            {"sensor_msgs/msg/Image": messages.image, "sensor_msgs/msg/CompressedImage": messages.compressed_image},
+            {"sensor_msgs/msg/Image": from_image, "sensor_msgs/msg/CompressedImage": from_compressed_image},
             ("image_raw", "image_raw/compressed", "image", "image/compressed"),
-            validator=validation.images,
+            validator=image_validator,
             findings=RawChecks,
         ),
         Stream(
             "sightings",
             CornersEvent,
-            {"apriltag_msgs/msg/AprilTagDetectionArray": messages.apriltags},
+            {"apriltag_msgs/msg/AprilTagDetectionArray": from_apriltags},
             (),
             keyframe=True,
-            validator=validation.corners,
+            validator=corners_validator,
             findings=SightingsChecks,
         ),
     ),

@@ -1,13 +1,31 @@
-"""What robots report of their wheels."""
+"""What robots report of their wheels: events, their messages, and which of them can be used."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fgloc.frames import quaternion_yaw
-from fgloc.types import FloatArray, MotionEvent, OdometerPose
+from fgloc.config import Config
+from fgloc.frames import quaternion_yaw, yaw_quaternion
+from fgloc.sensors.base import BASE, EventInput, When, matrix, vector, xyz, xyzw
+from fgloc.sensors.checks import (
+    EMPTIED,
+    PLANAR,
+    Changes,
+    FieldChecks,
+    Table,
+    count,
+    finite_rows,
+    spikes,
+    times,
+    unit_length,
+)
+from fgloc.types import Event, FloatArray, MotionEvent, OdometerPose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,3 +66,221 @@ class JointsEvent(MotionEvent):
     def publisher(self) -> tuple[str, ...]:
         """Wheels and arm may share the topic: the joints tell them apart."""
         return self.names
+
+
+def from_odometry(m: Any, when: When) -> Event:
+    """From ``nav_msgs/Odometry``."""
+    return OdometryEvent(
+        *when,
+        m.header.frame_id,
+        m.child_frame_id,
+        xyz(m.pose.pose.position),
+        xyzw(m.pose.pose.orientation),
+        matrix(m.pose.covariance, 6),
+        xyz(m.twist.twist.linear),
+        xyz(m.twist.twist.angular),
+        matrix(m.twist.covariance, 6),
+    )
+
+
+def from_joints(m: Any, when: When) -> Event:
+    """From ``sensor_msgs/JointState``."""
+    return JointsEvent(*when, tuple(m.name), vector(m.position), vector(m.velocity), vector(m.effort))
+
+
+_MAX_ANGLE = 1e9  # rad, of a joint
+_NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
+_NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
+
+
+def odometry_validator(checks: FieldChecks) -> Callable[[OdometryEvent], Event | str]:
+    """Validator of odometry: pose and twist are judged apart."""
+    bounds = checks.config
+
+    def validate(event: OdometryEvent) -> Event | str:
+        config = bounds
+        changes: Changes = {}
+        vx, vy, vz = event.linear.tolist()
+        wx, wy, wz = event.angular.tolist()
+        if not math.isfinite(vx + vy + vz + wx + wy + wz):
+            twist = "non_finite"
+        elif max(abs(vx), abs(vy), abs(vz)) > config.max_speed:
+            twist = "speed_bound"
+        elif max(abs(wx), abs(wy), abs(wz)) > config.max_yaw_rate:
+            twist = "yaw_rate_bound"
+        else:
+            twist = checks.covariance(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
+        x, y, z = event.position.tolist()
+        if not math.isfinite(x + y + z):
+            pose = "non_finite"
+        elif max(abs(x), abs(y), abs(z)) > config.max_position:
+            pose = "position_bound"
+        else:
+            pose = checks.quaternion(event.orientation, "orientation", changes) or checks.covariance(
+                event.topic, "pose", event.pose_cov, PLANAR, "pose_cov", changes
+            )
+        if twist:
+            checks.rejections[f"odometry.twist_{twist}"] += 1
+            changes |= _NO_TWIST
+        if pose:
+            checks.rejections[f"odometry.pose_{pose}"] += 1
+            changes |= _NO_POSE
+        if twist and pose:
+            return EMPTIED
+        return replace(event, **changes) if changes else event
+
+    return validate
+
+
+def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str]:
+    """Validator of joint states: entries are judged one by one."""
+    bounds = checks.config
+
+    def validate(event: JointsEvent) -> Event | str:
+        n = len(event.names)
+        changes: Changes = {}
+        usable = 0  # angles and rates
+        for name, bound, wild in (
+            ("position", _MAX_ANGLE, "position_bound"),
+            ("velocity", bounds.max_wheel_rate, "wheel_rate_bound"),
+            ("effort", math.inf, ""),
+        ):
+            array: FloatArray = getattr(event, name)
+            values: list[float] = array.tolist()
+            if n == 0 or len(values) not in (0, n):
+                return "length"
+            good = [abs(value) <= bound and math.isfinite(value) for value in values]
+            if name != "effort":
+                usable += sum(good)
+            if all(good):
+                continue
+            if all(math.isnan(value) for value in values):  # a driver's way to say that it has none
+                checks.note(f"{event.topic}: every {name} is NaN in some messages; taken as not given")
+                changes[name] = np.empty(0)
+            else:
+                finite = all(math.isfinite(value) for value in values)
+                checks.rejections["joints." + (wild if finite else f"{name}_non_finite")] += 1
+                changes[name] = np.where(good, array, np.nan)
+        if not usable:
+            return "non_finite"
+        return replace(event, **changes) if changes else event
+
+    return validate
+
+
+_MOVED_M = 0.1  # a pose that moved further did move
+
+
+class OdometryChecks:
+    """Pose, twist and covariances against each other and against the gate's bounds."""
+
+    def __init__(self) -> None:
+        self._rows = Table(12)
+
+    def add(self, event: Event) -> None:
+        """Take in one event."""
+        assert isinstance(event, OdometryEvent)
+        self._rows.add(
+            *event.position[:2],
+            *event.orientation,
+            *event.linear[:2],
+            event.angular[2],
+            float(np.abs(event.pose_cov).max()),
+            float(np.abs(event.twist_cov).max()),
+            event.stamp_ns * 1e-9,
+        )
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """What is wrong."""
+        rows = self._rows.array()
+        found = []
+        finite = finite_rows(rows[:, :9])
+        if not finite.all():
+            found.append(f"{topic}: {count(~finite)} hold NaN or infinity and will be rejected.")
+        found += unit_length(topic, rows[finite, 2:6])
+        zero = [name for name, column in (("pose", 9), ("twist", 10)) if not rows[:, column].any()]
+        if zero:
+            found.append(f"{topic}: the covariance of {' and '.join(zero)} is all zero; the configured noise is used.")
+        if finite.sum() > 1:
+            found += self._motion(topic, rows[finite], seconds[finite], config)
+        return found
+
+    @staticmethod
+    def _motion(topic: str, rows: FloatArray, seconds: FloatArray, config: Config) -> list[str]:
+        x, y, qx, qy, qz, qw = rows[:, :6].T
+        speed, rate = np.hypot(rows[:, 6], rows[:, 7]), np.abs(rows[:, 8])
+        found = spikes(topic, "yaw rate", "rad/s", rate, config.gate.max_yaw_rate, seconds)
+        found += spikes(topic, "speed", "m/s", speed, config.gate.max_speed, seconds)
+        steps = np.hypot(np.diff(x), np.diff(y))
+        turns = np.abs(np.diff(np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))))
+        dt = np.maximum(np.diff(seconds), 0.0)
+        jumped = steps > config.gate.max_speed * dt + 0.5
+        if jumped.any():
+            at = int(np.argmax(np.where(jumped, steps, 0)))
+            found.append(
+                f"{topic}: the pose jumps {times(int(jumped.sum()))}, by up to {steps[at]:.3g} m "
+                f"at {seconds[at + 1]:.1f} s: reset, or another robot."
+            )
+        whole = ~jumped & (dt <= config.gate.gap_s)  # what happened in a gap only the pose can know
+        path, turned = float(steps[whole].sum()), float(turns[whole].sum())
+        if path > _MOVED_M and not speed.any() and not rate.any():
+            found.append(
+                f"{topic}: the twist is always zero while the pose moves {path:.1f} m; "
+                "motion is taken from the pose (wheels.source: pose)."
+            )
+            return found
+        sane = (rate[:-1] <= config.gate.max_yaw_rate) & whole
+        for name, unit, by_twist, by_pose, least in (
+            ("speed", "m", float((speed[:-1] * dt)[whole].sum()), path, 1.0),
+            ("yaw rate", "rad", float((rate[:-1] * dt)[sane].sum()), float(turns[sane].sum()), 1.0),
+        ):
+            if by_pose > least and not 0.7 < by_twist / by_pose < 1.4:
+                degrees = " (degrees for radians?)" if unit == "rad" and 40 < by_twist / by_pose < 75 else ""
+                found.append(
+                    f"{topic}: the twist's {name} adds up to {by_twist:.1f} {unit}, the pose's to {by_pose:.1f} {unit}"
+                    f"{degrees}."
+                )
+        if path <= _MOVED_M and turned <= _MOVED_M:
+            found.append(f"{topic}: the robot does not move ({path:.2f} m, {turned:.2f} rad).")
+        return found
+
+
+class WheelsInput(EventInput):
+    """What wheels report."""
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        pose: Sequence[float] | None = None,
+        twist: Sequence[float] | None = None,
+        frame_id: str = "odom",
+    ) -> None:
+        """Wheel odometry.
+
+        Args:
+            stamp_ns: when it was measured.
+            pose: x, y [m], yaw [rad] in the odometry's own frame; None: it has none.
+            twist: forward, left [m/s], yaw rate [rad/s] of the base; None: it has none.
+            frame_id: of the pose.
+        """
+        unknown = np.full(3, np.nan)
+        x, y, yaw = unknown if pose is None else np.asarray(pose, dtype=float)
+        vx, vy, w = unknown if twist is None else np.asarray(twist, dtype=float)
+        position = np.array([x, y, 0.0])
+        orientation = np.full(4, np.nan) if np.isnan(yaw) else yaw_quaternion(float(yaw))
+        linear, angular = np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w])
+        none = np.zeros((6, 6))
+        when = self._when("odometry", stamp_ns)
+        self._deliver(OdometryEvent(*when, frame_id, BASE, position, orientation, none, linear, angular, none))
+
+    def joints(
+        self,
+        stamp_ns: int,
+        names: Sequence[str],
+        position: ArrayLike = (),
+        velocity: ArrayLike = (),
+        effort: ArrayLike = (),
+    ) -> None:
+        """Joint states: angles [rad], rates [rad/s] and torques [Nm] by joint; what is not measured is left out."""
+        arrays = (np.asarray(a, dtype=float) for a in (position, velocity, effort))
+        self._deliver(JointsEvent(*self._when("joints", stamp_ns), tuple(names), *arrays))

@@ -1,4 +1,4 @@
-"""Failures of the wheels that change how far they seem to roll: slip, dead encoders, coarse ticks, wrong scale."""
+"""Failures of wheels, odometry and encoders, and what they measure while the robot is carried."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from fgloc import se2
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.sensors.failures import Failure, Scene
-from fgloc.sensors.wheels.config import WheelsConfig
+from fgloc.sensors.failures import Carriage, Change, EventFailure, Failure, Scene
+from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import Event, FloatArray
 
@@ -251,3 +251,218 @@ class _Encoders:
             fits = [i for i, n in enumerate(event.names) if (n == name if name else side in n.lower())]
             found += fits[:1]
         return found if len(found) == 2 else None
+
+
+class EncoderFrozen(Failure):
+    """Odometry and wheel angles go on with new stamps but repeat their last values; then they jump to the present.
+
+    Joint efforts, which motor drivers measure, go on as they are.
+    """
+
+    kind: Literal["encoder_frozen"] = "encoder_frozen"
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The corrupted events, in order of receive time."""
+        schedule = self.when.schedule(scene)
+        last: dict[str, Event] = {}
+        for event in events:
+            if not isinstance(event, (OdometryEvent, JointsEvent)):
+                yield event
+            elif schedule.hits(event) and event.topic in last:
+                self.touch(scene)
+                frozen = replace(last[event.topic], stamp_ns=event.stamp_ns, received_ns=event.received_ns)
+                if isinstance(frozen, JointsEvent) and isinstance(event, JointsEvent):
+                    frozen = replace(frozen, names=event.names, effort=event.effort)
+                yield frozen
+            else:
+                last[event.topic] = event
+                yield event
+
+
+class EncoderRollover(EventFailure):
+    """Joint angles are counted modulo ``range_rad``: they fall back to 0 when they reach it."""
+
+    kind: Literal["encoder_rollover"] = "encoder_rollover"
+    range_rad: float = Field(6.283185307179586, gt=0, description="rad")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Joint states."""
+        return (JointsEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Wrap the angles."""
+
+        def wrap(event: Event) -> Event:
+            assert isinstance(event, JointsEvent)
+            return replace(event, position=np.mod(event.position, self.range_rad))
+
+        return wrap
+
+
+class OdometryReset(Failure):
+    """At the start of each interval odometry and wheel angles begin again at zero; after it they jump back."""
+
+    kind: Literal["odometry_reset"] = "odometry_reset"
+
+    def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
+        """The corrupted events, in order of receive time."""
+        schedule = self.when.schedule(scene)
+        origins: dict[tuple[str, float], FloatArray] = {}
+        for event in events:
+            interval = schedule.inside(event)
+            if interval is None or not isinstance(event, OdometryEvent | JointsEvent) or not schedule.hits(event):
+                yield event
+                continue
+            self.touch(scene)
+            key = (event.topic, interval[0])
+            if isinstance(event, JointsEvent):
+                origin = origins.setdefault(key, event.position)
+                same = len(origin) == len(event.position)
+                yield replace(event, position=event.position - origin) if same else event
+                continue
+            pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+            x, y, yaw = se2.between(origins.setdefault(key, pose), pose)
+            yield replace(event, position=np.array([x, y, event.position[2]]), orientation=yaw_quaternion(float(yaw)))
+
+
+class WheelNan(EventFailure):
+    """Odometry's pose and twist, joints' angles and rates are not a number."""
+
+    kind: Literal["wheel_nan"] = "wheel_nan"
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Odometry and joints."""
+        return (OdometryEvent, JointsEvent)
+
+    def begin(self, scene: Scene) -> Change:
+        """Fill with NaN."""
+
+        def corrupt(event: Event) -> Event:
+            pose = ("position", "orientation", "linear", "angular")
+            names = pose if isinstance(event, OdometryEvent) else ("position", "velocity")
+            changes: dict[str, Any] = {name: np.full_like(getattr(event, name), np.nan) for name in names}
+            return replace(event, **changes)
+
+        return corrupt
+
+
+class WrongCovariance(EventFailure):
+    """Odometry's covariances are ``factor`` times what they were: 0 is unknown, a negative one invalid."""
+
+    kind: Literal["wrong_covariance"] = "wrong_covariance"
+    factor: float = Field(0.01, description="of variances")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """Odometry."""
+        return (OdometryEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Multiply."""
+
+        def scale(event: Event) -> Event:
+            assert isinstance(event, OdometryEvent)
+            return replace(event, pose_cov=event.pose_cov * self.factor, twist_cov=event.twist_cov * self.factor)
+
+        return scale
+
+
+def carried(carriage: Carriage) -> Callable[[Event], Event]:
+    """Wheels in the air stand or spin, and go on from there afterwards.
+
+    Raises:
+        ValueError: as `_rate`.
+    """
+    rate, held = _rate(carriage), dict[str, _Held]()
+
+    def tell(event: Event) -> Event:
+        assert isinstance(event, JointsEvent | OdometryEvent)
+        topic = held.setdefault(event.topic, _Held(rate, carriage.spin_m_s))
+        return topic.tell(event, carriage.interval(event) is not None)
+
+    return tell
+
+
+class JoinedWheels:
+    """One topic of wheel angles or odometry poses without a jump at the cuts."""
+
+    def __init__(self) -> None:
+        self._shift = 0
+        self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
+        self._last: FloatArray | None = None  # as reported
+
+    def join(self, event: Event, shift: int) -> Event:
+        """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
+        assert isinstance(event, JointsEvent | OdometryEvent)
+        angles = isinstance(event, JointsEvent)
+        now = event.position if isinstance(event, JointsEvent) else _pose(event)
+        carried, self._shift = shift != self._shift, shift
+        if carried and self._last is not None and len(self._last) == len(now):
+            self._offset = self._last - now if angles else se2.compose(self._last, se2.inverse(now))
+        if self._offset is not None and len(self._offset) == len(now):
+            now = now + self._offset if angles else se2.compose(self._offset, now)
+            event = _told(event, now)
+        self._last = now
+        return event
+
+
+def _pose(event: OdometryEvent) -> FloatArray:
+    return np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+
+
+def _told(event: JointsEvent | OdometryEvent, now: FloatArray) -> JointsEvent | OdometryEvent:
+    if isinstance(event, JointsEvent):
+        return replace(event, position=now)
+    position = np.array([now[0], now[1], event.position[2]])
+    return replace(event, position=position, orientation=yaw_quaternion(float(now[2])))
+
+
+def _rate(carriage: Carriage) -> float:
+    """Rate of the wheels [rad/s] at this speed of their rims [m/s].
+
+    Raises:
+        ValueError: the wheels spin and the configuration has no radius.
+    """
+    spin, wheels = carriage.spin_m_s, carriage.scene.config.wheels
+    radii = [r for r in (wheels.left_radius, wheels.right_radius) if r is not None]
+    if spin and not radii:
+        raise ValueError("lift with wheels that spin needs wheels.left_radius and wheels.right_radius")
+    return spin / float(np.mean(radii)) if radii else 0.0
+
+
+class _Held:
+    """One topic of wheel angles or odometry: in the air it goes on from its last value, and afterwards from there."""
+
+    def __init__(self, rate: float, speed: float) -> None:
+        self._rate, self._speed = rate, speed  # rad/s, m/s in the air
+        self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
+        self._last: FloatArray | None = None  # as reported
+        self._last_ns = 0
+
+    def tell(self, event: JointsEvent | OdometryEvent, lifted: bool) -> JointsEvent | OdometryEvent:
+        """The event as the wheels in the air, or on the floor again, would make it."""
+        angles = isinstance(event, JointsEvent)
+        now = event.position if isinstance(event, JointsEvent) else _pose(event)
+        dt = (event.stamp_ns - self._last_ns) * 1e-9
+        if lifted and self._last is not None and len(self._last) == len(now):
+            if angles:
+                self._offset = self._last + self._rate * dt - now
+            else:
+                told = se2.compose(self._last, (self._speed * dt, 0.0, 0.0))
+                self._offset = se2.compose(told, se2.inverse(now))
+        if self._offset is not None and len(self._offset) == len(now):
+            now = now + self._offset if angles else se2.compose(self._offset, now)
+            event = self._told(event, now, lifted)
+        self._last, self._last_ns = now, event.stamp_ns
+        return event
+
+    def _told(self, event: JointsEvent | OdometryEvent, now: FloatArray, lifted: bool) -> JointsEvent | OdometryEvent:
+        if isinstance(event, JointsEvent):
+            if not lifted:
+                return replace(event, position=now)
+            velocity = np.full_like(event.velocity, self._rate)
+            return replace(event, position=now, velocity=velocity, effort=np.zeros_like(event.effort))
+        position = np.array([now[0], now[1], event.position[2]])
+        event = replace(event, position=position, orientation=yaw_quaternion(float(now[2])))
+        if not lifted:
+            return event
+        return replace(event, linear=np.array([self._speed, 0.0, 0.0]), angular=np.zeros(3))

@@ -1,21 +1,173 @@
-"""Wheel motion over a step: by the wheels, or by what replaces them."""
+"""Wheel motion over a step, what the wheels are off by, and whether they stand."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Container
+import math
+from collections import Counter, deque
+from collections.abc import Collection, Container, Iterator
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.sensors.wheels import installation
-from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.sensors.wheels.encoders import TicksTrack
-from fgloc.sensors.wheels.odometry import OdometryTrack
-from fgloc.sensors.wheels.timeline import TwistTimeline
-from fgloc.sensors.wheels.tracks import CommandTrack, Track
-from fgloc.types import FloatArray, MotionMeasurement, Step
+from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, MotionRole, Parameter, Rank
+from fgloc.sensors.settings import WheelsConfig
+from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, TicksTrack, Track, TwistTimeline
+from fgloc.types import FloatArray, MotionMeasurement, Setting, Step
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+
+
+_COMMANDED_NS = 1_000_000_000  # how long before a step a command still moves the robot
+_QUANTIZATION = 1e-3  # m, rad: of encoders, in a second; less is no motion
+_WINDOW_S = 1.0  # in which encoders that jitter by a tick come back to where they were ...
+_JITTER = 2e-3  # ... to within a tick of each wheel [rad]
+_LEAST_S = 0.1  # a shorter step has as large a quantization
+
+
+def is_standing(motion: FloatArray, seconds: float) -> bool:
+    """Whether a motion ``(3,)`` that wheels measured over a step of this length is none."""
+    x, y, yaw = motion
+    return bool(max(math.hypot(x, y), abs(yaw)) < _QUANTIZATION * max(seconds, _LEAST_S))
+
+
+class Standing:
+    """Whether wheels have stood, step by step or, as encoders jitter between two ticks, over a second."""
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[float, FloatArray]] = deque()
+
+    def fork(self) -> Standing:
+        """A copy that may go on without changing this one."""
+        forked = Standing()
+        forked._steps.extend(self._steps)
+        return forked
+
+    def observe(self, motion: FloatArray | None, seconds: float) -> bool:
+        """Whether the wheels stand still, after the next step.
+
+        Args:
+            motion: ``(3,)`` of the wheels over the step; None: unknown, or they are commanded to move.
+            seconds: length of the step.
+        """
+        if motion is None:
+            self._steps.clear()
+            return False
+        self._steps.append((seconds, motion))
+        while sum(s for s, _ in self._steps) - self._steps[0][0] >= _WINDOW_S:
+            self._steps.popleft()
+        if is_standing(motion, seconds):
+            return True
+        x, y, yaw = np.sum([m for _, m in self._steps], axis=0)
+        whole = sum(s for s, _ in self._steps) >= _WINDOW_S
+        return bool(whole and math.hypot(x, y) < _QUANTIZATION and abs(yaw) < _JITTER)
+
+
+def commanded_to_move(step: Step) -> bool | None:
+    """Whether a command of the step, or of the second before it, is not to stand; None: there is none."""
+    since = step.start_ns - _COMMANDED_NS
+    recent = [c.v != 0.0 or c.omega != 0.0 for c in step.controls if c.stamp_ns >= since]
+    return any(recent) if recent else None
+
+
+_SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is divided by
+OF_CLOCK = ("wheels.time_offset_s", "wheels.delay_s")
+
+
+def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+    """With their priors. Without a gyro theirs is the clock that others are compared to."""
+    wheels = config.wheels
+    return (
+        Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn"), lengthens=True),
+        Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",), lengthens=True),
+        Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma, effects=("turn",)),
+        Parameter("wheels.slowdown", wheels.slowdown_sigma),
+        Parameter("wheels.delay_s", wheels.delay_sigma_s),
+        Parameter(
+            "wheels.time_offset_s",
+            wheels.time_offset_sigma_s if MotionRole.RATE in roles else 0.0,
+            Rank.CLOCK,
+            ("heading",),
+        ),
+    )
+
+
+def _found_rows(config: Config) -> tuple[FoundRow, ...]:
+    """Rows of ``metrics.json``."""
+    wheels = config.wheels
+    unequal = (
+        FoundRow("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -wheels.track)
+        if wheels.track is not None
+        else FoundRow("wheels.yaw_per_m", "wheels.yaw_per_m", wheels.yaw_per_m, 1.0)
+    )
+    return (
+        FoundRow("wheels.radius_scale", "wheels.radius", 1.0, 1.0),
+        FoundRow("wheels.track_scale", "wheels.track", 1.0, 1.0),
+        unequal,
+        FoundRow("wheels.slowdown", "wheels.slowdown", wheels.slowdown, 1.0),
+        FoundRow("wheels.delay_s", "wheels.delay_s", wheels.delay_s, 1.0),
+        FoundRow("wheels.time_offset_s", "wheels.time_offset_s", 0.0, 1.0),
+    )
+
+
+def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
+    """Lines of ``robot.yaml``."""
+    wheels = config.wheels
+    longer, turn = 1.0 + state.value("wheels.radius"), 1.0 - state.value("wheels.track")
+    pull = (turn * longer * wheels.yaw_per_m + state.value("wheels.yaw_per_m")) / longer
+    gain = {"wheels.radius": wheels.scale_v}
+    yield from state.setting("wheels.scale_v", wheels.scale_v, wheels.scale_v * longer, gain)
+    gain = {"wheels.track": wheels.scale_omega, "wheels.radius": wheels.scale_omega}
+    gain["wheels.track"] *= -1.0
+    yield from state.setting("wheels.scale_omega", wheels.scale_omega, wheels.scale_omega * longer * turn, gain)
+    yield from state.setting("wheels.yaw_per_m", wheels.yaw_per_m, pull, {"wheels.yaw_per_m": 1.0})
+    for name in ("slowdown", "delay_s"):
+        given = getattr(wheels, name)
+        now = max(0.0, given + state.value(f"wheels.{name}"))
+        yield from state.setting(f"wheels.{name}", given, now, {f"wheels.{name}": 1.0})
+
+
+def derivatives(m: MotionMeasurement, change: FloatArray | None, config: WheelsConfig) -> dict[str, FloatArray]:
+    """Derivative ``(3,)`` of a motion (right perturbation) by each parameter.
+
+    Args:
+        m: as it is reported.
+        change: ``(3,)`` of the twist over the step: by it a wrong clock shows; None: it is not needed.
+        config: as it was reported with.
+    """
+    rho_x, rho_y, phi = se2.log(m.motion)
+    by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
+    by = {
+        "wheels.radius": np.array([rho_x, rho_y, phi]),
+        "wheels.track": -phi * by_turn,
+        "wheels.yaw_per_m": rho_x * by_turn,
+        "wheels.slowdown": _by_slowdown(m, rho_x, phi, config),
+    }
+    return by if change is None else by | {"wheels.time_offset_s": change, "wheels.delay_s": -change}
+
+
+def _by_slowdown(m: MotionMeasurement, rho_x: float, phi: float, config: WheelsConfig) -> FloatArray:
+    """By ``slowdown``: it takes from the speed by the turning that is reported."""
+    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
+    commanded = abs(phi) / seconds / config.scale_omega
+    return np.array([-commanded * rho_x / max(1.0 - config.slowdown * commanded, _SLOWEST), 0.0, 0.0])
+
+
+INSTALLATION = MotionInstallation(
+    _parameters,
+    _found_rows,
+    _settings,
+    {
+        "wheels.scale_v": "wheels.scale_sigma",
+        "wheels.scale_omega": "wheels.turn_scale_sigma",
+        "wheels.yaw_per_m": "wheels.yaw_per_m_sigma",
+        "wheels.slowdown": "wheels.slowdown_sigma",
+        "wheels.delay_s": "wheels.delay_sigma_s",
+    },
+)
+
 
 _TRACKS: dict[str, type[Track]] = {
     "twist": OdometryTrack,
@@ -164,14 +316,14 @@ class WheelMotion:
             rates: weight of another source and its yaw rates ``(2,)`` [rad/s] at start and end of the step.
         """
         change = None
-        if any(name in wanted for name in installation.OF_CLOCK):
+        if any(name in wanted for name in OF_CLOCK):
             start, end = self.twist(step, step.start_ns), self.twist(step, step.stamp_ns)
             if rates is not None:
                 weight, (first, last) = rates
                 start[2] += weight * (first - start[2])
                 end[2] += weight * (last - end[2])
             change = end - se2.adjoint(se2.inverse(m.motion)) @ start
-        return installation.derivatives(m, change, self._config)
+        return derivatives(m, change, self._config)
 
     def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
         return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)

@@ -2,26 +2,483 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
 
-from fgloc.sensors.base import BuiltIn, Joined, RawMistake, Stream
-from fgloc.sensors.wheels import messages, validation
-from fgloc.sensors.wheels.channels import CHANNELS
-from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
-from fgloc.sensors.wheels.findings import OdometryChecks
-from fgloc.sensors.wheels.first_settings import FIRST_SETTINGS
-from fgloc.sensors.wheels.role import ROLE
-from fgloc.types import Event
+import numpy as np
+
+from fgloc.config import Config
+from fgloc.errors import ConfigError
+from fgloc.sensors.base import (
+    BuiltIn,
+    Channel,
+    FirstLook,
+    FirstSection,
+    FirstSettings,
+    Joined,
+    MotionRole,
+    Mounting,
+    OdometerErrors,
+    OdometerRole,
+    RawMistake,
+    SetupMistake,
+    Signal,
+    Stream,
+    WheelJoints,
+    of_stamps,
+    seconds,
+    with_values,
+)
+from fgloc.sensors.wheels import events as messages
+from fgloc.sensors.wheels import events as validation
+from fgloc.sensors.wheels.events import JointsEvent, OdometryChecks, OdometryEvent
+from fgloc.sensors.wheels.motion import INSTALLATION
+from fgloc.sensors.wheels.tracks import wheel_names
+from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, Section
+    from fgloc.config import Section
+    from fgloc.sensors.equipment import Odometer
     from fgloc.sensors.failures import Carriage
+    from fgloc.sensors.settings import WheelsConfig
+
+
+def _effort(events: Sequence[JointsEvent], origin_ns: int, mounting: Mounting) -> Signal | None:
+    """Torque [Nm] of both wheels together, and of the right less the left."""
+    if mounting.joints is None:
+        return None
+    stamps, (left, right) = _pairs(events, mounting.joints, "effort")
+    return of_stamps(stamps, np.array([right + left, right - left]), origin_ns)
+
+
+def _motion(events: Sequence[JointsEvent], origin_ns: int, mounting: Mounting) -> Signal | None:
+    """V [m/s] and ω [rad/s] by the angles or, where the joints report none, by the rates."""
+    joints = mounting.joints
+    if joints is None or joints.left_radius is None or joints.right_radius is None or joints.track is None:
+        return None
+    stamps, pair = _pairs(events, joints, "position")
+    of_angles = len(stamps) > 1
+    if not of_angles:
+        stamps, pair = _pairs(events, joints, "velocity")
+    left, right = joints.left_radius * pair[0], joints.right_radius * pair[1]
+    body = np.array([0.5 * (left + right), (right - left) / joints.track])
+    return Signal(seconds(stamps, origin_ns), body) if of_angles else of_stamps(stamps, body, origin_ns)
+
+
+def _pairs(events: Sequence[JointsEvent], joints: WheelJoints, what: str) -> tuple[list[int], FloatArray]:
+    """Stamps and values ``(2, n)`` of the left and the right wheel, where both are known."""
+    stamps: list[int] = []
+    values: list[FloatArray] = [np.empty((0, 2))]
+    for names, group in groupby(events, key=lambda event: event.names):
+        pair = wheel_names(names, joints.left, joints.right) or ("", "")
+        at = [names.index(name) for name in pair if name in names]
+        reported = [(event.stamp_ns, getattr(event, what)) for event in group]
+        reported = [(stamp, found) for stamp, found in reported if len(found) == len(names)]
+        if len(at) == 2 and reported:
+            stamps += [stamp for stamp, _ in reported]
+            values.append(np.array([found for _, found in reported])[:, at])
+    both = np.concatenate(values)
+    known = np.flatnonzero(np.isfinite(both).all(axis=1)).tolist()
+    return [stamps[k] for k in known], both[known].T
+
+
+CHANNELS = (
+    Channel("effort", 2, 1, JointsEvent, _effort, needs_joints=True),
+    Channel("wheels", 2, 2, JointsEvent, _motion, MotionRole.ODOMETER, needs_joints=True, needs_geometry=True),
+)
+
+
+_LEFT = re.compile(r"(?<![a-z])(left|l)(?![a-z])", re.IGNORECASE)
+_RIGHT = re.compile(r"(?<![a-z])(right|r)(?![a-z])", re.IGNORECASE)
+_FEWEST = 50  # messages of each, for a fit
+_FITS = 0.98  # share of the odometry's variance that the wheels must explain
+_CAUCHY, _ITERATIONS = 3.5, 5  # median absolute deviations beyond which a residual counts less: 95 % efficiency
+_LEAST_TURNING = 0.05  # rad/s: standard deviation of the yaw rate below which the track does not show
+NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
+_WINDOW_S = 0.3  # over which rates are means: stamps of single messages jitter
+_STEADY_S = 1.0  # after a command: by then the wheels turn as they are told
+_ALIKE = 0.05  # relative spread of the track that commands give at different times
+
+
+@dataclass(frozen=True, slots=True)
+class WheelPair:
+    """Two joints."""
+
+    left: str
+    right: str
+
+
+@dataclass(frozen=True, slots=True)
+class WheelGeometry:
+    """Nominal values [m], as the robot's driver has them.
+
+    Attributes:
+        radius_m: of both wheels.
+        track_m: between them.
+        by_commands: the track is that of the commands: the odometry's turn is not the wheels'.
+    """
+
+    radius_m: float
+    track_m: float
+    by_commands: bool = False
+
+
+def wheel_pair(names: Sequence[str]) -> WheelPair | None:
+    """The joints that are the left and right wheel by their names; None if that is not clear."""
+    words = {name: name.replace("_", " ").replace("-", " ") for name in names}
+    wheels = [name for name in names if "wheel" in name.lower()] or list(names)
+    left = [name for name in wheels if _LEFT.search(words[name]) and not _RIGHT.search(words[name])]
+    right = [name for name in wheels if _RIGHT.search(words[name]) and not _LEFT.search(words[name])]
+    return WheelPair(left[0], right[0]) if len(left) == len(right) == 1 else None
+
+
+def fit_geometry(
+    pair: WheelPair,
+    joints: Sequence[JointsEvent],
+    odometry: Sequence[OdometryEvent],
+    commands: Sequence[ControlEvent] = (),
+) -> WheelGeometry | None:
+    """Radius and track with which the wheels' angles give the driver's speeds; None if they do not explain them.
+
+    The odometry gives the radius, and the track unless its turn is another sensor's; then the commands give it.
+
+    Args:
+        pair: which joints.
+        joints: in the order of their stamps.
+        odometry: of the same drive, likewise.
+        commands: likewise.
+    """
+    angles = np.array([_angles(event, pair) for event in joints])
+    stamps = np.array([event.stamp_ns for event in joints], dtype=np.int64)
+    keep = np.flatnonzero(np.diff(stamps, prepend=-1) > 0)
+    if len(keep) < _FEWEST or len(odometry) < _FEWEST or not np.isfinite(angles[keep]).all():
+        return None
+    seconds, angles = (stamps[keep] - stamps[keep[0]]) * 1e-9, angles[keep]
+    at = np.array([(event.stamp_ns - stamps[keep[0]]) * 1e-9 for event in odometry])
+    twists = np.array([[event.linear[0], event.angular[2]] for event in odometry])
+    at, twists = at[known := np.isfinite(twists).all(axis=1)], twists[known]  # the gate refuses some
+    if len(at) < _FEWEST:
+        return None
+    order = np.argsort(at, kind="stable")
+    told = np.stack([np.interp(seconds, at[order], twists[order, k]) for k in range(2)], axis=1)
+    gone = np.cumsum(0.5 * (told[1:] + told[:-1]) * np.diff(seconds)[:, None], axis=0)
+    gone = np.concatenate([np.zeros((1, 2)), gone])
+    later = np.minimum(np.searchsorted(seconds, seconds + _WINDOW_S), len(seconds) - 1)
+    lasted = seconds[later] - seconds
+    heard = np.searchsorted(at[order], seconds[later], side="right") - np.searchsorted(at[order], seconds)
+    whole = (lasted > 0.5 * _WINDOW_S) & (lasted < 2.0 * _WINDOW_S) & (heard > 1)  # no silence in it
+    if whole.sum() < _FEWEST:
+        return None
+    rates, means = (((x[later] - x)[whole] / lasted[whole, None]) for x in (angles, gone))
+    difference, seconds = rates[:, 1] - rates[:, 0], seconds[whole]
+    radius = _slope(rates.mean(axis=1), means[:, 0])
+    per_difference = _slope(difference, means[:, 1]) if told[:, 1].std() > _LEAST_TURNING else None
+    by_commands = per_difference is None
+    if per_difference is None:
+        per_difference = _commanded(seconds + stamps[keep[0]] * 1e-9, difference, commands)
+    if radius is None or per_difference is None:
+        return None
+    return WheelGeometry(radius, radius / per_difference, by_commands)
+
+
+def _commanded(times: FloatArray, difference: FloatArray, commands: Sequence[ControlEvent]) -> float | None:
+    """Commanded yaw rate over the difference of the wheels' rates while a command holds; None: it is not constant."""
+    if len(commands) < 2:
+        return None
+    at = np.array([event.stamp_ns * 1e-9 for event in commands])
+    omega = np.array([event.omega for event in commands])
+    since = at[np.append(True, np.diff(omega) != 0.0)]
+    last = np.searchsorted(at, times, side="right") - 1
+    held = times - since[np.maximum(np.searchsorted(since, times, side="right") - 1, 0)]
+    turning = (last >= 0) & (held > _STEADY_S) & (times < at[np.maximum(last, 0)] + _STEADY_S)
+    turning &= (np.abs(omega[np.maximum(last, 0)]) > _LEAST_TURNING) & (difference != 0.0)
+    if turning.sum() < _FEWEST:
+        return None
+    ratios = omega[last[turning]] / difference[turning]
+    ratio = float(np.median(ratios))
+    return ratio if ratio > 0.0 and np.median(np.abs(ratios - ratio)) < _ALIKE * ratio else None
+
+
+def settings_of(events: Sequence[Event]) -> dict[str, Any] | None:
+    """Keys of the section `wheels` with which the angles of the wheels are used; None: they are not determined."""
+    joints = [event for event in events if isinstance(event, JointsEvent)]
+    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
+    pair = wheel_pair(names)
+    odometry = [event for event in events if isinstance(event, OdometryEvent)]
+    found = (
+        None
+        if pair is None
+        else fit_geometry(pair, joints, odometry, [e for e in events if isinstance(e, ControlEvent)])
+    )
+    if pair is None or found is None:
+        return None
+    radius = float(f"{found.radius_m:.4g}")
+    return {
+        "source": "ticks",
+        "left_joint": pair.left,
+        "right_joint": pair.right,
+        "left_radius": radius,
+        "right_radius": radius,
+        "track": float(f"{found.track_m:.4g}"),
+    }
+
+
+def _angles(event: JointsEvent, pair: WheelPair) -> tuple[float, float]:
+    def of(name: str) -> float:
+        i = event.names.index(name) if name in event.names else -1
+        return float(event.position[i]) if 0 <= i < len(event.position) else float("nan")
+
+    return of(pair.left), of(pair.right)
+
+
+def _slope(x: FloatArray, y: FloatArray) -> float | None:
+    """Robust regression without offset; None if it is not positive or leaves too much of the squares.
+
+    Messages that came late are outliers, and shorten the slope of least squares.
+    """
+    power = float(x @ x)
+    if power <= 0.0 or float(y @ y) <= 0.0:
+        return None
+    slope = float(x @ y) / power
+    left = float(((y - slope * x) ** 2).sum() / (y @ y))
+    for _ in range(_ITERATIONS):
+        residual = np.abs(y - slope * x)
+        moving = np.abs(x) > 0.1 * np.abs(x).max()
+        weights = 1.0 / (1.0 + (residual / (_CAUCHY * float(np.median(residual[moving])) + 1e-9)) ** 2)
+        slope = float((weights * x) @ y) / float((weights * x) @ x)
+    return slope if slope > 0.0 and left < 1.0 - _FITS else None
+
+
+def _first_section(look: FirstLook) -> FirstSection:
+    """Joints, radii and track, as far as the recording shows them."""
+    joints = [event for event in look.events[JointsEvent] if isinstance(event, JointsEvent)]
+    odometry = [event for event in look.events[OdometryEvent] if isinstance(event, OdometryEvent)]
+    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
+    if not names:
+        return FirstSection()
+    pair = wheel_pair(names)
+    commands = [event for event in look.events[ControlEvent] if isinstance(event, ControlEvent)]
+    geometry = None if pair is None or not odometry else fit_geometry(pair, joints, odometry, commands)
+    head = f"# Joints in the recording: {', '.join(names)}."
+    if pair is not None and geometry is not None:
+        return FirstSection((head, *_found(pair, geometry)))
+    if pair is None:
+        missing = (
+            f"which joints are the wheels: {', '.join(names)}; give wheels.left_joint and wheels.right_joint, their "
+            "radii and the track"
+        )
+    else:
+        missing = "radii and track of the wheels: measure them (wheels.left_radius, right_radius, track)"
+    return FirstSection((head, *_to_fill_in(pair)), (missing,))
+
+
+def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
+    track = "the track that with which it obeys commands" if geometry.by_commands else "likewise the track"
+    return (
+        f"# The radius is that with which the driver made its odometry, {track}; measure them all the same.",
+        "wheels:",
+        "  source: ticks",
+        f"  left_joint: {pair.left}",
+        f"  right_joint: {pair.right}",
+        f"  left_radius: {geometry.radius_m:.4g}  # m",
+        f"  right_radius: {geometry.radius_m:.4g}",
+        f"  track: {geometry.track_m:.4g}  # m, between the wheels' contact points",
+        "  # scale_sigma: 0.01  # how far the radii may be off; fgloc calibrate finds by how much they are",
+    )
+
+
+def _to_fill_in(pair: WheelPair | None) -> tuple[str, ...]:
+    return (
+        "# Fill in to use the angles of the wheels, which are better than the driver's odometry:",
+        "# wheels:",
+        "#   source: ticks",
+        f"#   left_joint: {pair.left if pair else ''}",
+        f"#   right_joint: {pair.right if pair else ''}",
+        "#   left_radius:   # m",
+        "#   right_radius:  # m",
+        "#   track:         # m, between the wheels' contact points",
+    )
+
+
+FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), _first_section)
+
+
+def correct(mistake: SetupMistake, config: Config) -> RawMistake:
+    """What to tell the user of a mistake, and to set."""
+    wheels = config.wheels
+    match mistake.kind:
+        case "track":
+            return _track(mistake, wheels)
+        case "radius":
+            return _radius(mistake, wheels)
+        case "odometry_frame":
+            c, s = mistake.turned[:2, 0]
+            sentence = (
+                f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
+                "set wheels.source: pose, or correct its child_frame_id."
+            )
+            return RawMistake(sentence, "wheels", {"source": "pose"})
+        case _:
+            return _sides(mistake, wheels)
+
+
+def _track(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
+    if mistake.source == "ticks" and wheels.track is not None:
+        new = {"track": wheels.track * mistake.factor}
+    else:
+        new = {"scale_omega": wheels.scale_omega / mistake.factor}
+    sentence = f"The wheels turn the robot {1.0 / mistake.factor:.3f} times as far as given: set {_lines(new)}."
+    return RawMistake(sentence, "wheels", new)
+
+
+def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
+    factor = mistake.factor
+    if mistake.source == "ticks" and wheels.left_radius is not None and wheels.right_radius is not None:
+        new = {"left_radius": wheels.left_radius * factor, "right_radius": wheels.right_radius * factor}
+        sentence = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
+    else:
+        new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
+        sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
+    return RawMistake(sentence, "wheels", new)
+
+
+def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
+    """Left and right exchanged, or forward and backward."""
+    if mistake.source == "ticks" and mistake.kind == "exchanged" and wheels.left_joint and wheels.right_joint:
+        sentence = (
+            "The left and the right wheel are exchanged: set wheels.left_joint: "
+            f"{wheels.right_joint} and wheels.right_joint: {wheels.left_joint}."
+        )
+        return RawMistake(sentence, "wheels", {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint})
+    how = {
+        "exchanged": "turn the robot the other way (left and right exchanged)",
+        "reversed": "turn backward when the robot goes forward",
+        "both_reversed": "turn backward when the robot goes forward, and left and right are exchanged",
+    }[mistake.kind]
+    line = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
+    return RawMistake(f"The wheels {how}: {line}.", "wheels", {})
+
+
+def _lines(values: Mapping[str, float]) -> str:
+    return " and ".join(f"wheels.{name}: {value:.4g}" for name, value in values.items())
+
+
+_JUMP = 8.0  # times a usual step of a wheel's angle, and ...
+_LEAST_JUMP_RAD = 0.5  # ... at least so much
+_ROLLS = 2  # jumps of one size that make it a roll-over; an encoder that restarts jumps by any amount
+_SAME_JUMP = 0.03  # share by which they may differ
+_WHOLE_TURN = 0.02  # share by which a range may be off one turn to be taken as one turn
+
+
+def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
+    """What the messages show to be wrong with the settings."""
+    rolled = roll_over(motion, config)
+    if rolled is None:
+        return ()
+    sentence = (
+        f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
+        f"set wheels.angle_range: {rolled[0]:.4f}."
+    )
+    return (RawMistake(sentence, "wheels", {"angle_range": rolled[0]}),)
+
+
+def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:
+    """After how much the wheels' angles roll over [rad], and how often they did; None: they do not.
+
+    Args:
+        motion: events in order of receipt, among them joint states.
+        config: of the wheels.
+    """
+    joints = [e for e in motion if isinstance(e, JointsEvent) and len(e.position) == len(e.names)]
+    if config.wheels.angle_range is not None or len(joints) < 10:
+        return None
+    try:
+        pair = wheel_names(joints[0].names, config.wheels.left_joint, config.wheels.right_joint)
+    except ConfigError:  # ambiguous: the run reports it
+        return None
+    if pair is None:
+        return None
+    jumps: list[float] = []
+    for name in pair:
+        angles = np.array([e.position[e.names.index(name)] for e in joints if name in e.names])
+        jumps += _jumps(angles[np.isfinite(angles)])
+    if len(jumps) < _ROLLS:
+        return None
+    size = float(np.median(jumps))
+    if float(np.mean(np.abs(np.array(jumps) - size) < _SAME_JUMP * size)) < 0.9:
+        return None
+    turn = 2.0 * math.pi
+    return (turn if abs(size - turn) < _WHOLE_TURN * turn else size), len(jumps)
+
+
+def _jumps(angles: FloatArray) -> list[float]:
+    """By how much [rad] each jump differs from the steps beside it."""
+    steps = np.diff(angles)
+    if len(steps) < 3:
+        return []
+    usual = max(_JUMP * float(np.median(np.abs(steps))), _LEAST_JUMP_RAD)
+    found = []
+    for k in np.flatnonzero(np.abs(steps) > usual).tolist():
+        beside = [steps[i] for i in (k - 1, k + 1) if 0 <= i < len(steps) and abs(steps[i]) <= usual]
+        if beside:
+            found.append(abs(float(steps[k] - np.mean(beside))))
+    return found
+
+
+_FREED = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # priors before anything was seen
+_FREED_COMMANDS = _FREED | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
+
+
+def _build(config: Config) -> Odometer:
+    from fgloc.sensors.wheels.motion import WheelMotion
+
+    return WheelMotion(config.wheels)
+
+
+def _errors(config: Config) -> OdometerErrors:
+    wheels = config.wheels
+    return OdometerErrors(
+        noise=wheels.noise,
+        scale_sigma=wheels.scale_sigma,
+        turn_scale_sigma=wheels.turn_scale_sigma,
+        yaw_per_m_sigma=wheels.yaw_per_m_sigma,
+        time_offset_sigma_s=wheels.time_offset_sigma_s,
+    )
+
+
+def _freed(config: Config) -> tuple[Config, ...]:
+    of_commands = with_values(config, "wheels", _FREED_COMMANDS)
+    return (of_commands,) if config.wheels.source == "command" else (with_values(config, "wheels", _FREED), of_commands)
+
+
+def _correct(mistake: SetupMistake, config: Config) -> RawMistake:
+
+    return correct(mistake, config)
+
+
+def _by_angles(events: Sequence[Event]) -> dict[str, Any] | None:
+
+    return settings_of(events)
+
+
+ROLE = OdometerRole(
+    installation=INSTALLATION,
+    build=_build,
+    errors=_errors,
+    freed=_freed,
+    distance_gain="wheels.scale_v",
+    correct=_correct,
+    by_angles=_by_angles,
+)
 
 
 def _failures() -> tuple[type[Section], ...]:
+    from fgloc.sensors.wheels import failures as contents
     from fgloc.sensors.wheels import failures as speeds
-    from fgloc.sensors.wheels import message_failures as contents
 
     return (
         speeds.WheelSlip,
@@ -37,19 +494,18 @@ def _failures() -> tuple[type[Section], ...]:
 
 
 def _carried(carriage: Carriage) -> Callable[[Event], Event]:
-    from fgloc.sensors.wheels.carried import carried
+    from fgloc.sensors.wheels.failures import carried
 
     return carried(carriage)
 
 
 def _mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
-    from fgloc.sensors.wheels.roll_over import mistakes
 
     return mistakes(motion, config)
 
 
 def _joined() -> Joined:
-    from fgloc.sensors.wheels.carried import JoinedWheels
+    from fgloc.sensors.wheels.failures import JoinedWheels
 
     return JoinedWheels()
 
@@ -61,17 +517,17 @@ WHEELS = BuiltIn(
         Stream(
             "odometry",
             OdometryEvent,
-            {"nav_msgs/msg/Odometry": messages.odometry},
+            {"nav_msgs/msg/Odometry": messages.from_odometry},
             ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
-            validator=validation.odometry,
+            validator=validation.odometry_validator,
             findings=OdometryChecks,
         ),
         Stream(
             "joints",
             JointsEvent,
-            {"sensor_msgs/msg/JointState": messages.joints},
+            {"sensor_msgs/msg/JointState": messages.from_joints},
             ("joint_states",),
-            validator=validation.joints,
+            validator=validation.joints_validator,
         ),
     ),
     motion=ROLE,

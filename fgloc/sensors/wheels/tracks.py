@@ -1,16 +1,199 @@
-"""From what robots report to a timeline of body twist: the common part, and commands that stand in for wheels."""
+"""Body twist as a function of time: from odometry, wheel angles or commands."""
 
 from __future__ import annotations
 
+import cmath
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from typing import Any
 
-from fgloc.sensors.wheels.config import WheelsConfig
-from fgloc.sensors.wheels.timeline import Twist, TwistTimeline
-from fgloc.types import ControlEvent, MotionEvent, Step
+import numpy as np
+
+from fgloc import se2
+from fgloc.errors import ConfigError
+from fgloc.frames import quaternion_yaw
+from fgloc.se2 import wrap
+from fgloc.sensors.settings import NoiseDensity, WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, FloatArray, MotionEvent, Step
+
+Twist = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s] in the body frame
+
+_KEEP_NS = 30_000_000_000  # late sightings reach back no further
+_TRIM_EVERY = 256
+_MAX_TURN = 1.0  # rad: longer arcs are cut, so that the quadrature of the noise stays exact to 1e-6
+_SHORT_TURN = 0.1  # rad: below it two nodes do
+_TWO_NODES = ((0.5 - 0.5 / math.sqrt(3.0), 0.5), (0.5 + 0.5 / math.sqrt(3.0), 0.5))  # Gauss-Legendre on [0, 1]
+_THREE_NODES = tuple((0.5 + 0.5 * s * math.sqrt(0.6), w / 18.0) for s, w in ((-1.0, 5.0), (0.0, 8.0), (1.0, 5.0)))
+_UNMEASURED_SPEED = 0.5  # m/s and rad/s that a robot without messages is taken to be capable of at least ...
+_SILENT_TAU_S = 2.0  # ... changing its mind after this time
+_STEADY_NS = 20_000_000  # a speed over less time may be a jitter of stamps
+_FLOOR = 1e-12  # keeps a covariance without any noise positive definite
+
+
+def _silent_spread(seconds: float) -> float:
+    """Variance of the displacement after this long at a random velocity of unit variance: ``seconds²`` at first."""
+    return 2.0 * _SILENT_TAU_S * (seconds + _SILENT_TAU_S * math.expm1(-seconds / _SILENT_TAU_S))
+
+
+class TwistTimeline:
+    """Piecewise constant body twist, contiguous from its first stamp on; pieces may be unknown.
+
+    After the last piece its ``tail`` holds for a while; then nothing is known.
+    """
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._pieces: list[Twist | None] = []  # None: unknown
+        self._end = 0
+        self._tail: Twist = (0.0, 0.0, 0.0)
+        self._tail_end = 0
+        self._fastest = _UNMEASURED_SPEED
+        self._fastest_turn = _UNMEASURED_SPEED
+
+    @property
+    def start_ns(self) -> int | None:
+        """When the timeline begins; None if it holds nothing."""
+        return self._starts[0] if self._starts else None
+
+    def begin(self, stamp_ns: int) -> None:
+        """Forget all and start here."""
+        self._starts.clear()
+        self._pieces.clear()
+        self._starts.append(stamp_ns)
+        self._pieces.append(None)
+        self._end = self._tail_end = stamp_ns
+
+    def extend(self, end_ns: int, twist: Twist | None) -> None:
+        """Add a piece from the last one's end to ``end_ns``; None: the twist is not known."""
+        if end_ns <= self._end:
+            return
+        if twist != self._pieces[-1]:
+            self._starts.append(self._end)
+            self._pieces.append(twist)
+        long = end_ns - self._end >= _STEADY_NS
+        self._end = self._tail_end = end_ns
+        if twist is not None and long:
+            self._fastest = max(self._fastest, math.hypot(twist[0], twist[1]))
+            self._fastest_turn = max(self._fastest_turn, abs(twist[2]))
+        if len(self._starts) % _TRIM_EVERY == 0:
+            old = bisect_right(self._starts, end_ns - _KEEP_NS) - 1
+            if old > 0:
+                del self._starts[:old]
+                del self._pieces[:old]
+
+    def hold(self, twist: Twist, end_ns: int) -> None:
+        """What is taken to hold beyond the last piece, until ``end_ns``."""
+        self._tail = twist
+        self._tail_end = max(end_ns, self._end)
+
+    def integrate(self, start_ns: int, end_ns: int, noise: NoiseDensity) -> tuple[FloatArray, FloatArray, float]:
+        """Motion between two times, ``start_ns <= end_ns``.
+
+        The covariance is that of a Wiener process along the exact path (xx along the body's x axis, yy across), so
+        that it does not depend on how the time is cut. Where the twist is unknown the robot is taken to stand, with the
+        spread of a velocity as large as the largest yet seen that changes within 2 s.
+
+        Returns:
+            ``T_start_end`` ``(3,)``, its right-perturbation covariance ``(3, 3)``, and the time without knowledge [s].
+        """
+        x = y = yaw = 0.0
+        p = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        unknown = 0.0
+        x2m, y2m, t2m = noise.x_per_sqrt_m**2, noise.y_per_sqrt_m**2, noise.yaw_per_sqrt_m**2
+        xy2r, t2r = noise.xy_per_sqrt_rad**2, noise.yaw_per_sqrt_rad**2
+        xy2s, t2s = noise.xy_per_sqrt_s**2, noise.yaw_per_sqrt_s**2
+        for from_ns, to_ns, twist, origin_ns in self._between(start_ns, end_ns):
+            seconds = (to_ns - from_ns) * 1e-9
+            if twist is None:
+                before, after = (from_ns - origin_ns) * 1e-9, (to_ns - origin_ns) * 1e-9
+                spread = _silent_spread(after) - _silent_spread(before)
+                xy = self._fastest**2 * spread + xy2s * seconds
+                p = (p[0] + xy, p[1], p[2], p[3] + xy, p[4], p[5] + self._fastest_turn**2 * spread + t2s * seconds)
+                unknown += seconds
+                continue
+            vx, vy, w = twist
+            speed, turn = math.hypot(vx, vy), abs(w)
+            qx = x2m * speed + xy2r * turn + xy2s
+            qy = y2m * speed + xy2r * turn + xy2s
+            qt = t2m * speed + t2r * turn + t2s
+            cuts = int(turn * seconds / _MAX_TURN) + 1
+            h = seconds / cuts
+            for _ in range(cuts):
+                along, left, p = _advance(p, twist, h, (qx, qy, qt))
+                c, s = math.cos(yaw), math.sin(yaw)
+                x += c * along - s * left
+                y += s * along + c * left
+                yaw += w * h
+        cov = np.array(
+            [[p[0] + _FLOOR, p[1], p[2]], [p[1], p[3] + _FLOOR, p[4]], [p[2], p[4], p[5] + _FLOOR]], dtype=float
+        )
+        return np.array([x, y, wrap(yaw)]), cov, unknown
+
+    def _between(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, int, Twist | None, int]]:
+        """Start, end, twist and, of unknown pieces, where the silence began."""
+        at = start_ns
+        k = bisect_right(self._starts, at) - 1
+        while at < end_ns:
+            if k < 0:  # before the first message
+                until = min(self._starts[0], end_ns) if self._starts else end_ns
+                yield at, until, None, start_ns
+            elif at < self._end:
+                until = min(self._starts[k + 1] if k + 1 < len(self._starts) else self._end, end_ns)
+                if until > at:
+                    yield at, until, self._pieces[k], self._starts[k]
+            elif at < self._tail_end:
+                until = min(self._tail_end, end_ns)
+                yield at, until, self._tail, 0
+            else:
+                until = end_ns
+                yield at, until, None, self._tail_end
+            at = until
+            k += 1
+
+
+def _advance(
+    p: tuple[float, ...], twist: Twist, h: float, density: tuple[float, float, float]
+) -> tuple[float, float, tuple[float, float, float, float, float, float]]:
+    """One arc: its displacement along and left, and the covariance (xx, xy, xt, yy, yt, tt) at its end.
+
+    Args:
+        p: covariance at its start.
+        twist: of the body.
+        h: how long it takes [s].
+        density: of the noise by x, y [m²/s] and yaw [rad²/s].
+
+    Source: Solà et al. 2018, SE(2): the integral of ``Ad(exp(-u ξ)) Q Ad(exp(-u ξ))ᵀ`` over u, by quadrature, after
+    ``Ad(exp(-h ξ)) P Ad(exp(-h ξ))ᵀ``.
+    """
+    vx, vy, w = twist
+    qx, qy, qt = density
+    p11, p12, p13, p22, p23, p33 = p
+    angle = w * h
+    c, s = math.cos(angle), math.sin(angle)
+    sx, cx = (s / w, (1.0 - c) / w) if abs(angle) > 1e-6 else (h, 0.5 * angle * h)
+    xi, yi = -sx * vx - cx * vy, cx * vx - sx * vy  # translation of the arc's inverse
+    b11, b12, b13 = c * p11 + s * p12 + yi * p13, c * p12 + s * p22 + yi * p23, c * p13 + s * p23 + yi * p33
+    b21, b22, b23 = c * p12 - s * p11 - xi * p13, c * p22 - s * p12 - xi * p23, c * p23 - s * p13 - xi * p33
+    p11, p12, p22 = c * b11 + s * b12 + yi * b13, c * b12 - s * b11 - xi * b13, c * b22 - s * b21 - xi * b23
+    p13, p23 = b13, b23
+    along, left = sx * vx - cx * vy, cx * vx + sx * vy
+    for node, weight in _TWO_NODES if abs(angle) < _SHORT_TURN else _THREE_NODES:
+        k, u = weight * h, node * h
+        angle = w * u
+        c, s = math.cos(angle), math.sin(angle)
+        sx, cx = (s / w, (1.0 - c) / w) if abs(angle) > 1e-6 else (u, 0.5 * angle * u)
+        xi, yi = -sx * vx - cx * vy, cx * vx - sx * vy
+        p11 += k * (c * c * qx + s * s * qy + yi * yi * qt)
+        p12 += k * (c * s * (qy - qx) - xi * yi * qt)
+        p22 += k * (s * s * qx + c * c * qy + xi * xi * qt)
+        p13 += k * yi * qt
+        p23 -= k * xi * qt
+    return along, left, (p11, p12, p13, p22, p23, p33 + qt * h)
+
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
 MAX_GAP_S = 5.0  # over a longer gap no difference is used: the robot may have been restarted
@@ -109,3 +292,302 @@ def mean_twist(a: Twist | None, b: Twist | None) -> Twist | None:
     if a is None or b is None:
         return a or b
     return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])
+
+
+Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
+
+_CHECK_TURN, _CHECK_PATH = 0.5, 5.0  # rad or m of motion after which twist and pose are compared
+_CHECK_HEADING = 0.5  # m of motion after which the pose's heading is held against the direction of its motion
+_HEADING_RAD = 0.03  # of a pose's heading off its motion's direction: no offset of two clocks or axles makes more
+_STILL = 0.01  # a path shorter than this share of the other did not move (degrees for radians: 0.017)
+_BRIDGED_M, _BRIDGED_RAD = 0.5, 0.5  # over a long gap a motion of less is told by its ends
+_BEGINS_M = 0.5  # from its origin: there an odometry is that was started just now
+_SLACK_M, _SLACK_RAD = 0.03, 0.1
+_DEGREES = (40.0, 80.0)  # a reported rotation this many times the pose's was given in degrees
+
+
+class OdometryTrack(Track):
+    """Between two messages, the mean of their twists or the exact motion between their poses.
+
+    Either stands in where the other cannot be used (the gate marks that with NaN). With source "auto" pose differences
+    are used, which the driver has summed up from every reading of its encoders, whatever the rate and the stamps of its
+    messages; twists instead if the pose does not move, or if its heading is not that of its motion by the twists (a
+    heading from elsewhere, or set by hand). A pose that jumps (odometry set to zero) is re-based: only differences
+    count.
+    """
+
+    kind = "odometry"
+    events = OdometryEvent
+
+    def __init__(self, config: WheelsConfig) -> None:
+        """Start with nothing received."""
+        super().__init__(config)
+        self._mode: str = config.source if config.source in ("twist", "pose") else "auto"
+        self._compared = self._mode == "pose"
+        self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
+        self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
+
+    def _forget(self) -> None:
+        self._pose: Pose | None = None
+        self._twist: Twist | None = None
+        self._moving: Twist | None = None  # the last piece of the timeline
+
+    def _take(self, event: OdometryEvent) -> None:
+        vx, vy, _ = event.linear.tolist()
+        w = float(event.angular[2])
+        x, y, _ = event.position.tolist()
+        twist = None if math.isnan(vx + vy + w) else (vx, vy, w)
+        pose = None if math.isnan(x + y) else (x, y, quaternion_yaw(event.orientation))
+        if twist is None and pose is None:
+            return
+        piece = None
+        if self._last_ns is not None:
+            piece = self._connect((event.stamp_ns - self._last_ns) * 1e-9, pose, twist)
+        self._extend(event.stamp_ns, piece, self._twist or self._moving)
+        self._pose, self._twist, self._moving = pose, twist, piece or self._moving
+        self._reach(event.stamp_ns, (self._mode == "twist" and twist) or self._moving or twist)
+
+    def _connect(self, seconds: float, pose: Pose | None, twist: Twist | None) -> Twist | None:
+        """The twist between the last message and this one; None if neither twists nor poses tell."""
+        both = self._twist is not None and twist is not None
+        mean = mean_twist(self._twist, twist) if seconds <= self._config.hold_s else None
+        moved = self._between_poses(pose, mean, seconds)
+        if both and mean is not None and moved is not None and not self._compared:
+            self._compare(moved, mean, seconds)
+        if moved is None or mean is None:
+            return moved or mean
+        if self._mode == "pose":
+            return moved
+        if self._mode == "twist":
+            return mean if both else moved
+        return moved if any(moved) else mean
+
+    def _bridges(self, pose: Pose) -> bool:
+        """Whether the pose tells the motion over a long gap: it is used, it moves little, and it was not begun anew.
+
+        Where it moved far only the end is known, and what is seen meanwhile would contradict a way made up between.
+        """
+        before = self._pose or pose
+        stands = pose == before and self._twist is not None and any(self._twist)
+        restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
+        dx, dy, dyaw = _difference(before, pose)
+        little = math.hypot(dx, dy) < _BRIDGED_M and abs(dyaw) < _BRIDGED_RAD
+        return self._mode != "twist" and little and not stands and not restarted
+
+    def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
+        """The constant twist from the last pose to this one; None if that cannot be known."""
+        if pose is None or self._pose is None:
+            return None
+        if seconds > MAX_GAP_S and not self._bridges(pose):
+            return None
+        dx, dy, dyaw = _difference(self._pose, pose)
+        # Less than the slack is no jump, however short the time: stamps of receipt come in bursts.
+        speed = max(math.hypot(dx, dy) - _SLACK_M, 0.0) / seconds
+        turn = max(abs(dyaw) - _SLACK_RAD, 0.0) / seconds
+        # Judged by the twist or, without one, by the motion just before.
+        slack = 1.0
+        reference = mean if mean is not None and any(mean) else None
+        if reference is None:
+            reference, slack = self._moving or (MAX_SPEED, 0.0, MAX_TURN), 1.0 + 10.0 * seconds
+        may = min(slack + 1.5 * math.hypot(reference[0], reference[1]), MAX_SPEED)
+        may_turn = min(3.0 * slack + 1.5 * abs(reference[2]), MAX_TURN)
+        if speed > may or turn > may_turn:
+            self.rejections["wheels.pose_reset"] += 1
+            self.notes["reset"] = (
+                f"the odometry's pose jumped {self.rejections['wheels.pose_reset']} time(s), the last by "
+                f"{math.hypot(dx, dy):.3g} m and {dyaw:.3g} rad: taken as a reset, motion goes on from the new value"
+            )
+            return None
+        return dx / seconds, dy / seconds, dyaw / seconds
+
+    def _compare(self, moved: Twist, mean: Twist, seconds: float) -> None:
+        """Cross-check twist and pose once enough was driven, and settle which is used.
+
+        Raises:
+            ConfigError: the configuration insists on a twist that is in degrees per second.
+        """
+        for k, value in enumerate((math.hypot(*moved[:2]), moved[2], math.hypot(*mean[:2]), mean[2])):
+            self._paths[k] += abs(value) * seconds
+        self._along += complex(*moved[:2]) * complex(*mean[:2]).conjugate() * seconds**2
+        pose_path, pose_turn, twist_path, twist_turn = self._paths
+        pose_still = pose_path <= _STILL * twist_path and pose_turn <= _STILL * twist_turn
+        twist_still = twist_path <= _STILL * pose_path and twist_turn <= _STILL * pose_turn
+        moved_enough = pose_turn > _CHECK_TURN or pose_path > _CHECK_PATH
+        if not moved_enough and not (pose_still and (twist_turn > _CHECK_TURN or twist_path > _CHECK_PATH)):
+            return
+        self._compared = pose_still or pose_path > _CHECK_HEADING
+        insists = self._config.source == "twist"
+        ratio, heading = twist_turn / max(pose_turn, 1e-9), cmath.phase(self._along)
+        mode = "pose"
+        if pose_still:
+            mode, text = "twist", "the odometry's pose does not move: its twist is used"
+        elif twist_still:
+            text = "the odometry's twist is zero while its pose moves: "
+            text += "set wheels.source to pose" if insists else "pose differences are used"
+        elif pose_turn > _CHECK_TURN and _DEGREES[0] < ratio < _DEGREES[1]:
+            text = f"the odometry's yaw rate is {ratio:.1f} times the rotation of its pose: degrees, not radians"
+            if insists:
+                raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
+            text += ": pose differences are used"
+        elif abs(heading) > _HEADING_RAD:
+            mode, text = (
+                "twist",
+                (
+                    f"the odometry's twist is used: the heading of its pose is {math.degrees(-heading):+.1f}° off the "
+                    "direction in which the pose moves"
+                ),
+            )
+        elif _differ(twist_path, pose_path) or _differ(twist_turn, pose_turn):
+            text = (
+                f"differences of the odometry's pose are used; its twist disagrees: {twist_path:.2f} m and "
+                f"{twist_turn:.2f} rad against {pose_path:.2f} m and {pose_turn:.2f} rad; see wheels.source"
+            )
+        else:
+            text = "differences of the odometry's pose are used; its twist agrees"
+        self._mode = "twist" if insists else mode
+        self.notes["source"] = text
+
+
+def _difference(a: Pose, b: Pose) -> Twist:
+    """``log(a⁻¹ b)``, as `fgloc.se2` has it, without arrays: it runs for every message."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    x, y, turn = c * (b[0] - a[0]) + s * (b[1] - a[1]), c * (b[1] - a[1]) - s * (b[0] - a[0]), se2.wrap(b[2] - a[2])
+    half = 0.5 * turn
+    k = 1.0 - half * half / 3.0 if abs(turn) < 1e-5 else half / math.tan(half)
+    return k * x + half * y, k * y - half * x, turn
+
+
+def _differ(a: float, b: float) -> bool:
+    """Whether two lengths that should be equal differ by more than a third."""
+    return max(a, b) > _CHECK_TURN and not 0.75 * b < a < 1.34 * b
+
+
+_PATIENCE = 20  # messages without the wheels' joints before a note is made
+
+
+class TicksTrack(Track):
+    """Differences of wheel angles or, in messages without angles, wheel rates.
+
+    Both wheels come in one message. Angles that roll over after ``angle_range`` are unwrapped both ways; an encoder
+    that jumps otherwise (set to zero) is re-based.
+    """
+
+    kind = "ticks"
+    events = JointsEvent
+
+    def __init__(self, config: WheelsConfig) -> None:
+        """Start with nothing received.
+
+        Raises:
+            ConfigError: the wheels' geometry is incomplete.
+        """
+        super().__init__(config)
+        if config.left_radius is None or config.right_radius is None or config.track is None:
+            raise ConfigError(
+                f"wheels.source is {config.source}, but wheel angles need the geometry; set wheels.left_radius, "
+                "wheels.right_radius and wheels.track"
+            )
+        self._left_radius, self._right_radius, self._width = config.left_radius, config.right_radius, config.track
+        self._wheels: tuple[str, str] | None = None
+        self._without = 0  # messages without the wheels
+
+    def _forget(self) -> None:
+        self._angles: tuple[float, float] | None = None
+        self._reported: Twist | None = None
+        self._moving: Twist | None = None  # the newest twist that is known
+
+    def _take(self, event: JointsEvent) -> None:
+        found = self._find(event.names)
+        if found is None:
+            return
+        angles, rates = _pair(event.position, *found), _pair(event.velocity, *found)
+        if angles is None and rates is None:
+            return
+        reported = None if rates is None else self._twist(*rates)
+        piece = None
+        if self._last_ns is not None:
+            seconds = (event.stamp_ns - self._last_ns) * 1e-9
+            piece = self._turned(angles, seconds)
+            if piece is None and reported is not None and seconds <= self._config.hold_s:
+                piece = mean_twist(self._reported, reported)
+        self._extend(event.stamp_ns, piece, self._moving)
+        self._angles, self._reported, self._moving = angles, reported, reported or piece or self._moving
+        self._reach(event.stamp_ns, self._moving)
+
+    def _turned(self, angles: tuple[float, float] | None, seconds: float) -> Twist | None:
+        """The twist that turned the wheels from the last message's angles to these; None if they cannot tell."""
+        if angles is None or self._angles is None or seconds > MAX_GAP_S:
+            return None
+        left, right = angles[0] - self._angles[0], angles[1] - self._angles[1]
+        roll = self._config.angle_range
+        if roll is not None:
+            if seconds > self._config.hold_s:  # nobody knows how often it rolled over
+                return None
+            left, right = math.remainder(left, roll), math.remainder(right, roll)
+        twist = self._twist(left / seconds, right / seconds)
+        if abs(twist[0]) > MAX_SPEED or abs(twist[2]) > MAX_TURN:
+            self.rejections["wheels.encoder_reset"] += 1
+            hint = "; if the angle rolls over, set wheels.angle_range" if roll is None else ""
+            self.notes["reset"] = (
+                f"wheel angles jumped {self.rejections['wheels.encoder_reset']} time(s), the last by {left:.3g} and "
+                f"{right:.3g} rad in {seconds:.3g} s: taken as a reset{hint}"
+            )
+            return None
+        return twist
+
+    def _twist(self, left: float, right: float) -> Twist:
+        """Body twist of wheel rates [rad/s]."""
+        left, right = self._left_radius * left, self._right_radius * right
+        return 0.5 * (left + right), 0.0, (right - left) / self._width
+
+    def _find(self, names: Sequence[str]) -> tuple[int, int] | None:
+        """Indices of the left and the right wheel; None if this message has not both."""
+        if self._wheels is None:
+            self._wheels = wheel_names(names, self._config.left_joint, self._config.right_joint)
+        if self._wheels is not None and self._wheels[0] in names and self._wheels[1] in names:
+            return names.index(self._wheels[0]), names.index(self._wheels[1])
+        self._without += 1
+        if self._without == _PATIENCE and self._last_ns is None:
+            text = (
+                f"{_PATIENCE} messages of joint states, and none holds both wheels{self._configured(names)}; the last "
+                f"holds {', '.join(names)}: set wheels.left_joint and wheels.right_joint"
+            )
+            if self._config.source == "ticks":
+                raise ConfigError(text)
+            self.notes["joints"] = text
+        return None
+
+    def _configured(self, names: Sequence[str]) -> str:
+        """The configured joints that are not among the names, with the name that is most like each."""
+        wanted = {"left_joint": self._config.left_joint, "right_joint": self._config.right_joint}
+        missing = []
+        for key, joint in wanted.items():
+            if joint is not None and joint not in names:
+                near = get_close_matches(joint, names, n=1)
+                missing.append(f"wheels.{key}: {joint}" + (f", did you mean '{near[0]}'?" if near else ""))
+        return f" ({'; '.join(missing)})" if missing else ""
+
+
+def wheel_names(names: Sequence[str], left: str | None, right: str | None) -> tuple[str, str] | None:
+    """Joints of the left and the right wheel, as configured or guessed; None if there are none among the names.
+
+    Raises:
+        ConfigError: several could be meant.
+    """
+    pair: list[str] = []
+    for side, given in (("left", left), ("right", right)):
+        found = [given] if given else [name for name in names if side in name.lower() and "wheel" in name.lower()]
+        if len(found) > 1:
+            raise ConfigError(
+                f"{len(found)} joints could be the {side} wheel ({', '.join(found)}); set wheels.{side}_joint"
+            )
+        pair += found
+    return (pair[0], pair[1]) if len(pair) == 2 else None
+
+
+def _pair(values: FloatArray, left: int, right: int) -> tuple[float, float] | None:
+    """Two finite entries of an array that may be empty."""
+    if len(values) <= max(left, right):
+        return None
+    pair = float(values[left]), float(values[right])
+    return pair if math.isfinite(pair[0] + pair[1]) else None

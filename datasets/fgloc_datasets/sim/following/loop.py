@@ -22,7 +22,7 @@ from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.decode import events_of
-from fgloc.sensors.markers.events import CornersEvent, ImageEvent
+from fgloc.sensors.markers.images import CornersEvent, ImageEvent
 from fgloc.types import Event, FloatArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message

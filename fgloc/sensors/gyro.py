@@ -1,0 +1,563 @@
+"""An inertial unit: yaw rate as a motion source, roll and pitch on uneven ground."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.frames import rotation_of, rpy_matrix
+from fgloc.sensors.base import (
+    BASE,
+    AttitudeNames,
+    BuiltIn,
+    Channel,
+    EventInput,
+    FoundRow,
+    InstallationState,
+    MotionInstallation,
+    MotionRole,
+    Mounting,
+    Parameter,
+    RateErrors,
+    RateRole,
+    Signal,
+    Stream,
+    Turn,
+    When,
+    matrix,
+    of_stamps,
+    xyz,
+)
+from fgloc.sensors.checks import Changes, FieldChecks, Table, count, finite_rows, spikes
+from fgloc.sensors.failures import Carriage, Change, EventFailure, Scene
+from fgloc.sensors.settings import GyroConfig
+from fgloc.sensors.wheels.motion import Standing
+from fgloc.stats import GATE, chi2_bound
+from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setting, Step
+
+if TYPE_CHECKING:
+    from fgloc.config import Section
+    from fgloc.sensors.equipment import AttitudeSensor, RateSensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuEvent(InertialEvent):
+    """``sensor_msgs/Imu``."""
+
+    angular_velocity_cov: FloatArray  # (3, 3)
+
+
+def from_imu(m: Any, when: When) -> Event:
+    """From ``sensor_msgs/Imu``."""
+    return ImuEvent(
+        *when,
+        m.header.frame_id,
+        xyz(m.angular_velocity),
+        xyz(m.linear_acceleration),
+        matrix(m.angular_velocity_covariance, 3),
+    )
+
+
+_MAX_ACCELERATION = 1e3  # m/s²
+
+
+def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
+    """Validator of IMU messages."""
+    bounds = checks.config
+
+    def validate(event: ImuEvent) -> Event | str:
+        changes: Changes = {}
+        cov = event.angular_velocity_cov
+        if cov[0, 0] == -1.0:  # REP 145
+            checks.note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")
+            return "unavailable"
+        wx, wy, wz = event.angular_velocity.tolist()
+        if not math.isfinite(wx + wy + wz):
+            return "non_finite"
+        if max(abs(wx), abs(wy), abs(wz)) > bounds.max_yaw_rate:
+            return "yaw_rate_bound"
+        if reason := checks.covariance(
+            event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes
+        ):
+            return reason
+        ax, ay, az = event.linear_acceleration.tolist()
+        if not abs(ax) + abs(ay) + abs(az) <= _MAX_ACCELERATION:  # also NaN
+            checks.rejections["imu.acceleration"] += 1
+            changes["linear_acceleration"] = np.full(3, np.nan)
+        return replace(event, **changes) if changes else event
+
+    return validate
+
+
+class ImuChecks:
+    """Gyro and accelerometer for plausibility."""
+
+    def __init__(self) -> None:
+        self._rows = Table(6)
+
+    def add(self, event: Event) -> None:
+        """Take in one event."""
+        assert isinstance(event, ImuEvent)
+        self._rows.add(*event.angular_velocity, *event.linear_acceleration)
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """What is wrong."""
+        rows = self._rows.array()
+        found = []
+        finite = finite_rows(rows)
+        if not finite.all():
+            found.append(f"{topic}: {count(~finite)} hold NaN or infinity and will be rejected.")
+        found += spikes(topic, "yaw rate", "rad/s", np.abs(rows[:, 2]), config.gate.max_yaw_rate, seconds)
+        if not rows[:, :3].any():
+            found.append(f"{topic}: the gyro is always zero.")
+        gravity = float(np.median(np.linalg.norm(rows[finite, 3:], axis=1))) if finite.any() else 0.0
+        if 0.0 < gravity < 8.8 or gravity > 10.8:
+            hint = " (unit g?)" if 0.9 < gravity < 1.1 else ""
+            found.append(f"{topic}: the acceleration's median is {gravity:.2f} m/s², expected about 9.81{hint}.")
+        return found
+
+
+class GyroInput(EventInput):
+    """What an IMU reports."""
+
+    def imu(
+        self,
+        stamp_ns: int,
+        angular_velocity: ArrayLike,
+        linear_acceleration: ArrayLike = (0.0, 0.0, 0.0),
+        frame_id: str = BASE,
+    ) -> None:
+        """Gyro rates ``(3,)`` [rad/s] and accelerations ``(3,)`` [m/s²] in the IMU's axes."""
+        rates, accelerations = (np.asarray(a, dtype=float) for a in (angular_velocity, linear_acceleration))
+        self._deliver(ImuEvent(*self._when("imu", stamp_ns), frame_id, rates, accelerations, np.zeros((3, 3))))
+
+
+BIASES = ("gyro.bias_x", "gyro.bias_y")  # rad/s, in the axes of the base
+TILTS = ("gyro.roll_rad", "gyro.pitch_rad")  # of the IMU, beside its mounting as it is given
+LEVELS = ("gyro.level_x_rad", "gyro.level_y_rad")  # tilt about x and y that the accelerometer's bias makes
+
+
+def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+    """With their priors; on uneven ground also of what tells roll and pitch."""
+    scale = Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0, effects=("turn",))
+    if config.estimator.ground == "flat" or MotionRole.RATE not in roles:
+        return (scale,)
+    biases = (Parameter(name, config.gyro.bias_sigma) for name in BIASES)
+    tilts = (Parameter(name, config.gyro.tilt_sigma_rad) for name in TILTS)
+    return (scale, *biases, *tilts, *(Parameter(name, config.gyro.level_sigma_rad) for name in LEVELS))
+
+
+def _found_rows(config: Config) -> tuple[FoundRow, ...]:
+    """Rows of ``metrics.json``."""
+    return (FoundRow("gyro.scale", "gyro.scale", 1.0, -1.0),)
+
+
+def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
+    """Lines of ``robot.yaml``."""
+    scale = config.gyro.scale
+    yield from state.setting("gyro.scale", scale, scale * (1.0 + state.value("gyro.scale")), {"gyro.scale": scale})
+
+
+def _derivatives(motion: FloatArray) -> dict[str, FloatArray]:
+    """Derivative ``(3,)`` of a motion whose turn is the gyro's (right perturbation) by each parameter."""
+    rho_x, rho_y, phi = se2.log(motion)
+    return {"gyro.scale": phi * np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])}
+
+
+INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, {"gyro.scale": "gyro.scale_sigma"})
+
+
+_MAX_GAP_S = 0.1  # over a longer silence the turn is not known
+_AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
+_APART_S = 2.0  # between two yaws that the bias is learned from, at least
+
+
+class Gyro:
+    """Integrates the yaw rate over steps and keeps an estimate of its bias (a scalar Kalman filter).
+
+    The bias is learned while the wheels stand, and between fixes of the yaw.
+
+    Attributes:
+        bias: [rad/s].
+        bias_variance: [rad²/s²].
+        rejections: steps without a turn, by reason: ``gyro.silence``.
+    """
+
+    def __init__(self, config: GyroConfig, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """Set up.
+
+        Args:
+            config: noise of the gyro.
+            up: ``(3,)`` the base's z axis in the IMU's frame.
+        """
+        self.bias = 0.0
+        self.bias_variance = config.bias_sigma**2
+        self.rejections: Counter[str] = Counter()
+        self._config = config
+        self._up = np.asarray(up, dtype=float)
+        self._standing_s = 0.0
+        self._wheels = Standing()
+        self._anchor: tuple[float, float] | None = None  # yaw and variance of the last fix ...
+        self._turned = self._turned_s = 0.0  # ... and what was turned since
+        self._received = False
+        self.forget_fix()
+
+    @property
+    def up(self) -> FloatArray:
+        """The base's z axis ``(3,)`` in the IMU's frame, times the scale of its rates."""
+        return self._up
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether over the last step, and for a while, it has shown nothing but its bias beside wheels that stand."""
+        return self._standing_s > _AT_REST_S
+
+    def fork(self) -> Gyro:
+        """A copy that may integrate beyond the newest step without changing this one."""
+        forked = copy.copy(self)
+        forked.rejections = Counter()
+        forked._wheels = self._wheels.fork()
+        return forked
+
+    def resume(self, bias: float, bias_variance: float) -> None:
+        """Go on from what an earlier run learned of the bias [rad/s], [rad²/s²]."""
+        self.bias, self.bias_variance = bias, min(bias_variance, self._config.bias_sigma**2)
+
+    def measure(self, step: Step, wheels: ArrayLike | None, since_fix_s: float = 0.0) -> Turn | None:
+        """Turn over the step.
+
+        Args:
+            step: with the IMU's messages.
+            wheels: ``(3,)`` what the wheels measured of the step: where they stand, the bias shows.
+            since_fix_s: how long before the step no fix has determined the yaw. A wrong bias turns all steps
+                alike, so that its variance grows with the square of that time, however it is cut into steps.
+
+        Returns:
+            None without data of the gyro; after its first data, that is counted.
+        """
+        dt = step.dt
+        raw = None if dt <= 0.0 else self._integral(step.inertial, step.start_ns, step.stamp_ns)
+        if raw is None:
+            self._standing_s = 0.0
+            if self._received:
+                self.rejections["gyro.silence"] += 1
+            return None
+        self._received = True
+        self.bias_variance += self._config.bias_walk**2 * dt
+        self._watch_rest(raw / dt, dt, wheels)
+        yaw = raw - self.bias * dt
+        drift = self.bias_variance * ((since_fix_s + dt) ** 2 - since_fix_s**2)
+        noise = self._config.yaw_per_sqrt_s**2 * dt
+        return Turn(yaw, noise + drift, noise, self._config.yaw_per_sqrt_s**2)
+
+    def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
+        """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
+        times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
+        rates = np.array([event.angular_velocity for event in events]) @ self._up
+        at = np.array([(stamp - stamps_ns[0]) * 1e-9 for stamp in stamps_ns])
+        return np.asarray(np.interp(at, times, rates) - self.bias)
+
+    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
+        """Of a motion whose turn is this gyro's, by what the gyro is off by."""
+        return _derivatives(motion)
+
+    def turned(self, yaw: float, seconds: float) -> None:
+        """The robot went on by a step over which `measure` gave this turn [rad]."""
+        self._turned += yaw
+        self._turned_s += seconds
+
+    def fix(self, yaw: float, variance: float, apart_s: float = 0.0) -> None:
+        """Take in the yaw at the end of the last step, as fixes determine it; the turn between two corrects the bias.
+
+        Args:
+            yaw: [rad].
+            variance: [rad²].
+            apart_s: how far apart the two have to be at least, so that their errors do not depend on this gyro.
+        """
+        if self._anchor is not None:
+            if self._turned_s < max(_APART_S, apart_s):
+                return
+            before, spread = self._anchor
+            error = math.remainder(self._turned - (yaw - before), math.tau)
+            noise = self._config.yaw_per_sqrt_s**2 * self._turned_s
+            self._learn(self.bias + error / self._turned_s, (spread + variance + noise) / self._turned_s**2)
+        self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
+
+    def forget_fix(self) -> None:
+        """The robot may have been turned without data since the last fix."""
+        self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
+
+    def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
+        stands = self._wheels.observe(None if wheels is None else np.asarray(wheels, dtype=float), dt)
+        variance = self._config.yaw_per_sqrt_s**2 / dt
+        still = (rate - self.bias) ** 2 < chi2_bound(GATE, 1) * (self.bias_variance + variance)  # or turned by hand
+        self._standing_s = self._standing_s + dt if stands and still else 0.0
+        if self._standing_s > _AT_REST_S:
+            self._learn(rate, variance)
+
+    def _learn(self, bias: float, variance: float) -> None:
+        gain = self.bias_variance / (self.bias_variance + variance)
+        change = gain * (bias - self.bias)
+        self.bias += change
+        self.bias_variance *= 1.0 - gain
+        self._turned -= change * self._turned_s  # what was turned since the last fix, with the bias of now
+
+    def _integral(self, events: tuple[InertialEvent, ...], start_ns: int, end_ns: int) -> float | None:
+        """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""
+        if not events:
+            return None
+        up = self._up
+        times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in events])
+        rates = np.array([event.angular_velocity for event in events]) @ up
+        end = (end_ns - start_ns) * 1e-9
+        inside = times[(times > 0.0) & (times < end)]
+        nodes = np.concatenate([[0.0], inside, [end]])
+        if max(times[0], end - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
+            return None
+        return float(np.trapezoid(np.interp(nodes, times, rates), nodes))
+
+
+_SPEED_SIGMA = 0.015  # m/s: by what wheels and a mean over 40 ms are off from the robot's speed at one time
+
+Twist = Callable[[Step, int], FloatArray]
+"""Of the base ``(3,)`` at a time near the step's end."""
+
+
+class Attitude:
+    """Integrates the rates about x and y, and takes the robot's own acceleration out of the specific force.
+
+    Source: Titterton and Weston, Strapdown Inertial Navigation Technology, 2nd edition, 3.4 (specific force in body
+    axes: ``f = dv/dt + ω × v - g``).
+    """
+
+    def __init__(self, config: GyroConfig, T_base_imu: FloatArray) -> None:
+        """Take the noise, and the mounting ``(4, 4)`` of the IMU."""
+        self._config = config
+        self._R, self._t = T_base_imu[:3, :3], T_base_imu[:3, 3]
+
+    def rates_at(self, events: Sequence[InertialEvent], at_ns: int) -> FloatArray:
+        """Angular velocity ``(3,)`` [rad/s] of the base at a time, bias included."""
+        times, rates, _ = self._samples(events, at_ns)
+        return np.array([np.interp(0.0, times, rates[:, i]) for i in range(3)])
+
+    def measure(self, step: Step, twist: Twist) -> InertialReading | None:
+        """The step's reading; None if the IMU was silent.
+
+        Args:
+            step: with the IMU's messages.
+            twist: tells the speed at its start and end.
+        """
+        dt = step.dt
+        if dt <= 0.0 or not step.inertial:
+            return None
+        times, rates, forces = self._samples(step.inertial, step.start_ns)
+        inside = times[(times > 0.0) & (times < dt)]
+        nodes = np.concatenate([[0.0], inside, [dt]])
+        if max(times[0], dt - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
+            return None
+        at = np.column_stack([np.interp(nodes, times, rates[:, i]) for i in range(3)])
+        turn = np.trapezoid(at, nodes, axis=0)
+        sampled = (times > 0.0) & (times <= dt)
+        force, variance = None, self._config.acceleration_sigma**2 + 2.0 * (_SPEED_SIGMA / dt) ** 2
+        if sampled.any() and np.isfinite(forces[sampled]).all() and forces[sampled].any():
+            force = self._without_acceleration(step, turn, forces[sampled].mean(axis=0), twist)
+        return InertialReading(turn[:2], self._config.yaw_per_sqrt_s**2 * dt, force, variance, dt)
+
+    def _without_acceleration(self, step: Step, turn: FloatArray, force: FloatArray, twist: Twist) -> FloatArray:
+        """The mean force over a step less the robot's own acceleration, in the base's axes at the end."""
+        dt = step.dt
+        start, end = twist(step, step.start_ns), twist(step, step.stamp_ns)
+        omega = turn / dt
+        speed = np.array([*(0.5 * (start[:2] + end[:2])), 0.0]) + np.cross(omega, self._t)
+        own = np.array([*((end[:2] - start[:2]) / dt), 0.0]) + np.cross(omega, speed)
+        return np.asarray(rotation_of(-0.5 * turn) @ (force - own))
+
+    def _samples(self, events: Sequence[InertialEvent], origin_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        times = np.array([(event.stamp_ns - origin_ns) * 1e-9 for event in events])
+        rates = np.array([event.angular_velocity for event in events]) @ self._R.T
+        forces = np.array([event.linear_acceleration for event in events]) @ self._R.T
+        return times, rates, forces
+
+
+_GRAVITY = 9.81  # m/s²
+
+
+def _rate(events: Sequence[InertialEvent], origin_ns: int, mounting: Mounting) -> Signal | None:
+    """Yaw rate [rad/s], its bias taken out."""
+    if not events:
+        return None
+    rates = np.concatenate([e.angular_velocity for e in events]).reshape(-1, 3)
+    rates = rates @ np.asarray(mounting.imu_up) - np.asarray(mounting.gyro_bias)
+    return of_stamps([e.stamp_ns for e in events], rates[None], origin_ns)
+
+
+def _gravity(events: Sequence[InertialEvent], origin_ns: int, mounting: Mounting) -> Signal | None:
+    """Specific force along the robot's x and y over that of gravity: on a slope what pulls the robot, sign reversed.
+
+    The IMU's x axis is taken to lie in the plane of the robot's x and z.
+    """
+    forces = np.array([e.linear_acceleration for e in events]).reshape(-1, 3)
+    known = np.isfinite(forces).all(axis=1) & (np.abs(forces).sum(axis=1) > 0.0)
+    if not known.any():
+        return None
+    up = np.asarray(mounting.imu_up) / np.linalg.norm(mounting.imu_up)
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    ahead /= np.linalg.norm(ahead)
+    pulls = forces[known] @ np.array([ahead, np.cross(up, ahead)]).T / _GRAVITY
+    return of_stamps([e.stamp_ns for e, there in zip(events, known, strict=True) if there], pulls.T, origin_ns)
+
+
+CHANNELS = (
+    Channel("gyro", 1, 0, InertialEvent, _rate, MotionRole.RATE),
+    Channel("gravity", 2, 3, InertialEvent, _gravity),
+)
+
+
+class ImuBias(EventFailure):
+    """The gyroscope's yaw rate is off by ``yaw_rate`` and the accelerometer by ``acceleration``."""
+
+    kind: Literal["imu_bias"] = "imu_bias"
+    yaw_rate: float = Field(0.05, description="rad/s, about z")
+    acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")
+
+    def targets(self) -> tuple[type[Event], ...]:
+        """IMU messages."""
+        return (ImuEvent,)
+
+    def begin(self, scene: Scene) -> Change:
+        """Add."""
+        rates, accelerations = np.array([0.0, 0.0, self.yaw_rate]), np.array(self.acceleration)
+
+        def bias(event: Event) -> Event:
+            assert isinstance(event, ImuEvent)
+            return replace(
+                event,
+                angular_velocity=event.angular_velocity + rates,
+                linear_acceleration=event.linear_acceleration + accelerations,
+            )
+
+        return bias
+
+
+_BOUNCE_HZ, _BOUNCE_M_S2 = 1.9, 1.0  # vertical acceleration of what a walking person carries: amplitude
+_SWAY_HZ, _SWAY_RAD = 0.7, 0.03  # of the hands, in roll and pitch
+_TILT_RAD = 0.12  # largest tilt at which it is held
+
+
+def carried(carriage: Carriage) -> Callable[[Event], Event]:
+    """The IMU is shaken in the air. It is taken to be level."""
+    hands = {(a, b): _Hands(a, b, carriage) for a, b in carriage.intervals}
+
+    def tell(event: Event) -> Event:
+        assert isinstance(event, ImuEvent)
+        interval = carriage.interval(event)
+        return event if interval is None else hands[interval].shake(event, carriage.seconds(event))
+
+    return tell
+
+
+class _Hands:
+    """What the hands do to the IMU in one interval."""
+
+    def __init__(self, start_s: float, end_s: float, carriage: Carriage) -> None:
+        rng = carriage.scene.rng
+        self.start_s, self.end_s = start_s, end_s
+        self._rise_s, self._height = min(carriage.rise_s, 0.5 * (end_s - start_s)), carriage.height_m
+        self._tilt = rng.uniform(-_TILT_RAD, _TILT_RAD, 2)
+        self._phase = rng.uniform(0.0, 2.0 * math.pi, 3)
+
+    def shake(self, event: ImuEvent, t: float) -> ImuEvent:
+        """The message with the hands' motion added."""
+        s = min(t - self.start_s, self.end_s - t) / self._rise_s  # 0 on the floor, 1 up
+        up, rate, rises = _minimum_jerk(s)
+        sign = 1.0 if t - self.start_s < self.end_s - t else -1.0
+        swing = 2.0 * math.pi * _SWAY_HZ
+        angles = self._phase[:2] + swing * t
+        tilt = up * (self._tilt + _SWAY_RAD * np.sin(angles))
+        turning = up * _SWAY_RAD * swing * np.cos(angles)
+        turning = turning + sign * rate / self._rise_s * (self._tilt + _SWAY_RAD * np.sin(angles))
+        vertical = self._height * rises / self._rise_s**2
+        vertical += up * _BOUNCE_M_S2 * math.sin(2.0 * math.pi * _BOUNCE_HZ * t + self._phase[2])
+        R = rpy_matrix(tilt[0], tilt[1], 0.0)
+        force = R.T @ (event.linear_acceleration + np.array([0.0, 0.0, vertical]))
+        rates = R.T @ event.angular_velocity + np.array([turning[0], turning[1], 0.0])
+        return replace(event, angular_velocity=rates, linear_acceleration=force)
+
+
+def _minimum_jerk(s: float) -> tuple[float, float, float]:
+    """Height and its first and second derivative on the way from 0 to 1 in unit time.
+
+    Source: Flash, Hogan 1985, "The coordination of arm movements".
+    """
+    if s >= 1.0:
+        return 1.0, 0.0, 0.0
+    return (
+        10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5,
+        30.0 * s**2 - 60.0 * s**3 + 30.0 * s**4,
+        60.0 * s - 180.0 * s**2 + 120.0 * s**3,
+    )
+
+
+def _build(config: Config, up: FloatArray) -> RateSensor:
+
+    return Gyro(config.gyro, up)
+
+
+def _errors(config: Config) -> RateErrors:
+    return RateErrors(config.gyro.yaw_per_sqrt_s, config.gyro.scale_sigma, config.gyro.bias_sigma)
+
+
+def _attitude(config: Config, T_base_imu: FloatArray) -> AttitudeSensor:
+
+    return Attitude(config.gyro, T_base_imu)
+
+
+ROLE = RateRole(
+    installation=INSTALLATION,
+    build=_build,
+    errors=_errors,
+    is_used=lambda config: config.gyro.use,
+    scale=lambda config: config.gyro.scale,
+    attitude=_attitude,
+    attitude_names=AttitudeNames(BIASES, TILTS, LEVELS),
+)
+
+
+def _failures() -> tuple[type[Section], ...]:
+
+    return (ImuBias,)
+
+
+def _carried(carriage: Carriage) -> Callable[[Event], Event]:
+
+    return carried(carriage)
+
+
+GYRO = BuiltIn(
+    name="gyro",
+    streams=(
+        Stream(
+            "imu",
+            ImuEvent,
+            {"sensor_msgs/msg/Imu": from_imu},
+            ("imu", "imu/data"),
+            validator=imu_validator,
+            findings=ImuChecks,
+        ),
+    ),
+    failing_as="imu",
+    motion=ROLE,
+    channels=CHANNELS,
+    failures=_failures,
+    carried=_carried,
+)

@@ -1,1 +1,0 @@
-"""Yaw rate of an IMU as a motion source."""

@@ -1,0 +1,168 @@
+"""Poses of markers, as another node has estimated them from single views."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fgloc.frames import quaternion_matrix
+from fgloc.sensors.base import BuiltIn, Stream, When, matrix, xyz, xyzw
+from fgloc.sensors.checks import Changes, FieldChecks, SightingsChecks
+from fgloc.sensors.landmarks import planar_yaw
+from fgloc.types import Event, FloatArray, FrameMeasurement, LandmarkSighting, Sighting, SightingsEvent
+
+if TYPE_CHECKING:
+    from fgloc.sensors.landmarks import SightingContext
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPose(Sighting):
+    """One marker's pose in the sensor frame."""
+
+    position: FloatArray  # (3,)
+    orientation: FloatArray  # (4,) quaternion x, y, z, w
+    cov: FloatArray  # (6, 6) ROS order; zeros if the message gives none
+
+    def place(self) -> FloatArray | None:
+        """Its position."""
+        return self.position
+
+    def distance(self) -> float | None:
+        """Of that position."""
+        return float(np.linalg.norm(self.position))
+
+    def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
+        """On each coordinate of its position."""
+        if not (sigma := sigmas["position_m"]):
+            return self
+        return replace(self, position=self.position + rng.normal(0.0, sigma, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPosesEvent(SightingsEvent):
+    """``aruco_msgs/MarkerArray`` or ``vision_msgs/Detection3DArray``."""
+
+    sightings: tuple[MarkerPose, ...]
+
+
+_ID = re.compile(r"(?:^|[^0-9A-Za-z])(\d+)$")  # "7", "tag36h11:7", "marker_7"; not the 11 of "tag36h11"
+
+
+def from_aruco(m: Any, when: When) -> Event:
+    """From ``aruco_msgs/MarkerArray``."""
+    frame = m.header.frame_id or next((marker.header.frame_id for marker in m.markers), "")
+    return MarkerPosesEvent(*when, frame, tuple(_marker_pose(int(marker.id), marker.pose) for marker in m.markers))
+
+
+def from_detections(m: Any, when: When) -> Event:
+    """From ``vision_msgs/Detection3DArray``.
+
+    Things whose id holds no number are no markers; a message of nothing else is an error.
+    """
+    named = [(_detection_id(d, d.results[0]), d.results[0].pose) for d in m.detections if d.results]
+    sightings = tuple(_marker_pose(marker_id, pose) for marker_id, pose in named if marker_id is not None)
+    if named and not sightings:
+        raise ValueError("no detection's id holds a number")
+    return MarkerPosesEvent(*when, m.header.frame_id, sightings)
+
+
+def _marker_pose(marker_id: int, pose: Any) -> MarkerPose:
+    """From a PoseWithCovariance."""
+    return MarkerPose(marker_id, xyz(pose.pose.position), xyzw(pose.pose.orientation), matrix(pose.covariance, 6))
+
+
+def _detection_id(detection: Any, result: Any) -> int | None:
+    """Marker number of a Detection3D: its hypothesis' class, in older definitions its result's id, else its own id."""
+    hypothesis = getattr(result, "hypothesis", None)
+    for value in (getattr(hypothesis, "class_id", ""), getattr(result, "id", ""), getattr(detection, "id", "")):
+        if isinstance(value, int):
+            return value
+        if match := _ID.search(value.strip()):
+            return int(match.group(1))
+    return None
+
+
+def validator(checks: FieldChecks) -> Callable[[MarkerPosesEvent], Event | str]:
+    """Validator of marker poses."""
+    bounds = checks.config
+
+    def judge(topic: str, sighting: MarkerPose) -> MarkerPose | str:
+        distance = math.hypot(*sighting.position.tolist())
+        if not math.isfinite(distance):
+            return "non_finite"
+        if not bounds.min_range < distance <= bounds.max_range:
+            return "range_bound"
+        changes: Changes = {}
+        reason = checks.quaternion(sighting.orientation, "orientation", changes)
+        reason = reason or checks.covariance(topic, "marker pose", sighting.cov, range(6), "cov", changes)
+        if reason:
+            return reason
+        return replace(sighting, **changes) if changes else sighting
+
+    return lambda event: checks.sift(event, judge)
+
+
+_MIN_RANGE_M = 1e-3
+
+
+class MarkerPoseMeasurer:
+    """Planar poses of markers; range and bearing only if ``landmarks.yaw_sigma_rad`` is not set."""
+
+    def __init__(self, context: SightingContext) -> None:
+        self._context = context
+
+    def __call__(self, event: MarkerPosesEvent) -> Iterator[LandmarkSighting]:
+        """Those of one message."""
+        made = (self._marker_pose(event.stamp_ns, seen) for seen in self._context.usable(event.sightings))
+        return (m for m in made if m is not None)
+
+    def _marker_pose(self, stamp_ns: int, seen: MarkerPose) -> LandmarkSighting | None:
+        section = self._context.config.landmarks
+        arm = self._context.T_base_sensor[:3, :3] @ seen.position  # from the sensor, in the base's axes
+        distance = section.range_scale * (math.hypot(arm[0], arm[1]) - section.range_bias_m)
+        if distance < _MIN_RANGE_M:
+            self._context.reject("range")
+            return None
+        bearing = math.atan2(arm[1], arm[0]) - section.bearing_bias_rad
+        c, s = math.cos(bearing), math.sin(bearing)
+        J = np.array([[c, -distance * s], [s, distance * c]])
+        place = self._context.T_base_sensor[:2, 3] + distance * np.array([c, s])
+        cov = J @ self._context.range_bearing_cov(distance) @ J.T
+        landmark = self._context.landmark(seen.landmark_id)
+        if section.yaw_sigma_rad is None or (landmark is not None and landmark.size_m == 0.0):
+            return self._context.polar(stamp_ns, seen.landmark_id, place, cov)
+        rotation = self._context.T_base_sensor[:3, :3] @ quaternion_matrix(seen.orientation)
+        yaw = planar_yaw(rotation, landmark) - section.bearing_bias_rad
+        return self._context.planar(stamp_ns, seen.landmark_id, place, cov, yaw, section.yaw_sigma_rad**2)
+
+
+def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSighting]]:
+
+    return MarkerPoseMeasurer(context)
+
+
+MARKER_POSE = BuiltIn(
+    name="marker_pose",
+    streams=(
+        Stream(
+            "sightings",
+            MarkerPosesEvent,
+            {
+                "aruco_msgs/msg/MarkerArray": from_aruco,
+                "vision_msgs/msg/Detection3DArray": from_detections,
+            },
+            (),
+            keyframe=True,
+            validator=validator,
+            findings=SightingsChecks,
+        ),
+    ),
+    failing_as="camera",
+    measures=_measures,
+    measured=(FrameMeasurement,),
+)

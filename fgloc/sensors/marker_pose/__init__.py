@@ -1,1 +1,0 @@
-"""Poses of markers, as another node has estimated them from single views."""

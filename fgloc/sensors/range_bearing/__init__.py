@@ -1,1 +1,0 @@
-"""Ranges with bearings of landmarks."""
