@@ -30,7 +30,7 @@ from benchmarks.adaptive_recordings import SEEDS, Split, prepare
 from benchmarks.adaptive_runs import CASES, cell
 from benchmarks.adaptive_scores import Figures
 from benchmarks.common import Row, main, not_run
-from fgloc.instrumentation.progress import counted
+from fgloc.instrumentation import counted
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.camera import RenderError
 

@@ -28,7 +28,7 @@ from fgloc.config import Config, load_config
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.estimators import FixedLag, isam2_params
 from fgloc.graph.factors import pose_key
-from fgloc.instrumentation.timing import Stopwatch
+from fgloc.instrumentation import Stopwatch
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.localizer import Localizer

@@ -13,9 +13,8 @@ from pydantic import AfterValidator, Field, create_model, model_validator
 
 from fgloc.errors import ConfigError
 from fgloc.extensions import outside_sensors
-from fgloc.files.section import SHIPPED
-from fgloc.files.section import Section as Section
-from fgloc.files.settings_file import Settings
+from fgloc.files.settings import SHIPPED, Settings
+from fgloc.files.settings import Section as Section
 from fgloc.sensors.settings import MOTION_SOURCES, SensorSections, shipped_name
 from fgloc.stats import GATE
 

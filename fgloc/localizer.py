@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from fgloc.config import Config
 from fgloc.graph.estimators import make_estimator
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.instrumentation.timing import Stopwatch
+from fgloc.instrumentation import Stopwatch
 from fgloc.relocalization.initialization import Initialization
 from fgloc.relocalization.recorder import Recorder
 from fgloc.relocalization.tracking_state import Tracking

@@ -16,7 +16,7 @@ from fgloc.config import Config
 from fgloc.diagnosis.mistakes import Mistakes, find_mistakes
 from fgloc.errors import EstimatorError
 from fgloc.graph.contradictions import Contradiction
-from fgloc.instrumentation.timing import one_blas_thread
+from fgloc.instrumentation import one_blas_thread
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay.options import Progress, RunMode, RunOptions
 from fgloc.replay.outcome import Outcome, never_found, sentence

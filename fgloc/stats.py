@@ -1,4 +1,4 @@
-"""Quantiles that decide: one place for what "unlikely" means.
+"""Statistics: quantiles that decide, in one place, and figures rounded by their standard deviation.
 
 There are four levels: `GATE` of a single measurement (``estimator.gate_probability``), one false alarm a day of a
 monitor (`alarm_bound`), the gate's of several hypotheses over a whole run (`evidence_bound`): by it a landmark is named
@@ -54,3 +54,17 @@ def evidence_bound(probability: float, hypotheses: int) -> float:
     Source: the likelihood ratio exceeds x with a probability of at most 1/x (Ville 1939), for each of them.
     """
     return 2.0 * math.log(hypotheses / (1.0 - probability))
+
+
+def rounded(value: float, sigma: float, sign: str = "") -> tuple[str, str]:
+    """Value and sigma in words: the sigma with two significant digits, the value with as many decimals, never -0.
+
+    Args:
+        value: the figure.
+        sigma: its standard deviation; where it is 0, not finite or out of proportion six digits of the value are shown.
+        sign: "+" to show that of a positive value, too.
+    """
+    if not (math.isfinite(value) and 1e-9 < sigma < 1e6):
+        return f"{value:{sign}z.6g}", f"{sigma:.2g}"
+    places = max(0, -int(f"{sigma:.1e}".partition("e")[2]) + 1)
+    return f"{value:{sign}z.{places}f}", f"{sigma:.{places}f}"

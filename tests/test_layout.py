@@ -18,7 +18,7 @@ from fgloc_training.config import TrainConfig
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 PACKAGES = {"fgloc": ROOT, "fgloc_datasets": ROOT / "datasets", "fgloc_training": ROOT / "training"}
 MODULES = sorted(path for name, folder in PACKAGES.items() for path in (folder / name).rglob("*.py"))
-BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats", "rounding"}
+BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
 UPWARD = {
     ("types", "fgloc.evaluation.report"),  # RunResult.write, imported when it is called
     ("config", "fgloc.sensors.settings"),  # sections of the built-in sensors

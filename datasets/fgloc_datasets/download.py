@@ -15,7 +15,7 @@ from typing import BinaryIO
 from urllib.parse import urlsplit
 
 from fgloc.errors import RecordingError
-from fgloc.instrumentation.progress import counted
+from fgloc.instrumentation import counted
 
 _TIMEOUT_S = 60.0
 _BLOCK = 1 << 20

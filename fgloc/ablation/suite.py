@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
-from fgloc.files.settings_file import Settings, sentences
+from fgloc.files.settings import Settings, sentences
 from fgloc.recording.files import find_beside
 from fgloc.replay.options import RunMode
 

@@ -14,7 +14,7 @@ from scipy import stats
 from fgloc.ablation.jobs import Job
 from fgloc.ablation.records import Record
 from fgloc.ablation.suite import NOTHING, Cell, Suite
-from fgloc.rounding import rounded
+from fgloc.stats import rounded
 
 
 @dataclass(frozen=True, slots=True)

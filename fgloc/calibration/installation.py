@@ -21,10 +21,9 @@ from fgloc.config import Config
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
-from fgloc.rounding import rounded
 from fgloc.sensors import registry
 from fgloc.sensors.cameras import pinhole
-from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS
+from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS, rounded
 from fgloc.types import Camera, Finding, FloatArray, InstallationFound, LandmarkMap, Setting, Severity, note
 
 Found = Mapping[str, tuple[float, float]]

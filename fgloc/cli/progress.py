@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from fgloc.instrumentation.progress import Advance, Listener, end, tell, told_to
+from fgloc.instrumentation import Advance, Listener, end, tell, told_to
 
 if TYPE_CHECKING:
     from fgloc.replay.options import Progress

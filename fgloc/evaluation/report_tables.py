@@ -13,7 +13,7 @@ from fgloc.calibration.installation import contradicted, found_text, given_text,
 from fgloc.evaluation.judgements import GRAVITY, Judgement
 from fgloc.evaluation.matching import Matched
 from fgloc.evaluation.metrics import Metrics
-from fgloc.rounding import rounded
+from fgloc.stats import rounded
 from fgloc.types import Mode, RunResult
 
 _MOST_ROWS = 60  # of the table of judgements

@@ -11,6 +11,7 @@ process lives: what is found unlocked was left by a killed one, and is removed.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 import glob
@@ -25,7 +26,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from fgloc.errors import OutputError
-from fgloc.files.system_calls import exchange, flush_folder
 
 _PARTIAL = ".partial-"
 _OLD, _MOVED = ".old", ".moved"  # in a temporary folder: the old files; the same once all of them are in it
@@ -54,7 +54,7 @@ def atomic_file(path: Path, binary: bool = False) -> Iterator[IO[Any]]:
                 temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
-        flush_folder(path.parent)
+        _flush_folder(path.parent)
 
 
 @contextmanager
@@ -78,12 +78,12 @@ def atomic_folder(out: Path, own: Sequence[str] = (), kept: Sequence[str] = ()) 
         stage, handle = _new_folder(out.parent / f".{out.name}{_PARTIAL}" if beside else out / _PARTIAL)
         try:
             yield stage
-            flush_folder(stage)
+            _flush_folder(stage)
             with _one_at_a_time(out.parent):
                 own = (*own, *map(glob.escape, _names(stage)))
                 if not (beside and _replaceable(out, own, kept) and _exchanged(stage, out, own)):
                     _move_in(stage, out, own)
-                flush_folder(out.parent)
+                _flush_folder(out.parent)
         finally:
             shutil.rmtree(stage, ignore_errors=True)
             os.close(handle)
@@ -218,7 +218,7 @@ def _exchanged(stage: Path, out: Path, own: Sequence[str]) -> bool:
             if not _fits(name, own):
                 _link(out / name, stage / name)
         sys.audit("fgloc.exchange", str(stage), str(out))
-        return exchange(stage, out)
+        return _exchange(stage, out)
     except OSError as error:
         if error.errno not in _CANNOT_EXCHANGE:
             raise
@@ -270,3 +270,35 @@ def _names(folder: Path) -> list[str]:
 
 def _fits(name: str, patterns: Sequence[str]) -> bool:
     return any(fnmatch(name, pattern) for pattern in patterns)
+
+
+# --- System calls that Python has no function for ---------------------------------------------------------------------
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Exchange two names by one system call: renameat2 with RENAME_EXCHANGE, on macOS renamex_np with RENAME_SWAP."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    ends = os.fsencode(a), os.fsencode(b)
+    if hasattr(libc, "renameat2"):
+        here = ctypes.c_int(-100)  # AT_FDCWD
+        failed = libc.renameat2(here, ctypes.c_char_p(ends[0]), here, ctypes.c_char_p(ends[1]), ctypes.c_uint(2))
+    elif hasattr(libc, "renamex_np"):
+        failed = libc.renamex_np(ctypes.c_char_p(ends[0]), ctypes.c_char_p(ends[1]), ctypes.c_uint(2))
+    else:
+        return False
+    if failed:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+    return True
+
+
+def _flush_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk, where the file system allows it."""
+    if not folder.is_dir():
+        return
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from fgloc.config import LiveConfig
 from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.instrumentation.timing import one_blas_thread
+from fgloc.instrumentation import one_blas_thread
 from fgloc.live.anchors import Outlet
 from fgloc.live.detection import DetectionWorker, Queued, State
 from fgloc.live.reception import role_of

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, FiniteFloat
 
-from fgloc.files.section import Section
+from fgloc.files.settings import Section
 from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
 from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, MotionEvent, PoseMeasurement, Setting

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 from pydantic import AfterValidator
 
 from fgloc.extensions import outside_sensors
-from fgloc.files.section import Section
+from fgloc.files.settings import Section
 from fgloc.sensors.base import (
     BuiltIn,
     Context,

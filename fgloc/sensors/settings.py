@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fgloc.files.section import SHIPPED, Section
+from fgloc.files.settings import SHIPPED, Section
 
 
 class NoiseDensity(Section):

@@ -12,12 +12,12 @@ import yaml
 from command_line import fgloc
 from test_cli import write_circle
 
+from fgloc import instrumentation as progress
 from fgloc.cli import extras
 from fgloc.cli.progress import LINE_S, Lines
 from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.evaluation.warnings import all_findings
-from fgloc.instrumentation import progress
 from fgloc.runner import run
 from fgloc.sensors.settings import WheelsConfig
 from fgloc.types import Finding, Severity, ordered

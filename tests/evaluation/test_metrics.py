@@ -12,7 +12,7 @@ from fgloc.evaluation import consistency, metrics
 from fgloc.evaluation.matching import Matched, in_own_gauge, match
 from fgloc.evaluation.metrics import relative_error
 from fgloc.frames import yaw_quaternion
-from fgloc.rounding import rounded
+from fgloc.stats import rounded
 from fgloc.types import Trajectory
 
 START_NS = 1_700_000_000_123_456_789

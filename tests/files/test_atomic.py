@@ -123,7 +123,7 @@ def test_fault_71_kill_in_a_folder_that_cannot_be_exchanged_never_mixes_two_resu
 def test_without_an_exchange_by_the_file_system_an_error_takes_all_back(tmp_path, monkeypatch):
     out = tmp_path / "out"
     write(out, "old")
-    monkeypatch.setattr(atomic, "exchange", lambda *_: False)
+    monkeypatch.setattr(atomic, "_exchange", lambda *_: False)
     write(out, "new", optional=False)
     assert content(out) == NEW
     real, count = Path.replace, 0

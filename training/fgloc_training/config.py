@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from fgloc.config import Section
-from fgloc.files.settings_file import Settings
+from fgloc.files.settings import Settings
 from fgloc.sensors.learned.card import Input, Kind, Split
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fgloc.instrumentation.progress import end, tell
+from fgloc.instrumentation import end, tell
 from fgloc_training.checkpoint import Checkpoint, Curve
 
 _MOST_GRADIENT = 5.0  # norm above which the gradient is clipped

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from fgloc.files.atomic import atomic_folder, check_out
-from fgloc.instrumentation.progress import counted
+from fgloc.instrumentation import counted
 from fgloc.sensors.learned.card import ModelCard, Split
 from fgloc_training.checkpoint import Checkpoints
 from fgloc_training.config import TrainConfig, load_train_config

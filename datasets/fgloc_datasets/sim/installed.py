@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from fgloc.files.settings_file import Settings
+from fgloc.files.settings import Settings
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, Landmark, LandmarkMap
 from fgloc_datasets.sim.installation import Installation

@@ -12,7 +12,7 @@ import mujoco
 import yaml
 
 from fgloc.files.atomic import atomic_folder
-from fgloc.instrumentation.progress import counted
+from fgloc.instrumentation import counted
 from fgloc.sensors.maps import write_map
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import write_robot

@@ -14,8 +14,8 @@ from typing import Literal
 from pydantic import Field
 
 from fgloc.errors import ConfigError, FglocError
-from fgloc.files.settings_file import Settings
-from fgloc.instrumentation.progress import counted
+from fgloc.files.settings import Settings
+from fgloc.instrumentation import counted
 from fgloc_datasets.sim.physics import SimulationError
 from fgloc_datasets.sim.record import is_recorded, record
 from fgloc_datasets.sim.scenario import Control, Scenario

@@ -16,7 +16,7 @@ from fgloc.ablation.failures.timing import Truncated
 from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config
 from fgloc.errors import ConfigError
-from fgloc.files.settings_file import sentences
+from fgloc.files.settings import sentences
 from fgloc.types import Event, LandmarkMap, TruthEvent
 from fgloc_datasets.sim.sensors import EPOCH_NS
 

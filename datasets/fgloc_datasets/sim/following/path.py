@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from scipy.interpolate import Akima1DInterpolator
 
 from fgloc.errors import ConfigError
-from fgloc.files.settings_file import Settings
+from fgloc.files.settings import Settings
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.section import Positive, Section, Vector2
 

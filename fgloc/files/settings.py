@@ -1,4 +1,4 @@
-"""Settings from YAML into pydantic models; what is wrong is named with file, line, key and the likeliest correction."""
+"""Settings from YAML into pydantic models; a wrong value is named with file, line, key and the likeliest correction."""
 
 from __future__ import annotations
 
@@ -9,11 +9,27 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from fgloc.errors import ConfigError
 from fgloc.files.documents import Item, plain, read_document
+
+SHIPPED = "shipped:"
+"""Begins the name of a file that comes with fgloc."""
+
+
+class Section(BaseModel):
+    """A part of the configuration: unknown keys are errors, numbers are finite, values are immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_comments(cls, content: Any) -> Any:
+        """A section whose keys are all comments is an empty one; YAML reads it as None."""
+        return {} if content is None else content
+
 
 MAX_BYTES = 1_000_000  # of a settings file; PyYAML takes 6 s for it
 _MOST_SHOWN = 20  # wrong values

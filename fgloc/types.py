@@ -1,0 +1,743 @@
+"""Data that cross module borders: events, steps, maps, measurements, findings, results.
+
+Data flow one way: ``Event → validation → Step → Measurement → association → factor → Estimate``. Everything here is
+frozen. Times are ``stamp_ns`` (when the sensor measured) and ``received_ns`` (when the recorder got it), both integers;
+everything else is SI. Arrays are float64 or int64, and are not to be written to.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum, StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fgloc import se2
+from fgloc.errors import TrajectoryError
+
+if TYPE_CHECKING:
+    from fgloc.config import Config
+
+
+MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
+
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+# --- Events: one message (or one transform of one) as recorded, before validation -------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Event:
+    """One message of a recording or a live stream."""
+
+    stamp_ns: int
+    received_ns: int
+    topic: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionEvent(Event):
+    """Of a source of motion: it holds over time and is integrated over steps, at its own stamps."""
+
+    @property
+    def publisher(self) -> tuple[str, ...]:
+        """What tells apart those who share the topic, each with a clock of its own."""
+        return ()
+
+    @property
+    def base_frame_id(self) -> str:
+        """The robot's base frame, if the message names it."""
+        return ""
+
+    @property
+    def odometer(self) -> OdometerPose | None:
+        """The pose that the source has integrated itself; None: it gives none."""
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometerPose:
+    """Pose of the base in a frame of the source's own, and the twist there."""
+
+    frame_id: str
+    pose: FloatArray  # (3,); NaN where it is not known
+    twist: FloatArray  # (3,) in the body frame: m/s, m/s, rad/s; NaN where it is not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlEvent(MotionEvent):
+    """Control input: the commanded velocity. It holds until the next."""
+
+    v: float  # m/s, forward
+    omega: float  # rad/s, counter-clockwise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialEvent(MotionEvent):
+    """Rates and specific forces in the axes of an inertial unit."""
+
+    frame_id: str
+    angular_velocity: FloatArray  # (3,) rad/s
+    linear_acceleration: FloatArray  # (3,) m/s²
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawEvent(Event):
+    """Data in which a detector still has to find the landmarks."""
+
+    frame_id: str
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height, if the message names them."""
+        return None
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no data."""
+        return False
+
+    def decoded_size(self) -> tuple[int, int] | None:
+        """Width and height of the decoded data; None if it cannot be decoded."""
+        return self.size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One landmark in one message; subclasses say how it was seen."""
+
+    landmark_id: int
+
+    def place(self) -> FloatArray | None:
+        """Position ``(3,)`` in the sensor's axes, if the message gives it."""
+        return None
+
+    def distance(self) -> float | None:
+        """Distance from the sensor [m], if the message gives it."""
+        return None
+
+    def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
+        """With white noise on its numbers, as ``fgloc ablate`` adds it.
+
+        Args:
+            sigmas: by kind of number: ``corner_px``, ``range_m``, ``bearing_rad``, ``position_m``; 0: none.
+            rng: of the noise.
+        """
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightingsEvent(Event):
+    """Landmarks that were seen at one time. Made anew as a keyframe, or moved to one."""
+
+    in_pixels: ClassVar[bool] = False  # whether it takes a calibrated camera to make measurements of them
+
+    frame_id: str
+    sightings: tuple[Sighting, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorEvent(Event):
+    """One message of a registered sensor (`fgloc.sensors.base`); a subclass says what is in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraInfoEvent(Event):
+    """``sensor_msgs/CameraInfo``."""
+
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str
+    K: FloatArray  # (3, 3)
+    D: FloatArray  # (n,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TransformEvent(Event):
+    """One transform of ``/tf`` or ``/tf_static``: ``T_parent_child``."""
+
+    parent: str
+    child: str
+    translation: FloatArray  # (3,)
+    rotation: FloatArray  # (4,) quaternion x, y, z, w
+    static: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthEvent(Event):
+    """Pose from an external positioning system. Never reaches the estimator."""
+
+    frame_id: str
+    position: FloatArray  # (3,)
+    orientation: FloatArray  # (4,) quaternion x, y, z, w
+
+
+# --- Steps: all events between two keyframes --------------------------------------------------------------------------
+
+M = TypeVar("M", bound=MotionEvent)
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)  # sensors remember what they made of it
+class Step:
+    """All that was received between two keyframes, gated and in order of stamp.
+
+    Each tuple of ``motion`` holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the
+    last one at or before the start, and the first one at or after the end where known. Control inputs reach back
+    ``history_s`` further. ``sightings`` were made at ``stamp_ns`` (the keyframe) or, arriving late, at their own stamps
+    in the lag.
+    """
+
+    index: int
+    segment: int  # counts up where the clock jumped; a new segment shares no motion with the one before
+    start_ns: int
+    stamp_ns: int
+    motion: Mapping[type[MotionEvent], tuple[MotionEvent, ...]] = field(default_factory=dict)  # by class of event
+    sightings: tuple[SightingsEvent, ...] = ()
+    sensed: tuple[SensorEvent, ...] = ()  # of registered sensors, at their own stamps like late sightings
+
+    @property
+    def dt(self) -> float:
+        """Length [s]."""
+        return (self.stamp_ns - self.start_ns) * 1e-9
+
+    def of(self, kind: type[M]) -> tuple[M, ...]:
+        """The motion events of a class, or of the one class derived from it that the robot has."""
+        for made, events in self.motion.items():
+            if issubclass(made, kind):
+                return events  # type: ignore[return-value]
+        return ()
+
+    @property
+    def controls(self) -> tuple[ControlEvent, ...]:
+        """Control inputs."""
+        return self.of(ControlEvent)
+
+    @property
+    def inertial(self) -> tuple[InertialEvent, ...]:
+        """Of the inertial unit."""
+        return self.of(InertialEvent)
+
+
+def by_class(events: Iterable[MotionEvent]) -> dict[type[MotionEvent], tuple[MotionEvent, ...]]:
+    """Motion events as a step holds them, in the order in which they are given."""
+    made: dict[type[MotionEvent], list[MotionEvent]] = {}
+    for event in events:
+        made.setdefault(type(event), []).append(event)
+    return {kind: tuple(same) for kind, same in made.items()}
+
+
+# --- Cameras, landmarks and their maps --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Intrinsics and mounting.
+
+    ``model`` is ``"plumb_bob"`` (D: k1 k2 p1 p2 [k3]), ``"rational_polynomial"`` (D: k1 k2 p1 p2 k3 k4 k5 k6) or
+    ``"equidistant"`` (fisheye, D: k1 k2 k3 k4). A width and height of 0 say that the calibration names no image size.
+    """
+
+    width: int
+    height: int
+    model: str
+    K: FloatArray  # (3, 3)
+    D: FloatArray  # (n,)
+    T_base_cam: FloatArray  # (4, 4), cam is the optical frame: z forward, x right, y down
+    frame_id: str = ""
+    notes: tuple[str, ...] = ()  # what was assumed when the calibration was read
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A marker or beacon of the map.
+
+    ``size_m`` is the side of the black square, 0 if the landmark is a point; ``rotation`` is of the marker frame: x to
+    the marker's right as seen, y to its top, z out of its face towards the viewer.
+    """
+
+    landmark_id: int
+    position: FloatArray  # (3,) m in the map frame
+    rotation: FloatArray  # (3, 3) R_map_marker; identity for a point
+    size_m: float
+    cov: FloatArray | None = None
+    """Of x, y ``(2, 2)``, of x, y, z ``(3, 3)`` in the map frame, or ``(6, 6)`` of these and the rotation [rad] about
+    the marker's own axes; None: not known."""
+
+    def corners(self) -> FloatArray:
+        """Corners ``(4, 3)`` in the map frame, in the order of MarkerCorners."""
+        h = 0.5 * self.size_m
+        local = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+        return np.asarray(self.position + local @ self.rotation.T)
+
+    @property
+    def planar(self) -> FloatArray:
+        """``(3,)`` x, y, yaw: yaw of the face normal if the marker stands, of its x axis if it lies."""
+        axis = self.rotation[:, 2] if abs(self.rotation[2, 2]) < 0.7 else self.rotation[:, 0]
+        return np.array([self.position[0], self.position[1], np.arctan2(axis[1], axis[0])])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """Landmarks by id; ``dictionary`` is OpenCV's name (``"DICT_4X4_50"``) or empty."""
+
+    landmarks: Mapping[int, Landmark]
+    dictionary: str = ""
+    source: str = ""
+    notes: tuple[str, ...] = ()  # what was assumed or left out when the file was read
+
+    def __contains__(self, landmark_id: int) -> bool:
+        return landmark_id in self.landmarks
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+
+# --- Measurements: computed by sensors from events; factors are made of them ------------------------------------------
+
+_AT_REST = np.zeros(3)
+_LEVEL = np.zeros(2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialReading:
+    """What an inertial unit measures of one step on uneven ground, in the axes of the base."""
+
+    turn: FloatArray  # (2,) rad: about x and y over the step, with the bias in it
+    turn_variance: float  # rad², of each
+    force: FloatArray | None  # (3,) m/s²: specific force at the step's end, without the robot's own acceleration
+    force_variance: float  # (m/s²)², of each
+    seconds: float  # length of the step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionMeasurement:
+    """``T_start_end`` of the base from ``source`` (wheels, learned or gyro), with right-perturbation covariance."""
+
+    source: str
+    start_ns: int
+    stamp_ns: int
+    motion: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3) of what differs from step to step; what is always the same is in `depends_on`
+    # by parameter of the installation: derivative (3,) of the motion (right perturbation), and the value it has in it
+    depends_on: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    inertial: InertialReading | None = None  # of the same step; on uneven ground
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionReadings:
+    """What each motion source measured of one step, as if it were alone; None where it has no data."""
+
+    wheels: MotionMeasurement | None = None
+    learned: MotionMeasurement | None = None
+    gyro: MotionMeasurement | None = None  # only its yaw means anything
+    inertial: InertialReading | None = None  # on uneven ground
+    at_rest: bool = False  # wheels report no motion, and the gyro none but its bias
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelMeasurement:
+    """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
+
+    stamp_ns: int
+    landmark_id: int
+    corners_px: FloatArray  # (4, 2)
+    sigma_px: float
+    camera: Camera  # plumb_bob, whose D explains corners_px
+    twist: FloatArray = field(
+        default_factory=lambda: _AT_REST
+    )  # (3,) of the base at the exposure: m/s, m/s, rad/s, in the keyframe's axes
+    offset_s: float = 0.0  # how late the stamp was taken to be when the sighting was moved to its keyframe
+    blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
+    jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
+    motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
+    cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
+    tilting: FloatArray = field(default_factory=lambda: _LEVEL)  # (2,) rad/s: roll and pitch rate of the base
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointMeasurement:
+    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
+
+    stamp_ns: int
+    landmark_id: int
+    range_m: float
+    bearing_rad: float
+    cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
+    offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def point(self) -> FloatArray:
+        """Where it is in the base frame ``(2,)`` [m]."""
+        return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMeasurement:
+    """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
+
+    stamp_ns: int
+    landmark_id: int
+    pose: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
+    offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseMeasurement(ABC):
+    """What a registered sensor measured, as a function of the robot's pose; each kind of it is a subclass.
+
+    A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
+    the first pose are made of that.
+    """
+
+    source: str  # in steps.csv and in the counts
+    stamp_ns: int
+    cov: FloatArray  # (d, d) of the residual
+    target: int = -1  # which anchor or beacon was measured, in the sensor's own numbering; -1: none
+    observes_yaw: bool = False  # whether one reading determines the yaw, as a compass does
+    cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
+    T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
+    motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
+
+    @abstractmethod
+    def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted minus measured ``(d,)`` for ``T_map_base`` ``(3,)`` at the stamp, with its Jacobian.
+
+        Returns:
+            The residual, in the units of `cov`, and its derivative ``(d, 3)`` by the right perturbation of the pose.
+        """
+
+    def places(self) -> Iterable[FloatArray]:
+        """Where in the map ``(2,)`` the robot may be, roughly: where the search for its first pose begins."""
+        return ()
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[PoseMeasurement]:
+        """What else the reading may mean, most probable first: tried in turn where the chi-square gate refuses it.
+
+        Args:
+            predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.
+        """
+        return ()
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return len(self.cov)
+
+    @property
+    def landmark_id(self) -> int:
+        """A number that no landmark of the map has."""
+        return -2 - self.target
+
+    def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `residual_at`, by the pose at the keyframe."""
+        residual, J = self.residual_at(se2.compose(pose, self.T_keyframe_then))
+        return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
+
+
+LandmarkSighting = PixelMeasurement | PointMeasurement | FrameMeasurement
+LandmarkMeasurement = LandmarkSighting | PoseMeasurement
+
+
+# --- Findings: errors, warnings and notes on a recording, its set-up or a run -----------------------------------------
+
+
+class Severity(IntEnum):
+    """Effect of a finding on the result; a higher value is graver."""
+
+    NOTE = 0  # the user should know
+    WARNING = 1  # something is off, and the run copes with it
+    ERROR = 2  # the poses are not to be trusted as the set-up is; exit code 3
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong, or worth knowing, with its evidence and its remedy.
+
+    Attributes:
+        code: stable name, ``subject.kind``: "sightings.axes", "imu.axes", "truth.frame".
+        text: one sentence with the evidence and the remedy.
+        severity: effect on the result.
+        lines: settings that undo it, ``section.key`` of robot.yaml to the value as YAML.
+        value: figure that was found (a lag [s], a scale, an angle [rad]); None: there is none.
+        sigma: standard deviation of `value`; None: not known.
+    """
+
+    code: str
+    text: str
+    severity: Severity = Severity.NOTE
+    lines: Mapping[str, str] = field(default_factory=dict)
+    value: float | None = None
+    sigma: float | None = None
+
+
+def note(code: str, texts: Iterable[str], severity: Severity = Severity.NOTE) -> list[Finding]:
+    """Findings without settings, one for each sentence."""
+    return [Finding(code, text, severity) for text in texts]
+
+
+def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Findings by severity, the gravest first; else in the given order.
+
+    Repetitions are dropped: of equal sentences, and of two findings that set the same key the later one loses that line
+    (and is dropped if it is no graver than a note and has no other line).
+    """
+    kept: list[Finding] = []
+    texts: set[str] = set()
+    keys: set[str] = set()
+    for finding in sorted(findings, key=lambda f: -f.severity):
+        if finding.text in texts:
+            continue
+        if finding.lines and finding.severity < Severity.ERROR and keys >= finding.lines.keys():
+            continue
+        texts.add(finding.text)
+        keys |= finding.lines.keys()
+        kept.append(finding)
+    return tuple(kept)
+
+
+# --- Results: decisions, estimates, trajectories, runs ----------------------------------------------------------------
+
+
+class Mode(StrEnum):
+    """How the estimate came about."""
+
+    OK = "OK"
+    UNCONFIRMED = "UNCONFIRMED"  # by sightings that nothing checks yet: before the first pose is certain
+    DEAD_RECKONING = "DEAD_RECKONING"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """What became of one measurement, or of the pose: a row of ``steps.csv``."""
+
+    step: int
+    stamp_ns: int
+    kind: str  # a sensor by its name, "place", "mode" or "clock"
+    landmark_id: int  # -1 for motion
+    residual: float  # norm of the whitened residual against the prediction
+    nis: float
+    dof: int
+    weight: float  # 1 as given, less if inflated, 0 if rejected
+    reason: str  # "" if used as given
+    threshold: float = math.nan  # that the NIS is held against; NaN: none
+    shift_m: float = (
+        math.nan
+    )  # of a motion: how much further forward than its reference; of a place: from the estimated pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What makes a planar pose one in space, where the ground is uneven.
+
+    The base's rotation is ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    """
+
+    z: float  # m
+    roll: float  # rad
+    pitch: float  # rad, positive where the nose is down
+    cov: FloatArray  # (6, 6) of x, y, z, roll, pitch, yaw in the map frame, as in ROS
+
+    def with_planar(self, cov: FloatArray) -> Ground:
+        """With another covariance ``(3, 3)`` of x, y and yaw, which are then not correlated with the others."""
+        whole = self.cov.copy()
+        whole[PLANAR, :] = whole[:, PLANAR] = 0.0
+        whole[np.ix_(PLANAR, PLANAR)] = cov
+        return replace(self, cov=whole)
+
+
+PLANAR = (0, 1, 5)
+"""Rows of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """``T_map_base`` at one keyframe. ``cov`` is in the map frame."""
+
+    stamp_ns: int
+    pose: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+    mode: Mode = Mode.OK
+    decisions: tuple[Decision, ...] = ()
+    ground: Ground | None = None  # None: the floor is flat
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses over time. ``covs`` is in the map frame; None where unknown (a truth)."""
+
+    stamps_ns: IntArray  # (n,) strictly increasing
+    poses: FloatArray  # (n, 3)
+    covs: FloatArray | None = None  # (n, 3, 3)
+    ground: FloatArray | None = None  # (n, 3) height, roll and pitch; None: the floor is flat, or not known
+    ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw in the map frame
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def ground_at(self, i: int) -> Ground | None:
+        """What pose ``i`` has beside the planar one; None: the floor is flat."""
+        if self.ground is None or self.ground_covs is None:
+            return None
+        z, roll, pitch = self.ground[i].tolist()
+        return Ground(z, roll, pitch, self.ground_covs[i])
+
+    def interpolate(self, stamp_ns: int | IntArray) -> FloatArray:
+        """Poses between the known ones: linear in x and y, and in yaw the shorter way round.
+
+        Args:
+            stamp_ns: one time, or ``(m,)`` times, between the first and the last of ``stamps_ns``.
+
+        Returns:
+            ``(3,)`` for one time, else ``(m, 3)``.
+
+        Raises:
+            TrajectoryError: the trajectory is empty, or a time lies outside it.
+        """
+        if not len(self):
+            raise TrajectoryError("the trajectory is empty: nothing to interpolate")
+        asked = np.atleast_1d(np.asarray(stamp_ns, dtype=np.int64))
+        first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
+        outside = asked[(asked < first) | (asked > last)]
+        if outside.size:
+            raise TrajectoryError(
+                f"stamp {outside[0]} ns lies outside the trajectory; expected {first} to {last} ns. fgloc.Live "
+                "extrapolates beyond the last pose"
+            )
+        poses = se2.interpolate(self.stamps_ns, self.poses, asked)
+        return poses[0] if np.ndim(stamp_ns) == 0 else poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicTimes:
+    """When a topic had messages.
+
+    ``times`` are in seconds from the first estimate; of very many only one in ``every`` is kept.
+    """
+
+    times: FloatArray  # (n,)
+    count: int
+    every: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A value of the installation, as it was given and as a run found it; in the units of ``robot.yaml``."""
+
+    name: str
+    given: float
+    found: float
+    sigma: float  # of what was found
+    prior_sigma: float  # of what was given
+
+    @property
+    def off(self) -> float:
+        """How far what was given and what the measurements alone give are apart, in sigmas of both.
+
+        What was found lies between the two, by their sigmas; its expected square distance from the given value is the
+        difference of the variances.
+        """
+        spread = self.prior_sigma**2 - self.sigma**2
+        return (self.found - self.given) / math.sqrt(max(spread, 1e-6 * self.prior_sigma**2, 1e-30))
+
+    @property
+    def unpulled(self) -> float:
+        """The change that the measurements alone ask for, without the pull of the prior."""
+        share = 1.0 - (self.sigma / self.prior_sigma) ** 2 if self.prior_sigma > 0.0 else 1.0
+        return (self.found - self.given) / max(share, 0.05)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstallationFound:
+    """The whole installation state of a run ``(n,)``, with the prior that it began from."""
+
+    names: tuple[str, ...]
+    mean: FloatArray  # (n,)
+    cov: FloatArray  # (n, n)
+    prior_cov: FloatArray  # (n, n)
+    camera: Camera | None  # of corners, as the run used it
+    seen_by: str  # role whose stamps the sightings have
+    wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they had no messages
+    settings: tuple[Setting, ...] = ()  # all but the map's
+    landmarks: LandmarkMap | None = None  # of a known map, where they were found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """A whole run, ready to be evaluated and written."""
+
+    trajectory: Trajectory
+    modes: tuple[Mode, ...]  # one per pose
+    decisions: tuple[Decision, ...]
+    counts: Mapping[str, int]  # factors held, by kind
+    rejections: Mapping[str, int]  # items rejected, by reason
+    findings: tuple[Finding, ...]  # what is wrong and worth knowing, the gravest first
+    step_ms: FloatArray  # (n,) wall time of each update
+    wall_s: float
+    truth: Trajectory | None = None
+    landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
+    spans: Mapping[str, TopicTimes] = field(default_factory=dict)  # by topic
+    source: Path | None = None
+    found: InstallationFound | None = None
+    installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
+    cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
+    first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
+    config: Config | None = None  # as the run used it: with the mistakes undone
+    odometry: Trajectory | None = None  # odometry alone, beside the run; None: nothing measured the motion
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of all findings, the gravest first."""
+        return tuple(finding.text for finding in self.findings)
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Sentences of the findings because of which the poses are not to be trusted."""
+        return tuple(finding.text for finding in self.findings if finding.severity is Severity.ERROR)
+
+    def write(self, folder: Path) -> None:
+        """Write all files of the run, as ``fgloc smooth`` and ``fgloc online`` do; see ``docs/formats.md``.
+
+        Args:
+            folder: made if missing; an error leaves what was there as it was.
+
+        Raises:
+            OutputError: the folder cannot be written.
+            TrajectoryError: a pose is not finite.
+            CovarianceError: a covariance is not positive definite.
+        """
+        from fgloc.config import Config
+        from fgloc.evaluation.report import write_results
+
+        write_results(self, self.config or Config(), folder, "fgloc.RunResult.write")
