@@ -22,8 +22,8 @@ from benchmarks.common import Row, not_run
 from fgloc import se2
 from fgloc.config import load_config
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
+from fgloc.recording.storage import find_beside
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent, Event, TruthEvent

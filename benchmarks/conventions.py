@@ -33,8 +33,8 @@ from fgloc.config import Config, config_of
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.signals import SignalCollector
 from fgloc.errors import FglocError
-from fgloc.recording.files import find_beside
 from fgloc.recording.reader import Recording
+from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors.marker_pose import MarkerPose
 from fgloc.sensors.range_bearing import RangeBearing

@@ -43,7 +43,7 @@ from benchmarks.field_recordings import DATA, RECORDINGS, Recording
 from benchmarks.field_sheet import SHEET, SOUND, false_findings, found, right_cause
 from benchmarks.installed_runs import kept
 from fgloc import se2
-from fgloc.recording.outputs import read_tum
+from fgloc.files.outputs import read_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import FloatArray, IntArray, Trajectory
 

@@ -27,7 +27,7 @@ from benchmarks import identification_husky, identification_limits, identificati
 from benchmarks.common import Row, main, not_run
 from fgloc.calibration.multi_run import calibrate
 from fgloc.config import load_config
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 from fgloc.runner import run
 from fgloc.sensors.learned.card import Kinematics, Split
 from fgloc.sensors.learned.network import MotionModel

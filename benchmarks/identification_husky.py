@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks.common import Row
 from fgloc.config import load_config
-from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
+from fgloc.recording.storage import find_beside
 from fgloc.recording.truth import base_pose
 from fgloc.sensors.learned.card import Input, Split
 from fgloc.sensors.learned.sensor import load_model

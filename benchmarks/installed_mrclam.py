@@ -23,7 +23,7 @@ from benchmarks.common import Row, not_run
 from benchmarks.installed_runs import kept
 from benchmarks.installed_scores import errors
 from fgloc.config import load_config
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 from fgloc.runner import run
 from fgloc.types import Estimate, Step, Trajectory
 from fgloc_datasets import mrclam

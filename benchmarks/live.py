@@ -31,7 +31,7 @@ from fgloc import se2
 from fgloc.config import load_config
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose
-from fgloc.recording.cdr import Messages
+from fgloc.recording.messages import Messages
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import Storage
 from fgloc.sensors.markers.images import ImageEvent

@@ -41,8 +41,8 @@ from fgloc.ablation.failures import Scene, corrupt, generators
 from fgloc.config import load_config
 from fgloc.evaluation.consistency import nees
 from fgloc.evaluation.matching import match
+from fgloc.files.outputs import read_tum
 from fgloc.frames import quaternion_yaw
-from fgloc.recording.outputs import read_tum
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map

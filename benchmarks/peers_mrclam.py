@@ -25,7 +25,7 @@ from benchmarks.installed_mrclam import DATA, MODELS
 from fgloc import se2
 from fgloc.ablation.jobs import start_at_truth
 from fgloc.config import Config, load_config
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent

@@ -19,8 +19,8 @@ from benchmarks.common import Row, main, not_run
 from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import compute_metrics
-from fgloc.recording.files import find_beside
 from fgloc.recording.reader import open_recording
+from fgloc.recording.storage import find_beside
 from fgloc.runner import run
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map

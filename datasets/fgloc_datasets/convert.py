@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from fgloc.config import load_config
 from fgloc.errors import RecordingError
+from fgloc.files.outputs import write_text
 from fgloc.instrumentation import counted
-from fgloc.recording.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
 

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgloc.errors import ConfigError, RecordingError
-from fgloc.recording.outputs import write_text
+from fgloc.files.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message, new_bag, read_table, write_merged, write_robot

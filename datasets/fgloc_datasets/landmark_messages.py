@@ -104,7 +104,7 @@ class LandmarkMessages(MessageWriter):
     ) -> None:
         """``apriltag_msgs/AprilTagDetectionArray`` of corners (4, 2) [px] by id, clockwise from the top left.
 
-        The message counts from the first pixel's corner and holds the tag upside down (`fgloc.recording.decode`).
+        The message counts from the first pixel's corner and holds the tag upside down (`fgloc.recording.reader`).
         """
         detections = []
         for number, given in markers.items():

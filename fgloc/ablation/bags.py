@@ -11,7 +11,7 @@ from fgloc.ablation.jobs import Job, make_jobs
 from fgloc.ablation.suite import NOTHING, Cell
 from fgloc.config import Config
 from fgloc.errors import ConfigError, FglocError
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 
 _TAKEN = {"jobs"}  # the sweep's own folder
 

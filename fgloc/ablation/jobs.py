@@ -28,8 +28,8 @@ from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
+from fgloc.files.outputs import sha256_of, write_text
 from fgloc.frames import quaternion_yaw
-from fgloc.recording.outputs import sha256_of, write_text
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fgloc.errors import OutputError
-from fgloc.recording.outputs import write_json
+from fgloc.files.outputs import write_json
 
 _ATTEMPT = re.compile(r"(\w+) (\d+\.\d{6})")
 

@@ -30,7 +30,7 @@ from fgloc.evaluation.ablation_plots import FEWEST_FOR_BAND, Curves, Point, Trac
 from fgloc.evaluation.html import embedded, page
 from fgloc.evaluation.style import png
 from fgloc.files.atomic import atomic_folder
-from fgloc.recording.outputs import sha256_of, write_json, write_text
+from fgloc.files.outputs import sha256_of, write_json, write_text
 
 _SEVERITY = (
     f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, of {FEWEST_FOR_BAND} runs or more; "

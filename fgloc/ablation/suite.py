@@ -13,7 +13,7 @@ from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.files.settings import Settings, sentences
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 from fgloc.replay.options import RunMode
 
 _MOST_RUNS = 1_000_000

@@ -16,9 +16,9 @@ from fgloc.diagnosis.pairs import Noise
 from fgloc.diagnosis.signals import read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.files import find_beside
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording
+from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import FirstLook, FirstSection

@@ -11,7 +11,7 @@ import numpy as np
 from fgloc.calibration.installation import found_text, settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
-from fgloc.recording.files import find_beside
+from fgloc.recording.storage import find_beside
 from fgloc.replay.options import Progress
 from fgloc.runner import run
 from fgloc.sensors import registry

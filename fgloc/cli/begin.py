@@ -29,8 +29,8 @@ def init(
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
     from fgloc.calibration.first_settings import first_settings
     from fgloc.config import load_config
-    from fgloc.recording.files import find_beside
-    from fgloc.recording.outputs import write_text
+    from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import find_beside
 
     found = first_settings(bag)
     write_text(out, found.text)

@@ -30,8 +30,8 @@ def export(
     if mcap is None and kitti is None:
         raise ConfigError("nothing to write: give --mcap FILE or --kitti FILE, or both")
     from fgloc.evaluation.results import read_results
+    from fgloc.files.outputs import write_kitti
     from fgloc.recording.mcap_export import write_mcap
-    from fgloc.recording.outputs import write_kitti
 
     results = read_results(folder)
     if mcap is not None:

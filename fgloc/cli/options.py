@@ -77,7 +77,7 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
     from pydantic import ValidationError
 
     from fgloc.config import config_of, load_config
-    from fgloc.recording.files import find_beside
+    from fgloc.recording.storage import find_beside
     from fgloc.sensors import registry
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))

@@ -139,7 +139,7 @@ def calibrate(
     from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
-    from fgloc.recording.outputs import write_text
+    from fgloc.files.outputs import write_text
 
     check_out(out, folder=False)
     before = configured(bags[0], config, None)
@@ -164,7 +164,7 @@ def _localize(
 ) -> RunResult:
     """Run a recording, once it is certain that the results can be written."""
     # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
-    from fgloc.recording.files import find_beside
+    from fgloc.recording.storage import find_beside
     from fgloc.runner import run
 
     check_out(out)
@@ -177,7 +177,7 @@ def _write(result: RunResult, bag: Path, out: Path, command: str, figures: Seque
     """Write the results of a run."""
     from fgloc.config import Config
     from fgloc.evaluation.report import write_results
-    from fgloc.recording.outputs import sha256_of
+    from fgloc.files.outputs import sha256_of
 
     return write_results(result, result.config or Config(), out, command, sha256_of(bag), figures)
 

@@ -23,8 +23,8 @@ def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> N
     """Tell what a recording holds. Topics, rates, gaps, what a run would use, what looks wrong (also with the map)."""
     from fgloc.diagnosis.mistakes import inspect_all
     from fgloc.errors import MapError
-    from fgloc.recording.files import find_beside
     from fgloc.recording.info import format_info
+    from fgloc.recording.storage import find_beside
 
     if map_file is not None and not map_file.exists():
         raise MapError(f"{map_file}: there is no such file; give the map, or leave --map out")
@@ -46,7 +46,7 @@ def evaluate(
     """Compare two TUM trajectories."""
     from fgloc.evaluation import metrics
     from fgloc.evaluation.matching import match
-    from fgloc.recording.outputs import read_tum
+    from fgloc.files.outputs import read_tum
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
     matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)

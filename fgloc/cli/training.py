@@ -94,7 +94,7 @@ def evaluate_model(
 def _write_config(bags: list[Path], out: Path) -> None:
     """``--init``."""
     from fgloc.cli.options import configured
-    from fgloc.recording.outputs import write_text
+    from fgloc.files.outputs import write_text
     from fgloc_training.initial import look, missing, training_yaml
 
     check_out(out, folder=False)

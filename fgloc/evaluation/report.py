@@ -24,14 +24,7 @@ from fgloc.evaluation.style import FORMATS, Format, image_of, png
 from fgloc.evaluation.timeline import plot_timeline
 from fgloc.evaluation.trajectory_plot import plot_trajectory
 from fgloc.files.atomic import atomic_folder
-from fgloc.recording.outputs import (
-    write_bytes,
-    write_covariance_csv,
-    write_json,
-    write_steps_csv,
-    write_text,
-    write_tum,
-)
+from fgloc.files.outputs import write_bytes, write_covariance_csv, write_json, write_steps_csv, write_text, write_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
 from fgloc.sensors.maps import write_map

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgloc.errors import TrajectoryError
 from fgloc.files.documents import read_text
-from fgloc.recording.outputs import read_tum
+from fgloc.files.outputs import read_tum
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, Trajectory
 
 _MOST_BYTES = 1 << 30  # of each file

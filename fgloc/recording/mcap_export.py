@@ -15,7 +15,7 @@ from fgloc import se2
 from fgloc.errors import TrajectoryError
 from fgloc.files.atomic import atomic_file
 from fgloc.recording import standard_messages as standard
-from fgloc.recording.cdr import Messages
+from fgloc.recording.messages import Messages
 from fgloc.types import FloatArray, LandmarkMap, Mode, Trajectory
 
 ODOMETRY, POSE, PATH, MAP, TRUTH, TRUTH_PATH = (

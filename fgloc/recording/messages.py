@@ -1,9 +1,27 @@
-"""Message types: the standard ones and the marker packages that standard distributions lack."""
+"""Message types: definitions (embedded in a recording, or the defaults), their limits, and (de)serialization.
+
+rosbags writes code for each element of a fixed array of texts or messages (``string[100000000]`` takes 5 GB), and
+parses IDL by trying: two nested parentheses take a minute. So a definition is checked before it is used.
+"""
 
 from __future__ import annotations
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import Typesdict
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+from fgloc.errors import RecordingError
+from fgloc.recording.storage import Channel
+
+# --- Default definitions ----------------------------------------------------------------------------------------------
 
 # Public interface definitions of the packages named in the keys.
 _DEFINITIONS = {
@@ -42,3 +60,330 @@ def default_typestore(ros1: bool = False) -> Typestore:
     for name, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
+
+
+# --- Limits of what a definition may ask for --------------------------------------------------------------------------
+
+MAX_TEXT = 1 << 18  # characters of one definition with all that it uses; that of nav_msgs/Odometry has 9000
+_MAX_UNROLLED = 1000  # elements of a fixed array of texts or messages; AprilTag has 4 corners
+_FREE_VALUES, _VALUES_PER_BYTE = 16, 4
+_MAX_NESTED_SEQUENCES = 3
+_IDL_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|/\*.*?\*/|//[^\n]*|#[^\n]*|@\w+(?:::\w+)*|.', re.DOTALL)
+
+
+class DefinitionError(Exception):
+    """A definition that is damaged or hostile."""
+
+
+def plain_idl(text: str) -> str:
+    """IDL without comments, includes and annotations, which tell nothing of the serialization.
+
+    Raises:
+        DefinitionError: what is left has parentheses, or sequences nested deeply.
+    """
+    out: list[str] = []
+    depth, annotated, nested = 0, False, 0
+    for match in _IDL_TOKEN.finditer(text):
+        token = match[0]
+        if token.startswith(("/*", "//", "#")):
+            out.append(" ")
+        elif depth or (annotated and token == "("):
+            depth += {"(": 1, ")": -1}.get(token, 0)
+            annotated = depth > 0
+        elif token.startswith("@"):
+            annotated = True
+        elif annotated and token.isspace():
+            continue
+        else:
+            annotated = False
+            nested += {"<": 1, ">": -1}.get(token, 0)
+            if token == "(" or nested > _MAX_NESTED_SEQUENCES:
+                raise DefinitionError(f"{token!r} after {''.join(out)[-40:]!r}")
+            out.append(token)
+    return "".join(out)
+
+
+def check_sizes(definitions: Typesdict) -> None:
+    """Refuse definitions by which a short message stands for many values.
+
+    Raises:
+        DefinitionError: one of them does, or contains itself.
+    """
+    sizes: dict[str, tuple[int, int]] = {}
+    for name in definitions:
+        _size(name, definitions, sizes, ())
+
+
+def _size(
+    name: str, definitions: Mapping[str, Any], sizes: dict[str, tuple[int, int]], inside: tuple[str, ...]
+) -> tuple[int, int]:
+    """Values that are made of one message of a type, and the bytes that it takes at least."""
+    if name in sizes:
+        return sizes[name]
+    if name in inside or len(inside) > 50:
+        raise DefinitionError(f"{name} contains itself, or is nested too deeply")
+    if name not in definitions:
+        return 1, 1  # rosbags will miss it
+    values, size = 1, 0
+    for _, field in definitions[name][1]:
+        kind, content = field
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            element, length = content
+            each_values, each_size = _field_size(element, definitions, sizes, (*inside, name))
+            if kind == Nodetype.SEQUENCE:
+                if each_size == 0:
+                    raise DefinitionError(f"{name} has a sequence of messages without fields")
+                values, size = values + 1, size + 4
+                continue
+            numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
+            if length > _MAX_UNROLLED and not numbers:
+                raise DefinitionError(f"{name} has a fixed array of {length}")
+            values, size = values + (1 if numbers else length * each_values), size + length * each_size
+        else:
+            more_values, more_size = _field_size(field, definitions, sizes, (*inside, name))
+            values, size = values + more_values, size + more_size
+    if values > _FREE_VALUES + _VALUES_PER_BYTE * size:
+        raise DefinitionError(f"{name} makes {values} values of {size} bytes")
+    sizes[name] = values, size
+    return values, size
+
+
+def _field_size(
+    field: Any, definitions: Mapping[str, Any], sizes: dict[str, tuple[int, int]], inside: tuple[str, ...]
+) -> tuple[int, int]:
+    kind, content = field
+    if kind == Nodetype.NAME:
+        return _size(content, definitions, sizes, inside)
+    name = content[0]
+    return 1, 4 if name == "string" else {"16": 2, "32": 4, "64": 8}.get(name[-2:], 1)
+
+
+# --- Definitions that a recording embeds ------------------------------------------------------------------------------
+
+
+class Decoder:
+    """Deserializes messages of one recording.
+
+    Definitions that the recording embeds win; the defaults serve for the rest.
+
+    Attributes:
+        store: rosbags' typestore with the definitions used.
+        notes: what the user should know of the definitions used.
+    """
+
+    def __init__(self, ros1: bool, definitions: Iterable[tuple[str, MessageDefinition]]) -> None:
+        """Build the typestore.
+
+        Args:
+            ros1: messages are in ROS 1 serialization, else CDR.
+            definitions: message type and embedded definition (format NONE if there is none) of each topic in use.
+        """
+        embedded: Typesdict = {}
+        used, missing, damaged = set(), set(), set()
+        seen: set[tuple[str, str]] = set()
+        characters = 0
+        for message_type, definition in definitions:
+            used.add(message_type)
+            if definition.format == MessageDefinitionFormat.NONE:
+                missing.add(message_type)
+                continue
+            if (message_type, definition.data) in seen:
+                continue
+            seen.add((message_type, definition.data))
+            try:
+                characters += len(definition.data)
+                if characters > MAX_TEXT:
+                    raise DefinitionError(f"definitions of more than {MAX_TEXT} characters")
+                embedded.update(_parse(message_type, definition))
+            except Exception:  # the parser leaks what damaged text makes it meet
+                damaged.add(message_type)
+        self.store = get_typestore(Stores.EMPTY)
+        try:
+            needed = _needed(used, embedded, ros1)
+            check_sizes(needed)
+            self.store.register(needed)
+        except Exception:  # a definition that parses may still be nonsense
+            self.store = get_typestore(Stores.EMPTY)
+            self.store.register(_needed(used, {}, ros1))
+            damaged |= embedded.keys() & used
+        self._deserialize = self.store.deserialize_ros1 if ros1 else self.store.deserialize_cdr
+        self.notes: list[str] = []
+        name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
+        if missing:
+            self.notes.append(
+                f"The recording holds no definitions of {', '.join(sorted(missing))}: those of {name} are used."
+            )
+        if damaged:
+            self.notes.append(f"Damaged definitions of {', '.join(sorted(damaged))}: those of {name} are used.")
+
+    def deserialize(self, message_type: str, raw: bytes) -> Any:
+        """Deserialize. Raises whatever rosbags leaks on damaged bytes."""
+        return self._deserialize(raw, message_type)
+
+
+@cache
+def _default_definitions(ros1: bool) -> Typesdict:
+    return default_typestore(ros1).fielddefs
+
+
+def _needed(used: Iterable[str], embedded: Typesdict, ros1: bool) -> Typesdict:
+    """The definitions of some types and of all the types inside them: loading hundreds more takes a while.
+
+    The default definitions are loaded only if one is not embedded.
+    """
+    needed: Typesdict = {}
+    queue = list(used)
+    while queue:
+        name = queue.pop()
+        if name in needed:
+            continue
+        found = embedded.get(name) or _default_definitions(ros1).get(name)
+        if found is not None:
+            needed[name] = found
+            queue += [inner for _, field in found[1] for inner in _names(field)]
+    return needed
+
+
+def _names(field: Any) -> Iterator[str]:
+    """Message types that a field's description holds."""
+    kind, value = field
+    if kind == Nodetype.NAME:
+        yield value
+    elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        yield from _names(value[0])
+
+
+def _parse(message_type: str, definition: MessageDefinition) -> Typesdict:
+    if definition.format == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(definition.data, message_type)
+    types: Typesdict = {}
+    separator = "=" * 80 + "\n"
+    for part in definition.data.split(separator):
+        text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+        if text.strip():
+            types.update(get_types_from_idl(plain_idl(text)))
+    return types
+
+
+# --- ROS 2's serialization on the wire (CDR) --------------------------------------------------------------------------
+
+_HEADER = "std_msgs/msg/Header"
+_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # ROS 1 types that ROS 2 has, alike, under another name
+_ROS1_NAMES = {ros2: ros1 for ros1, ros2 in _RENAMED.items()}
+_NUMPY = {"byte": "uint8", "char": "uint8", "bool": "bool"}  # the other element types have numpy's names
+
+
+@dataclass(frozen=True, slots=True)
+class FieldLayout:
+    """One field of a message type."""
+
+    name: str
+    element: str  # "float64", "string", ..., or the name of a message type
+    nested: bool  # whether the element is a message
+    array: int | None = None  # length of an array
+    sequence: int | None = None  # most elements of a sequence, 0 if unbounded
+
+
+class Messages:
+    """Message types and their (de)serialization."""
+
+    def __init__(self, store: Typestore | None = None, ros1: bool = False) -> None:
+        """Use the types of a store; None: ROS 2 Humble's and those of the marker packages.
+
+        ``ros1``: `to_cdr` is given messages in ROS 1 serialization.
+        """
+        self._store = default_typestore() if store is None else store
+        self._ros1 = ros1
+
+    @classmethod
+    def of_channel(cls, channel: Channel, ros1: bool) -> Messages:
+        """With the definitions that a recording embeds for one of its channels; those of ROS 1 as ROS 2 has them."""
+        store = Decoder(ros1, [(channel.message_type, channel.definition)]).store
+        if ros1 and _HEADER in store.fielddefs:
+            constants, fields = store.fielddefs[_HEADER]
+            header = {_HEADER: (constants, [field for field in fields if field[0] != "seq"])}
+            definitions = {**store.fielddefs, **header}
+            store = get_typestore(Stores.EMPTY)
+            store.register(definitions)
+        return cls(store, ros1)
+
+    def layout(self, message_type: str) -> dict[str, tuple[FieldLayout, ...]]:
+        """Fields of a message type and of all the types inside it, by type.
+
+        Raises:
+            RecordingError: one of the types is not known.
+        """
+        found: dict[str, tuple[FieldLayout, ...]] = {}
+        queue = [message_type]
+        while queue:
+            name = queue.pop()
+            if name in found:
+                continue
+            known = name if name in self._store.fielddefs else _ROS1_NAMES.get(name, name)
+            if known not in self._store.fielddefs:
+                raise RecordingError(f"no definition of the message type {name}; record it with its definition")
+            found[name] = tuple(_field(field, description) for field, description in self._store.fielddefs[known][1])
+            queue += [field.element for field in found[name] if field.nested]
+        return found
+
+    def definition(self, message_type: str) -> str:
+        """The text of a message type and of all the types inside it, as recordings embed it."""
+        return str(self._store.generate_msgdef(message_type, ros_version=2)[0])
+
+    def decode(self, message_type: str, cdr: bytes) -> Any:
+        """The message. Raises whatever rosbags leaks on damaged bytes."""
+        return self._store.deserialize_cdr(cdr, message_type)
+
+    def encode(self, message_type: str, values: Mapping[str, Any]) -> bytes:
+        """CDR of a message; fields that ``values`` lacks are zero or empty, nested messages are mappings themselves.
+
+        Raises:
+            KeyError: a value that is no field of the type.
+        """
+        return bytes(self._store.serialize_cdr(self._build(message_type, values), message_type))
+
+    def to_cdr(self, message_type: str, raw: bytes) -> bytes:
+        """CDR of a recorded message. Raises whatever rosbags leaks on damaged bytes."""
+        return bytes(self._store.ros1_to_cdr(raw, message_type)) if self._ros1 else raw
+
+    def _build(self, message_type: str, values: Mapping[str, Any]) -> Any:
+        fields = [_field(name, description) for name, description in self._store.fielddefs[message_type][1]]
+        if unknown := values.keys() - {field.name for field in fields}:
+            raise KeyError(f"{message_type} has no {', '.join(sorted(unknown))}")
+        return self._store.types[message_type](**{field.name: self._value(field, values) for field in fields})
+
+    def _value(self, field: FieldLayout, values: Mapping[str, Any]) -> Any:
+        given = values.get(field.name)
+        if field.array is None and field.sequence is None:
+            if field.nested:
+                return self._build(field.element, given or {})
+            if given is not None:
+                return given
+            return "" if field.element == "string" else np.zeros(1, _dtype(field.element))[0].item()
+        items: Sequence[Any] = given if given is not None else ()
+        if field.nested:
+            return [self._build(field.element, item) for item in items]
+        if field.element == "string":
+            return list(items)
+        return np.asarray(items if given is not None else np.zeros(field.array or 0), dtype=_dtype(field.element))
+
+
+def ros2_type(message_type: str) -> str:
+    """What ROS 2 calls a recorded message type."""
+    return _RENAMED.get(message_type, message_type)
+
+
+def _dtype(element: str) -> str:
+    return _NUMPY.get(element, element)
+
+
+def _field(name: str, description: Any) -> FieldLayout:
+    kind, value = description
+    if kind == Nodetype.BASE:
+        return FieldLayout(name, value[0], False)
+    if kind == Nodetype.NAME:
+        return FieldLayout(name, value, True)
+    inner = _field(name, value[0])
+    if kind == Nodetype.ARRAY:
+        return FieldLayout(name, inner.element, inner.nested, array=value[1])
+    return FieldLayout(name, inner.element, inner.nested, sequence=value[1])

@@ -6,12 +6,331 @@ flips bits. The index is not needed to walk the records, and a damaged chunk is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shutil
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
 
-from fgloc.recording.recover_mcap import recover_mcap
-from fgloc.recording.recover_ros1 import recover_ros1
-from fgloc.recording.recover_sqlite import recover_sqlite
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Writer
+
+from fgloc.recording.limits import Budget, check_tables, decompressed
+
+# --- MCAP -------------------------------------------------------------------------------------------------------------
+
+_MAX_NS = 2**63 - 1
+
+
+class McapSink:
+    """A new MCAP file that takes messages of any channel."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._writer = McapWriter(self._file, compression=CompressionType.NONE)
+        self._writer.start(profile="ros2", library="fgloc")
+        self.messages = 0
+
+    def channel(self, topic: str, message_type: str, encoding: str, definition: bytes, serialization: str) -> int:
+        """Add a channel; returns its id."""
+        text = definition.decode(errors="replace").encode()  # damaged text must not stop the reader
+        schema_id = self._writer.register_schema(message_type, encoding, text)
+        return int(self._writer.register_channel(topic, serialization, schema_id))
+
+    def write(self, channel_id: int, received_ns: int, data: bytes) -> None:
+        """Add a message, unless its time is impossible."""
+        if 0 <= received_ns <= _MAX_NS:
+            self._writer.add_message(channel_id, received_ns, data, received_ns)
+            self.messages += 1
+
+    def close(self) -> None:
+        """Write the index."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+
+
+def recover_mcap(path: Path, target: Path) -> tuple[int, float]:
+    """Copy what can be read of an MCAP; returns the number of messages and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: its chunks expand to more than its size allows.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for record, _ in _mcap_records(path):  # first for the channels: those of a damaged chunk are repeated at the end
+        if isinstance(record, Schema):
+            schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            channels.setdefault(record.id, record)
+    lost = 0.0
+    with closing(McapSink(target)) as sink:
+        ids: dict[int, int] = {}
+        for record, sound in _mcap_records(path):
+            lost = 1.0 - sound / path.stat().st_size
+            if not isinstance(record, Message) or record.channel_id not in channels:
+                continue
+            if record.channel_id not in ids:
+                channel = channels[record.channel_id]
+                schema = schemas.get(channel.schema_id) or Schema(data=b"", encoding="", id=0, name="")
+                ids[record.channel_id] = sink.channel(
+                    channel.topic, schema.name, schema.encoding, schema.data, channel.message_encoding
+                )
+            sink.write(ids[record.channel_id], record.log_time, record.data)
+    return sink.messages, lost
+
+
+def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
+    """Readable records, each with the number of the file's bytes that were sound so far; ends with (None, bytes)."""
+    size, budget = path.stat().st_size, Budget(path)
+    budget.start_pass()
+    with path.open("rb") as file:
+        read = len(file.read(8))  # magic
+        while len(frame := file.read(9)) == 9:
+            opcode, length = struct.unpack("<BQ", frame)
+            payload = file.read(min(length, size - file.tell()))
+            complete = len(payload) == length
+            if opcode == Opcode.CHUNK:
+                records, sound = _chunk_records(payload, complete, budget)
+            elif complete:
+                records = [_mcap_record(opcode, payload)]
+                sound = True
+            else:
+                records, sound = [], False
+            if sound:
+                read += 9 + len(payload)
+            for record in records:
+                yield record, read
+            if not complete:
+                break
+        else:
+            read += len(frame) if len(frame) == 8 else 0  # the magic at the end
+    yield None, read
+
+
+def _chunk_records(payload: bytes, complete: bool, budget: Budget) -> tuple[list[McapRecord | None], bool]:
+    """Records of a chunk, and whether it was sound. Of one that was cut short, the leading ones if not compressed."""
+    try:
+        chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
+    except Exception:  # damaged bytes make the parser raise anything
+        return [], False
+    if chunk.compression:
+        budget.check(chunk.uncompressed_size)
+        budget.spend(chunk.uncompressed_size)
+    try:
+        if complete:
+            data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+            plain = replace(chunk, compression="", data=data)
+            return list(breakup_chunk(plain, validate_crc=True)), True
+        if chunk.compression:
+            return [], False
+    except Exception:  # damaged bytes make the parser raise anything
+        return [], False
+    records: list[McapRecord | None] = []
+    stream = BytesIO(chunk.data)
+    while len(frame := stream.read(9)) == 9:
+        opcode, length = struct.unpack("<BQ", frame)
+        inner = stream.read(min(length, len(chunk.data)))
+        if len(inner) < length:
+            break
+        records.append(_mcap_record(opcode, inner))
+    return records, True
+
+
+def _mcap_record(opcode: int, payload: bytes) -> McapRecord | None:
+    """A schema, channel or message; None for anything else, or if it is damaged."""
+    stream = ReadDataStream(BytesIO(payload))
+    record: McapRecord | None = None
+    try:
+        if opcode == Opcode.SCHEMA:
+            record = Schema.read(stream)
+        elif opcode == Opcode.CHANNEL:
+            record = Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            record = Message.read(stream, len(payload))
+    except Exception:  # damaged bytes make the parser raise anything
+        return None
+    return record
+
+
+# --- rosbag2's SQLite -------------------------------------------------------------------------------------------------
+
+
+def sqlite_journals(path: Path) -> list[Path]:
+    """Journals that a killed recorder left beside a database: they hold, or undo, its last messages."""
+    candidates = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+    return [file for file in candidates if file.is_file() and file.stat().st_size > 0]
+
+
+def recover_sqlite(path: Path, target: Path) -> tuple[int, float]:
+    """Copy the readable rows into an MCAP; returns their number and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: a table is a query.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(100)
+    intended = size
+    if len(header) == 100:
+        page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
+        intended = max(size, (65536 if page == 1 else page) * pages)
+    source, options = path, "mode=ro&immutable=1"
+    if journals := sqlite_journals(path):
+        source, options = target.parent / path.name, "mode=rw"
+        for original in (path, *journals):
+            shutil.copyfile(original, target.parent / original.name)
+    with closing(McapSink(target)) as sink:
+        try:
+            with closing(sqlite3.connect(f"file:{quote(str(source.absolute()))}?{options}", uri=True)) as database:
+                check_tables(database, path)
+                _copy_rows(database, sink, Budget(path))
+        except sqlite3.Error:
+            pass  # damaged beyond the rows already copied
+    return sink.messages, 1.0 - size / intended
+
+
+def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> None:
+    budget.start_pass()
+    database.execute("PRAGMA writable_schema=ON")  # or SQLite refuses a file that is shorter than its header says
+    database.text_factory = lambda raw: raw.decode(errors="replace")
+    definitions: dict[str, tuple[str, str]] = {}
+    try:
+        rows = database.execute(
+            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT 10000"
+        )
+        definitions = {str(name): (str(encoding), str(text)) for name, encoding, text in rows}
+    except sqlite3.Error:
+        pass  # older bags have none
+    ids: dict[int, int] = {}
+    for topic_id, name, kind, serialization in database.execute(
+        "SELECT id, name, type, serialization_format FROM topics LIMIT 10000"
+    ):
+        encoding, text = definitions.get(str(kind), ("", ""))
+        ids[topic_id] = sink.channel(str(name), str(kind), encoding, text.encode(), str(serialization))
+    last, step = 0, 1
+    while step < 2**40:  # past a damaged page the next sound row is looked for further and further away
+        try:
+            rows = database.execute(
+                "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id", (last + step,)
+            )
+            for row_id, topic_id, received_ns, data in rows:
+                if row_id <= last:
+                    return  # a damaged tree that leads in circles
+                last, step = row_id, 1
+                if topic_id in ids and isinstance(received_ns, int) and isinstance(data, bytes):
+                    budget.spend(len(data))
+                    sink.write(ids[topic_id], received_ns, data)
+            return
+        except sqlite3.DatabaseError:
+            step *= 2
+
+
+# --- ROS 1 bags -------------------------------------------------------------------------------------------------------
+
+
+def recover_ros1(path: Path, target: Path) -> tuple[int, float]:
+    """Copy what can be read of a ROS 1 bag; returns the number of messages and the share of the bytes that is lost.
+
+    Raises:
+        TooLargeError: its chunks expand to more than its size allows.
+    """
+    budget = Budget(path)
+    budget.start_pass()
+    size = path.stat().st_size
+    read = messages = 0
+    connections: dict[int, Connection] = {}
+    known: dict[tuple[str, str], Connection] = {}
+    with Writer(target) as writer, path.open("rb") as file:
+        read += len(file.readline(64))  # magic
+        for header, data, sound in _ros1_records(file, size):
+            if header.get("op") == b"\x05":
+                inner, sound = _ros1_chunk(header, data, sound, budget)
+            else:
+                inner = [(header, data)] if sound else []
+            read += 8 + sum(5 + len(k) + len(v) for k, v in header.items()) + len(data) if sound else 0
+            for record, content in inner:
+                try:
+                    if record["op"] == b"\x07":
+                        number = struct.unpack("<L", record["conn"])[0]
+                        if number not in connections:
+                            connections[number] = _ros1_connection(writer, record, content, known)
+                    elif record["op"] == b"\x02":
+                        number = struct.unpack("<L", record["conn"])[0]
+                        sec, nsec = struct.unpack("<LL", record["time"])
+                        writer.write(connections[number], sec * 10**9 + nsec, content)
+                        messages += 1
+                except (KeyError, struct.error, UnicodeDecodeError):
+                    continue  # a damaged record, or one of a connection that was lost
+    return messages, max(0.0, 1.0 - read / size)
+
+
+def _ros1_connection(
+    writer: Writer, record: dict[str, bytes], content: bytes, known: dict[tuple[str, str], Connection]
+) -> Connection:
+    topic, fields = record["topic"].decode(), _ros1_fields(content)
+    kind = fields["type"].decode().replace("/", "/msg/", 1)
+    if (topic, kind) not in known:
+        known[topic, kind] = writer.add_connection(
+            topic, kind, msgdef=fields["message_definition"].decode(), md5sum=fields["md5sum"].decode()
+        )
+    return known[topic, kind]
+
+
+def _ros1_records(file: BinaryIO, size: int) -> Iterator[tuple[dict[str, bytes], bytes, bool]]:
+    """Header fields, data, and whether the data is complete."""
+    while len(raw := file.read(4)) == 4:
+        length = struct.unpack("<L", raw)[0]
+        header = file.read(min(length, size))
+        raw = file.read(4)
+        if len(header) < length or len(raw) < 4:
+            return
+        length = struct.unpack("<L", raw)[0]
+        data = file.read(min(length, size))
+        try:
+            fields = _ros1_fields(header)
+        except (ValueError, struct.error):
+            fields = {}
+        yield fields, data, len(data) == length and bool(fields)
+
+
+def _ros1_fields(header: bytes) -> dict[str, bytes]:
+    fields, position = {}, 0
+    while position < len(header):
+        length = struct.unpack_from("<L", header, position)[0]
+        name, _, value = header[position + 4 : position + 4 + length].partition(b"=")
+        fields[name.decode()] = value
+        position += 4 + length
+    return fields
+
+
+def _ros1_chunk(
+    header: dict[str, bytes], data: bytes, complete: bool, budget: Budget
+) -> tuple[list[tuple[dict[str, bytes], bytes]], bool]:
+    compression = header.get("compression", b"").decode(errors="replace")
+    if compression != "none":
+        if not complete or compression not in ("bz2", "lz4"):
+            return [], False
+        try:
+            data = decompressed(compression, data, budget.limit)
+        except Exception:  # damaged bytes
+            return [], False
+        budget.spend(len(data))
+    records = [(fields, content) for fields, content, sound in _ros1_records(BytesIO(data), len(data)) if sound]
+    return records, complete or bool(records)
+
+
+# --- All kinds --------------------------------------------------------------------------------------------------------
 
 _RECOVER = {"ros1": recover_ros1, "mcap": recover_mcap, "sqlite3": recover_sqlite}
 

@@ -1,4 +1,4 @@
-"""Poses and maps as standard ROS messages: nested mappings for `fgloc.recording.cdr.Messages.encode`."""
+"""Poses and maps as standard ROS messages: nested mappings for `fgloc.recording.messages.Messages.encode`."""
 
 from __future__ import annotations
 

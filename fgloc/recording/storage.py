@@ -1,21 +1,23 @@
-"""The files of a recording, opened with rosbags: one interface for all kinds, one error type, salvage where needed."""
+"""The files of a recording: found, opened with rosbags behind one interface for all kinds, salvaged where damaged."""
 
 from __future__ import annotations
 
 import hashlib
 import heapq
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
 from rosbags.interfaces import MessageDefinition
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from fgloc.errors import RecordingError
-from fgloc.recording.files import EXPECTED, find_files, kind_of
+from fgloc.files.documents import HostileError, parse, plain
 from fgloc.recording.limits import (
     REWINDS,
     Budget,
@@ -26,8 +28,145 @@ from fgloc.recording.limits import (
     decompressed,
     opening,
 )
-from fgloc.recording.recover import recover
-from fgloc.recording.recover_sqlite import sqlite_journals
+from fgloc.recording.recover import recover, sqlite_journals
+
+# --- metadata.yaml of a rosbag2 folder; hostile contents are refused --------------------------------------------------
+
+_MAX_BYTES = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class BagMetadata:
+    """What of ``metadata.yaml`` is needed to find and to judge the storage files."""
+
+    files: tuple[Path, ...]
+    compressed: str  # by rosbag2 itself: "file", "message", or "" (also where the storage format compresses)
+    message_count: int | None
+
+
+def read_metadata(folder: Path) -> BagMetadata | None:
+    """Read ``folder/metadata.yaml``; None if it is absent or is too damaged to be understood.
+
+    Raises:
+        RecordingError: the file is absurdly large or deep, has aliases that expand without bound, or names a path
+            outside the folder.
+    """
+    path = folder / "metadata.yaml"
+    try:
+        if not path.is_file():
+            return None
+        if path.stat().st_size > _MAX_BYTES:
+            raise RecordingError(f"{path}: {path.stat().st_size} bytes, expected less than {_MAX_BYTES}; {_REMEDY}")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return None
+    try:
+        root = parse(text, str(path))
+        content = {} if root is None else plain(root)
+        information = content["rosbag2_bagfile_information"]
+        names = [_inside(path, name) for name in information["relative_file_paths"]]
+        count = information.get("message_count")
+        mode = str(information.get("compression_mode")).lower()
+        return BagMetadata(
+            files=tuple(folder / name for name in dict.fromkeys(names)),
+            compressed=mode if mode in ("file", "message") else "",
+            message_count=count if isinstance(count, int) and count >= 0 else None,
+        )
+    except HostileError as error:
+        raise RecordingError(f"{path}: {error}; {_REMEDY}") from error
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+_REMEDY = "do not trust this recording, or delete its metadata.yaml to have the storage files opened directly"
+
+
+def _inside(path: Path, name: Any) -> str:
+    """File name of a relative path; ros2 foxy put the bag's folder in front of it."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise ValueError(name)
+    parts = PureWindowsPath(name).parts  # splits at / and at \
+    if PurePosixPath(name).is_absolute() or PureWindowsPath(name).anchor or ".." in parts:
+        raise RecordingError(f"{path}: relative_file_paths names {name!r}, expected a file in {path.parent}; {_REMEDY}")
+    return parts[-1]
+
+
+# --- Which files belong to a recording --------------------------------------------------------------------------------
+
+_KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
+_MOST_NAMED = 5
+EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
+
+
+def find_beside(bag: Path, name: str) -> Path | None:
+    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
+    folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
+    """Storage files of a recording, in order, and its metadata where used.
+
+    Raises:
+        RecordingError: there are none, or it is not clear which.
+    """
+    if not path.exists():
+        raise RecordingError(f"{path}: does not exist; {EXPECTED}")
+    if not path.is_dir():
+        kind_of(path)
+        if not path.is_file():
+            raise RecordingError(f"{path}: not a regular file; {EXPECTED}")
+        return None, (path,)
+    metadata = read_metadata(path)
+    if metadata is not None:
+        present = tuple(file for file in metadata.files if file.is_file())
+        if present:
+            missing = [file.name for file in metadata.files if file not in present]
+            if missing:
+                notes.append(f"Named by metadata.yaml but missing: {', '.join(missing)}.")
+            return metadata, present
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for file in sorted(path.iterdir(), key=_natural):
+        if file.is_file() and file.suffix in (".mcap", ".db3"):
+            groups[file.suffix].append(file)
+    if not groups:
+        inside = _recordings_in(path)
+        hint = f"give one of the recordings in it: {', '.join(inside)}" if inside else EXPECTED
+        raise RecordingError(f"{path}: a folder without .mcap or .db3; {hint}")
+    if len(groups) > 1:
+        names = ", ".join(file.name for files in groups.values() for file in files)
+        raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
+    files = next(iter(groups.values()))
+    state = "damaged" if (path / "metadata.yaml").exists() else "missing"
+    notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
+    return None, tuple(files)
+
+
+def _recordings_in(folder: Path) -> list[str]:
+    """Names of ROS 1 bags and rosbag2 folders in a folder, the first ones."""
+    found = [*folder.glob("*.bag"), *(file.parent for file in folder.glob("*/metadata.yaml"))]
+    return sorted({str(path) for path in found})[:_MOST_NAMED]
+
+
+def kind_of(path: Path) -> str:
+    """Kind ("ros1", "mcap" or "sqlite3"), by the suffix.
+
+    Raises:
+        RecordingError: it is none of theirs.
+    """
+    suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
+    if suffix not in _KINDS:
+        raise RecordingError(f"{path}: unknown kind {suffix!r}; {EXPECTED}")
+    return _KINDS[suffix]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key: run_2 before run_10."""
+    parts = "".join(c if c.isdigit() else f" {c} " for c in path.name).split()
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+# --- Reading ----------------------------------------------------------------------------------------------------------
 
 RawMessage = tuple[str, str, int, bytes]  # topic, message type (pkg/msg/Name), received_ns, serialized message
 

@@ -12,7 +12,7 @@ from command_line import fgloc
 
 import fgloc_datasets
 from fgloc import se2
-from fgloc.recording.outputs import write_tum
+from fgloc.files.outputs import write_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Trajectory
 from fgloc_datasets.bag import BagWriter

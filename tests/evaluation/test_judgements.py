@@ -9,7 +9,7 @@ import pytest
 from run_results import START_NS, figure_eight
 
 from fgloc.evaluation.judgements import episodes, gravest, judgements
-from fgloc.recording.outputs import write_steps_csv
+from fgloc.files.outputs import write_steps_csv
 from fgloc.types import Decision, Finding, Severity
 
 ALARM = 30.0

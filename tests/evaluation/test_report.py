@@ -17,7 +17,7 @@ from fgloc.errors import OutputError
 from fgloc.evaluation import report
 from fgloc.evaluation.html import plotly
 from fgloc.evaluation.metrics import compute_metrics
-from fgloc.recording.outputs import read_tum
+from fgloc.files.outputs import read_tum
 from fgloc.types import Mode, Trajectory
 
 FILES = {

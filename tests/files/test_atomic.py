@@ -250,7 +250,7 @@ def test_kernel_that_refuses_to_write_keeps_the_old_file(tmp_path):
     """A limit on the size of files is a write that the kernel refuses, whatever our code calls."""
     (tmp_path / "a").write_text("old")
     code = (
-        "import resource, sys; from pathlib import Path; from fgloc.recording.outputs import write_text\n"
+        "import resource, sys; from pathlib import Path; from fgloc.files.outputs import write_text\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try: write_text(Path(sys.argv[1]), 'x' * 10000)\n"
         "except Exception as error: print(type(error).__name__, error)"

@@ -10,7 +10,7 @@ from fgloc.ablation.suite import load_suite
 from fgloc.config import Config, load_config
 from fgloc.errors import ConfigError, FglocError, MapError, TrajectoryError
 from fgloc.files.documents import HostileError, parse, plain
-from fgloc.recording.outputs import read_tum
+from fgloc.files.outputs import read_tum
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import load_dictionary
 from tests.fuzz.hostile_yaml import SYNTAX, numeric_cases, numeric_keys

@@ -17,8 +17,8 @@ from fgloc.config import GateConfig, load_config, role_names
 from fgloc.errors import FglocError, ModelError
 from fgloc.files.documents import parse, plain
 from fgloc.intake.validation import EventValidator
-from fgloc.recording.decode import converters_of
 from fgloc.recording.messages import default_typestore
+from fgloc.recording.reader import converters_of
 from fgloc.sensors.learned.sensor import load_model
 from tests.fuzz import zygote
 from tests.fuzz.cases import recording_cases

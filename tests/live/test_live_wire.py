@@ -20,9 +20,8 @@ from fgloc.live.wire.names import dds_topic, dds_type, ros_topic, ros_type
 from fgloc.live.wire.participant import Participant, Publication, Sample
 from fgloc.live.wire.participant import Writer as WireWriter
 from fgloc.live.wire.play import Player
-from fgloc.recording.cdr import Messages
-from fgloc.recording.decode import converters_of
-from fgloc.recording.reader import open_recording
+from fgloc.recording.messages import Messages
+from fgloc.recording.reader import converters_of, open_recording
 
 
 @pytest.fixture(autouse=True)

@@ -16,8 +16,8 @@ from fgloc import se2
 from fgloc.cli import app
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.evaluation.results import read_results
+from fgloc.files.outputs import write_kitti
 from fgloc.recording.mcap_export import TYPES, write_mcap
-from fgloc.recording.outputs import write_kitti
 from fgloc.robust.decision_log import mode_decisions
 from fgloc.types import Mode, Trajectory
 

@@ -13,10 +13,8 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import get_types_from_msg
 
 from fgloc.errors import RecordingError
-from fgloc.recording.definition_limits import DefinitionError, check_sizes, plain_idl
-from fgloc.recording.definitions import Decoder
 from fgloc.recording.limits import Budget, TooLargeError, check_sqlite, decompressed
-from fgloc.recording.messages import default_typestore
+from fgloc.recording.messages import Decoder, DefinitionError, check_sizes, default_typestore, plain_idl
 from fgloc.sensors.markers.images import ImageError, ImageEvent, decode
 from tests.fuzz.hostile_bags import make_all, mcap_bomb, megabytes
 from tests.fuzz.processes import run

@@ -14,8 +14,8 @@ import pytest
 from run_results import START_NS, figure_eight
 
 from fgloc.errors import OutputError, TrajectoryError
+from fgloc.files import outputs
 from fgloc.files.atomic import atomic_folder
-from fgloc.recording import outputs
 from fgloc.types import Trajectory
 
 LINE = "1.0 0 0 0 0 0 0 1\n"

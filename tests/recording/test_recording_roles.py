@@ -9,8 +9,7 @@ from recording_bags import write_drive
 
 from fgloc.config import RecordingConfig, TopicsConfig
 from fgloc.errors import RecordingError
-from fgloc.recording.reader import open_recording
-from fgloc.recording.roles import TopicInfo, select_roles
+from fgloc.recording.reader import TopicInfo, open_recording, select_roles
 
 ODOMETRY, TWIST, IMU = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Imu"
 POSE, COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"

@@ -12,8 +12,8 @@ from world_bags import write_world
 
 from fgloc import se2
 from fgloc.errors import EstimatorError
-from fgloc.recording.files import find_beside
-from fgloc.recording.outputs import write_tum
+from fgloc.files.outputs import write_tum
+from fgloc.recording.storage import find_beside
 from fgloc.runner import run
 from fgloc.types import Mode, RunResult, TruthEvent
 

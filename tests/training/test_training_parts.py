@@ -13,7 +13,7 @@ from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from fgloc import se2
 from fgloc.errors import RecordingError, TrajectoryError
-from fgloc.recording.outputs import write_covariance_csv, write_tum
+from fgloc.files.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
 from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import ControlEvent, Trajectory

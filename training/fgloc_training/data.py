@@ -18,7 +18,7 @@ from scipy.signal import savgol_filter
 
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
-from fgloc.recording.outputs import read_tum
+from fgloc.files.outputs import read_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up

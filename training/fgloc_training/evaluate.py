@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2, norm
 
-from fgloc.recording.outputs import write_text
+from fgloc.files.outputs import write_text
 from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import FloatArray

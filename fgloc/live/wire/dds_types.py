@@ -7,7 +7,7 @@ from typing import Any
 
 from fgloc.errors import WireError
 from fgloc.live.wire.names import dds_type
-from fgloc.recording.cdr import FieldLayout
+from fgloc.recording.messages import FieldLayout
 
 
 def cdr_type(message_type: str, layout: Mapping[str, Sequence[FieldLayout]]) -> type[Any]:

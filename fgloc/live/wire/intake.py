@@ -12,8 +12,7 @@ from fgloc.errors import WireError
 from fgloc.live.wire.clock import WireClock
 from fgloc.live.wire.names import OWN
 from fgloc.live.wire.participant import Participant, Publication, Sample
-from fgloc.recording.decode import TF_TYPES, events_of
-from fgloc.recording.roles import TopicInfo, select_roles
+from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles
 from fgloc.types import Event
 
 SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found

@@ -14,7 +14,7 @@ from weakref import WeakValueDictionary
 from fgloc.errors import WireError
 from fgloc.live.wire.dds_types import cdr_type
 from fgloc.live.wire.names import dds_topic, ros_topic, ros_type
-from fgloc.recording.cdr import Messages
+from fgloc.recording.messages import Messages
 
 if TYPE_CHECKING:
     from cyclonedds.domain import Domain

@@ -11,7 +11,7 @@ from fgloc.errors import FglocError, WireError
 from fgloc.live.wire.clock import TOPIC as CLOCK
 from fgloc.live.wire.clock import TYPE as CLOCK_TYPE
 from fgloc.live.wire.participant import Participant, Writer
-from fgloc.recording.cdr import Messages, ros2_type
+from fgloc.recording.messages import Messages, ros2_type
 from fgloc.recording.storage import Channel, Storage
 
 _TICK_S = 0.01  # time between two messages of /clock
