@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from fgloc.config import load_config
-from fgloc.replay.options import RunMode
+from fgloc.replay import RunMode
 from fgloc.runner import run
 from fgloc.types import FloatArray, RunResult
 

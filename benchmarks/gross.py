@@ -31,7 +31,7 @@ from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.errors import FglocError
-from fgloc.replay.options import RunMode
+from fgloc.replay import RunMode
 from fgloc.runner import run
 from fgloc_datasets.sim.camera import RenderError
 

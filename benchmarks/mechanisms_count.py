@@ -19,7 +19,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parent.parent / "fgloc"
 DECIDING = (
     "localizer.py",
-    "replay/smoothing.py",
+    "replay.py",
     "stats.py",
     "robust/*.py",
     "relocalization/*.py",

@@ -11,11 +11,10 @@ from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.diagnosis.sanity import Sanity
 from fgloc.intake.keyframing import KeyframeBuilder
-from fgloc.intake.stream_facts import StreamFacts
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
-from fgloc.sensor_setup import SensorSetup, recorded_setup, sensor_setup
+from fgloc.sensor_setup import SensorSetup, StreamFacts, recorded_setup, sensor_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor
 from fgloc.sensors.equipment import LandmarkSensor, MotionPredictor, MotionSensors, Odometer, PoseSensors

@@ -14,7 +14,7 @@ from fgloc.config import Config, Section, config_of, config_type, load_config
 from fgloc.errors import ConfigError
 from fgloc.files.settings import Settings, sentences
 from fgloc.recording.storage import find_beside
-from fgloc.replay.options import RunMode
+from fgloc.replay import RunMode
 
 _MOST_RUNS = 1_000_000
 _WHEN = {"when.burst_s": "duration", "when.share": "share of the messages"}

@@ -12,7 +12,7 @@ from fgloc.calibration.installation import found_text, settings_found, with_sett
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.recording.storage import find_beside
-from fgloc.replay.options import Progress
+from fgloc.replay import Progress
 from fgloc.runner import run
 from fgloc.sensors import registry
 from fgloc.sensors.base import with_values

@@ -27,8 +27,7 @@ from fgloc.graph.installation import Installation, InstallationEstimate, install
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.graph.observation import Observations
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.replay.options import Progress
-from fgloc.replay.smoothing import smooth_run
+from fgloc.replay import Progress, smooth_run
 from fgloc.sensors import registry
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from fgloc.instrumentation import Advance, Listener, end, tell, told_to
 
 if TYPE_CHECKING:
-    from fgloc.replay.options import Progress
+    from fgloc.replay import Progress
 
 LINE_S = 10.0  # between two lines on a pipe; shorter work says nothing
 _RATE_S = 1.0  # work has to have gone on for this long before a rate, and so the time left, can be given

@@ -5,15 +5,121 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 from fgloc.config import GateConfig, KeyframesConfig
-from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
-from fgloc.intake.clock_notes import ClockNotes
-from fgloc.intake.event_buffer import EventBuffer
-from fgloc.intake.punctuality import MAX_PATIENCE_NS, Punctuality
+from fgloc.intake.clocks import ClockGuard, ClockNotes, ClockVerdict
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.types import ControlEvent, Event, MotionEvent, SensorEvent, SightingsEvent, Step
+
+# --- Events in order of stamp -----------------------------------------------------------------------------------------
+
+E = TypeVar("E", bound=Event)
+
+
+class EventBuffer(Generic[E]):
+    """Events of one kind in order of stamp; ``stamps`` are theirs [ns]."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.stamps: list[int] = []
+        self._events: list[E] = []
+
+    def insert(self, event: E) -> bool:
+        """Put in order of stamp; False if the topic has a message of this stamp already."""
+        stamp = event.stamp_ns
+        if not self.stamps or stamp > self.stamps[-1]:
+            self.stamps.append(stamp)
+            self._events.append(event)
+            return True
+        at = bisect_right(self.stamps, stamp)
+        k = at
+        while k > 0 and self.stamps[k - 1] == stamp:
+            k -= 1
+            if self._events[k].topic == event.topic:
+                return False
+        self.stamps.insert(at, stamp)
+        self._events.insert(at, event)
+        return True
+
+    def window(self, start_ns: int, end_ns: int, beyond: bool = True) -> tuple[E, ...]:
+        """Events inside, the last one at or before the start and, if ``beyond``, the first one at or after the end."""
+        first = max(bisect_right(self.stamps, start_ns) - 1, 0)
+        last = bisect_left(self.stamps, end_ns) + 1 if beyond else bisect_right(self.stamps, end_ns)
+        return tuple(self._events[first:last])
+
+    def after(self, stamp_ns: int) -> int | None:
+        """The first stamp later than this."""
+        at = bisect_right(self.stamps, stamp_ns)
+        return self.stamps[at] if at < len(self.stamps) else None
+
+    def trim(self, start_ns: int) -> None:
+        """Forget what no window from this start on needs."""
+        first = bisect_right(self.stamps, start_ns) - 1
+        if first > 0:
+            del self.stamps[:first]
+            del self._events[:first]
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.stamps.clear()
+        self._events.clear()
+
+
+# --- How late topics are ----------------------------------------------------------------------------------------------
+
+MAX_PATIENCE_NS = 1_000_000_000
+_LEAST_SETTLED_NS = 10_000_000  # a message of any topic may be this late: threads and networks take turns
+_REMEMBERED_NS = 60_000_000_000  # for so long it is remembered how late a topic was
+
+
+@dataclass(slots=True)
+class Peak:
+    """Largest value of late: of the running minute and of the one before it."""
+
+    value_ns: int = 0
+    before_ns: int = 0
+    since_ns: int = 0
+
+    def add(self, value_ns: int, now_ns: int) -> None:
+        """Take in a value at a time [ns]."""
+        if now_ns - self.since_ns > _REMEMBERED_NS:
+            twice = now_ns - self.since_ns > 2 * _REMEMBERED_NS
+            self.before_ns, self.value_ns, self.since_ns = 0 if twice else self.value_ns, 0, now_ns
+        self.value_ns = max(self.value_ns, value_ns)
+
+    @property
+    def ns(self) -> int:
+        """That value [ns]."""
+        return max(self.value_ns, self.before_ns)
+
+
+@dataclass(slots=True)
+class Punctuality:
+    """One topic's punctuality, as it is measured."""
+
+    newest_ns: int
+    received_ns: int  # of its last message
+    least_ns: int  # of `patience_ns`
+    held: bool = False  # a message's value holds until the next
+    late_ns: Peak = field(default_factory=Peak)  # by the newest stamp of all, of messages that came too late
+    disorder_ns: Peak = field(default_factory=Peak)  # how far it has stepped back behind its own newest stamp
+    lag_ns: Peak = field(default_factory=Peak)  # how far its messages were behind the newest stamp of all
+
+    @property
+    def patience_ns(self) -> int:
+        """How long, by the newest stamp of all, its word is waited for."""
+        return max(self.least_ns, min(5 * self.late_ns.ns // 4, MAX_PATIENCE_NS))
+
+    @property
+    def settled_ns(self) -> int:
+        """After so long, by the newest stamp of all, nothing older of this topic is expected."""
+        return max(_LEAST_SETTLED_NS, min(5 * self.lag_ns.ns // 4, MAX_PATIENCE_NS))
+
+
+# --- Keyframes --------------------------------------------------------------------------------------------------------
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot

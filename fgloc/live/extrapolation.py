@@ -18,7 +18,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict, spatial
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
-from fgloc.intake.clock_guard import ClockGuard, ClockVerdict
+from fgloc.intake.clocks import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.robust.motion_sources import MotionSources

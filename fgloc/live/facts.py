@@ -26,7 +26,7 @@ _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
 
 
 class LiveFacts:
-    """What has come in so far, as `fgloc.intake.stream_facts.StreamFacts` has it.
+    """What has come in so far, as `fgloc.sensor_setup.StreamFacts` has it.
 
     A role counts as there once everything is known that its sensor is built from: for images and marker corners, the
     calibration and the mounting of the camera too.

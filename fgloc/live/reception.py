@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fgloc.config import Config
-from fgloc.intake.topic_clocks import Source, TopicClocks, source_of
+from fgloc.intake.clocks import Source, TopicClocks, source_of
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.live.facts import LiveFacts
 from fgloc.live.facts import role_of as known_role

@@ -28,9 +28,9 @@ from fgloc import se2
 from fgloc.config import TopicsConfig, load_config
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.frames import yaw_quaternion
-from fgloc.intake.topic_activity import TopicActivity
 from fgloc.recording.reader import TopicInfo, select_roles
 from fgloc.recording.storage import find_beside
+from fgloc.replay import TopicActivity
 from fgloc.runner import run
 from fgloc.sensor_setup import given_pose
 from fgloc.sensors.gyro import ImuEvent

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from event_makers import command, imu, joints, ns, odometry
 
-from fgloc.intake.topic_clocks import TopicClocks
+from fgloc.intake.clocks import TopicClocks
 from fgloc.sensors.markers.images import CornersEvent
 
 RESET_S = 10.0

@@ -12,8 +12,7 @@ import fgloc as fgloc_package
 from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.recording.reader import open_recording
-from fgloc.replay.outcome import Outcome
-from fgloc.runner import run
+from fgloc.runner import Outcome, run
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.types import Finding, Mode, Severity
 from fgloc_datasets.bag import BagWriter

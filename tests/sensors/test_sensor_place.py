@@ -46,7 +46,7 @@ def test_the_transform_is_used_and_nothing_is_said(tmp_path):
 
 
 def test_a_sensor_that_first_speaks_late_has_its_place(tmp_path, monkeypatch):
-    monkeypatch.setattr("fgloc.intake.stream_facts._SCAN_EVENTS", 20)
+    monkeypatch.setattr("fgloc.sensor_setup._SCAN_EVENTS", 20)
     assert measured_range(assembled(tmp_path, first_ns=1_500_000_000)) == pytest.approx(2.3)
 
 

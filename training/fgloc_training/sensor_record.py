@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fgloc.config import Config
-from fgloc.intake.event_buffer import EventBuffer
+from fgloc.intake.keyframing import EventBuffer
 from fgloc.sensors.base import Mounting, WheelJoints
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.card import Signals, signals_of

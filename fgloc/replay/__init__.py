@@ -1,1 +1,0 @@
-"""Recorded events through the loop, and the smoothing of what came out."""
