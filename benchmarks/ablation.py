@@ -22,8 +22,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.common import Row, main, not_run
-from fgloc.ablation.jobs import Job, make_jobs
-from fgloc.ablation.records import Record, attempts, record_path
+from fgloc.ablation.jobs import Job, Record, attempts, make_jobs, record_path
 from fgloc.ablation.suite import Suite, expand
 from fgloc.ablation.sweep import sweep
 from fgloc_datasets import mrclam

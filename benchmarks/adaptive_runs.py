@@ -21,10 +21,11 @@ from pydantic import TypeAdapter
 
 from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
 from benchmarks.adaptive_scores import Figures, lost, score
-from fgloc.ablation.failures import AnyFailure, Failure, Scene, corrupt, generators
+from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
+from fgloc.sensors.failures import Failure, Scene
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent

@@ -11,11 +11,10 @@ import numpy as np
 
 from benchmarks.adaptive_recordings import Recorded, slip_intervals
 from fgloc import se2
-from fgloc.ablation.failures import Failure
-from fgloc.ablation.failures.kidnap import Kidnap
-from fgloc.ablation.failures.sightings import MovedMarker
+from fgloc.ablation.failures import Kidnap, MovedMarker
 from fgloc.config import Config
 from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.sensors.failures import Failure
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Decision, Event, FloatArray, Mode, RunResult
 

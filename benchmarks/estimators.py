@@ -21,8 +21,7 @@ from benchmarks.common import Row, main, not_run
 from benchmarks.installed_recordings import SEEDS, Take, folder, load, prepare
 from benchmarks.installed_runs import CASES, floor, kept, processor_times
 from benchmarks.installed_scores import Scores, carried, errors, lost_share
-from fgloc.ablation.failures.kidnap import Kidnap
-from fgloc.ablation.failures.lift import Lift
+from fgloc.ablation.failures import Kidnap, Lift
 
 KINDS = ("fixed_lag", "ekf")
 _QUICK = ("none", "frozen")

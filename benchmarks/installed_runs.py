@@ -40,11 +40,10 @@ from benchmarks.installed_scores import (
     refused_share,
 )
 from benchmarks.textbook import PIPELINES, Textbook
-from fgloc.ablation.failures.kidnap import Kidnap
-from fgloc.ablation.failures.lift import Lift
+from fgloc.ablation.failures import Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import FglocError
-from fgloc.evaluation.matching import match
+from fgloc.evaluation.metrics import match
 from fgloc.files.atomic import atomic_file
 from fgloc.localizer import Localizer
 from fgloc.types import Estimate, Step, Trajectory

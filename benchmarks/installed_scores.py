@@ -14,8 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from fgloc.config import Config
-from fgloc.evaluation.consistency import nees
-from fgloc.evaluation.metrics import match_result
+from fgloc.evaluation.metrics import match_result, nees
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Decision, Event, FloatArray, IntArray, LandmarkMap, Mode, RunResult
 

@@ -16,13 +16,11 @@ from benchmarks.installed_scores import Errors, carried, errors, lost_share
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_robots import robot, robot_chain
 from benchmarks.mechanisms_switch import watched
-from fgloc.ablation.failures import Failure
-from fgloc.ablation.failures.kidnap import Kidnap
-from fgloc.ablation.failures.lift import Lift
+from fgloc.ablation.failures import Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import FglocError
-from fgloc.evaluation.consistency import nees
-from fgloc.evaluation.metrics import match_result
+from fgloc.evaluation.metrics import match_result, nees
+from fgloc.sensors.failures import Failure
 from fgloc.types import RunResult
 
 _KINDS = {"frozen": "frozen", "onewheel": "left_wheel_dead"}  # the fault of the wheels in a case

@@ -37,13 +37,13 @@ from benchmarks.installed_recordings import SEEDS, Take, load, prepare
 from benchmarks.installed_runs import floor, kept, processor_times
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
-from fgloc.ablation.failures import Scene, corrupt, generators
+from fgloc.ablation.failures import corrupt, generators
 from fgloc.config import load_config
-from fgloc.evaluation.consistency import nees
-from fgloc.evaluation.matching import match
+from fgloc.evaluation.metrics import match, nees
 from fgloc.files.outputs import read_tum
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
+from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent

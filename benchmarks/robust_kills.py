@@ -106,8 +106,7 @@ def _nothing(_: object) -> None:
 
 def _ablation(place: Path, bag: Path) -> Writer:
     """The report of a sweep whose runs are done, beside their records."""
-    from fgloc.ablation.jobs import execute, make_jobs
-    from fgloc.ablation.records import read_record
+    from fgloc.ablation.jobs import execute, make_jobs, read_record
     from fgloc.ablation.report import write_report
     from fgloc.ablation.suite import expand, load_suite
 

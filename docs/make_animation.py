@@ -17,7 +17,8 @@ from matplotlib.patches import Ellipse
 from PIL import Image
 
 from fgloc import se2
-from fgloc.ablation.failures import Scene, corrupt, generators
+from fgloc.ablation.failures import corrupt, generators
+from fgloc.sensors.failures import Scene
 from fgloc.ablation.suite import Suite
 from fgloc.config import load_config
 from fgloc.evaluation.metrics import match_result

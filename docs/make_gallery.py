@@ -17,7 +17,8 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from fgloc.ablation.failures import Scene, corrupt, generators
+from fgloc.ablation.failures import corrupt, generators
+from fgloc.sensors.failures import Scene
 from fgloc.ablation.suite import FailureEntry
 from fgloc.config import load_config
 from fgloc.evaluation.report import write_results

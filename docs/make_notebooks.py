@@ -20,7 +20,7 @@ from pathlib import Path
 import fgloc
 from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error
-from fgloc.evaluation.trajectory_plot import plot_trajectory
+from fgloc.evaluation.plots import plot_trajectory
 from fgloc_datasets import SAMPLE
 
 sample = SAMPLE.parent
@@ -53,7 +53,8 @@ FAILURE = [
 from pathlib import Path
 
 import fgloc
-from fgloc.ablation.failures import Scene, corrupt, generators
+from fgloc.ablation.failures import corrupt, generators
+from fgloc.sensors.failures import Scene
 from fgloc.ablation.suite import FailureEntry
 from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error

@@ -34,7 +34,7 @@ ONLY = {  # the places that may import a library
     "mcap": {"recording"},
     "gtsam": {"graph"},
     "cv2": {"sensors", "fgloc_datasets"},
-    "matplotlib": {"evaluation", "fgloc_datasets", "fgloc_training"},
+    "matplotlib": {"evaluation", "ablation", "fgloc_datasets", "fgloc_training"},
     "typer": {"cli"},
     "rich": {"cli"},
     "dask": {"ablation"},

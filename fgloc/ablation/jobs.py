@@ -1,60 +1,168 @@
-"""One run of a sweep: named by the hash of its inputs, and executed once."""
+"""One run of a sweep: named by the hash of its inputs, executed once, and its record."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import re
 import resource
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 import fgloc
 from fgloc import se2
-from fgloc.ablation.failures import Scene, corrupt, generators
-from fgloc.ablation.records import Cost, Record, Track, log_attempt, owner_path, read_record, write_record
+from fgloc.ablation.failures import corrupt, generators
 from fgloc.ablation.suite import Cell
 from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
-from fgloc.files.outputs import sha256_of, write_text
+from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors import registry
+from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError
 from fgloc.types import Mode, RawEvent, RunResult, TruthEvent
 
+# --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
+
+_ATTEMPT = re.compile(r"(\w+) (\d+\.\d{6})")
+
+
+class Track(BaseModel):
+    """Estimate and truth at common times, for a picture [m]."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    estimate: list[tuple[float, float]]
+    truth: list[tuple[float, float]]
+
+
+class Cost(BaseModel):
+    """What a run took; never the same twice."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seconds: float
+    cpu_s: float
+    peak_mb: float
+
+
+class Record(BaseModel):
+    """What is known of a job after its run. All but ``cost`` depends on the inputs alone."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key: str
+    outcome: Literal["done", "refused", "crashed"]
+    error: str = ""  # of a refused run the message, of a crashed one the traceback
+    figures: dict[str, Any] = {}  # of Metrics, without times
+    modes: dict[str, float] = {}  # mode -> share of the poses
+    mistakes: tuple[str, ...] = ()  # of the set-up
+    affected: dict[str, int] = {}  # events that the failures changed, by kind
+    track: Track | None = None
+    cost: Cost
+
+
+def record_path(out: Path, key: str) -> Path:
+    """Where a job's record is."""
+    return out / "jobs" / f"{key}.json"
+
+
+def owner_path(out: Path, folder: str) -> Path:
+    """Where the key of the job is that wrote the files of a folder last."""
+    return out / "jobs" / f"{folder}.owner"
+
+
+def read_record(out: Path, key: str) -> Record | None:
+    """A job's record; None if it has none, or if its file is damaged: then the job has to run again."""
+    path = record_path(out, key)
+    try:
+        return Record.model_validate_json(path.read_bytes())
+    except (FileNotFoundError, ValidationError):
+        return None
+
+
+def write_record(out: Path, record: Record) -> None:
+    """Write a job's record, whole or not at all.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    write_json(record_path(out, record.key), record.model_dump(mode="json"))
+
+
+def attempts(out: Path) -> list[tuple[str, float]]:
+    """Key and time [s since 1970] of every run that was begun, in order, without lines that a full disk cut short."""
+    path = out / "jobs" / "attempts.log"
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines() if path.exists() else []
+    return [(match[1], float(match[2])) for match in map(_ATTEMPT.fullmatch, lines) if match]
+
+
+def log_attempt(out: Path, key: str) -> None:
+    """Note that a run begins.
+
+    Raises:
+        OutputError: it cannot be noted.
+    """
+    path = out / "jobs" / "attempts.log"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab", buffering=0) as file:
+            file.write(f"{key} {time.time():.6f}\n".encode())  # one short write: lines of several workers do not mix
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); finished runs are kept") from error
+
+
+@contextmanager
+def only_sweep(out: Path) -> Iterator[None]:
+    """Keep other sweeps out of a folder: two would run the same jobs, and each replace the other's report.
+
+    Raises:
+        OutputError: another one is at work in it, or it cannot be written.
+    """
+    path = out / "jobs" / ".lock"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"{out}: another sweep is at work in it; wait for it, or give another folder") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
+# --- Jobs -------------------------------------------------------------------------------------------------------------
+
 _TRACK_POINTS = 200
 _SOURCES_LEFT_OUT = (
-    "ablation/bags.py",
     "ablation/report.py",
-    "ablation/tables.py",
     "ablation/sweep.py",
-    "evaluation/plots.py",
-    "evaluation/ablation_plots.py",
-    "evaluation/html.py",
-    "evaluation/report.py",
-    "evaluation/report_tables.py",
-    "evaluation/error_scale.py",
     "evaluation/interactive.py",
+    "evaluation/plots.py",
+    "evaluation/report.py",
     "evaluation/style.py",
-    "evaluation/time_axis.py",
-    "evaluation/timeline.py",
-    "evaluation/trajectory_plot.py",
 )
 _COSTS = {"real_time_factor", "step_ms"}
 

@@ -1,36 +1,403 @@
-"""The report of an ablation: one page, the matrix and every run as CSV, and all of it as JSON."""
+"""The report of an ablation: one page, the matrix failure × variant and every run as CSV, and all of it as JSON."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fgloc.ablation.jobs import Job, code_hash
-from fgloc.ablation.records import Record
-from fgloc.ablation.suite import NOTHING, Suite
-from fgloc.ablation.tables import (
-    ATE,
-    METRICS,
-    Entry,
-    Run,
-    join,
-    matrix,
-    matrix_csv,
-    rows,
-    runs_csv,
-    sentence,
-    worst,
-    worth,
-)
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from scipy import stats
+
+from fgloc.ablation.jobs import Job, Record, code_hash
+from fgloc.ablation.suite import NOTHING, Cell, Suite
 from fgloc.config import files_of
-from fgloc.evaluation.ablation_plots import FEWEST_FOR_BAND, Curves, Point, Tracks, plot_severity, plot_tracks
-from fgloc.evaluation.html import embedded, page
-from fgloc.evaluation.style import png
+from fgloc.evaluation.report import embedded, page
+from fgloc.evaluation.style import BLUE, DPI, GREEN, NORMAL, SMALL, WIDTH, plain_label, png, tidy
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import sha256_of, write_json, write_text
+from fgloc.stats import rounded
+
+# --- From records to the matrix, and what a failure costs -------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A column of figures."""
+
+    key: str  # of metrics.json; "coverage.3" leads inside
+    label: str
+    factor: float = 1.0  # from the SI value to what is shown
+    form: str = ".3g"
+
+    def of(self, record: Record) -> float | None:
+        """The record's value in shown units; None if it has none."""
+        name, _, inner = self.key.partition(".")
+        value = record.figures.get(name)
+        if inner and isinstance(value, Mapping):
+            value = value.get(inner)
+        return value * self.factor if isinstance(value, int | float) else None
+
+
+METRICS = (
+    Metric("ate_mean_m", "ATE mean [mm]", 1000.0, ".3g"),
+    Metric("yaw_mae_deg", "yaw MAE [°]", 1.0, ".3g"),
+    Metric("drift_percent", "drift [%]", 1.0, ".3g"),
+    Metric("nees_over_3", "NEES / 3", 1.0, ".2f"),
+    Metric("coverage.3", "within 3σ [%]", 100.0, ".1f"),
+)
+ATE = METRICS[0]
+_NOTHING = 0.005  # a change of the error by a smaller share is none
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A cell with its record."""
+
+    cell: Cell
+    key: str
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One figure of one failure, severity and variant, over recordings and seeds."""
+
+    failure: str
+    severity: float | None
+    variant: str
+    metric: Metric
+    values: tuple[float, ...]
+    runs: int  # that were asked for; fewer values: the others gave none
+
+    @property
+    def mean(self) -> float | None:
+        """Mean over the runs that gave a value."""
+        return float(np.mean(self.values)) if self.values else None
+
+    @property
+    def spread(self) -> float | None:
+        """Standard deviation over the runs; None for fewer than two."""
+        return float(np.std(self.values, ddof=1)) if len(self.values) > 1 else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 % confidence interval of the mean (Student's t); None for fewer than two runs."""
+        mean, spread, n = self.mean, self.spread, len(self.values)
+        if mean is None or spread is None:
+            return None
+        half = float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
+        return mean - half, mean + half
+
+    @property
+    def text(self) -> str:
+        """``mean ± spread (n)``, or how many of the runs failed."""
+        if self.mean is None:
+            return f"no result (0 of {self.runs})"
+        shown = f"{self.mean:{self.metric.form}}"
+        if self.spread is not None:
+            shown = " ± ".join(rounded(self.mean, self.spread))
+        count = f"{len(self.values)}" if len(self.values) == self.runs else f"{len(self.values)} of {self.runs}"
+        return f"{shown} ({count})"
+
+
+def join(jobs: Iterable[Job], records: Mapping[str, Record]) -> list[Run]:
+    """All runs in the suite's order."""
+    return [Run(job.cell, job.key, records[job.key]) for job in jobs]
+
+
+def rows(suite: Suite) -> list[tuple[str, float | None]]:
+    """Failures with their severities, none first."""
+    listed = [(f.name, severity) for f in suite.failures for severity, _ in f.severities()]
+    return [(NOTHING, None), *listed]
+
+
+def matrix(suite: Suite, runs: Sequence[Run]) -> list[Entry]:
+    """Every figure of every failure, severity and variant."""
+    entries = []
+    for failure, severity in rows(suite):
+        for variant in suite.variants:
+            here = select(runs, failure, severity, variant.name)
+            for metric in METRICS:
+                values = tuple(v for run in here if (v := metric.of(run.record)) is not None)
+                entries.append(Entry(failure, severity, variant.name, metric, values, len(here)))
+    return entries
+
+
+def select(runs: Iterable[Run], failure: str, severity: float | None, variant: str) -> list[Run]:
+    """Runs of one row and column."""
+    wanted = (failure, severity, variant)
+    return [run for run in runs if (run.cell.failure, run.cell.severity, run.cell.variant) == wanted]
+
+
+def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
+    """What a failure costs the first variant at its last severity, run by run against the same without failure."""
+    entry = next(f for f in suite.failures if f.name == failure)
+    severity = list(entry.severities())[-1][0]
+    variant = suite.variants[0].name
+    here = select(runs, failure, severity, variant)
+    at = "" if entry.severity is None else f" at {severity:g} {entry.severity.unit}".rstrip()
+    name = failure[0].upper() + failure[1:]
+    if not any(run.record.affected for run in here if run.record.outcome == "done") and all(
+        run.record.outcome == "done" for run in here
+    ):
+        return f"{name}{at} changed no message of these recordings: they show nothing about it."
+    without = {run.cell.recording: ATE.of(run.record) for run in select(runs, NOTHING, None, variant)}
+    pairs = [
+        (before, after)
+        for run in here
+        if (after := ATE.of(run.record)) is not None and (before := without[run.cell.recording]) is not None
+    ]
+    lost = f"; {len(here) - len(pairs)} of {len(here)} runs gave no figure" if len(pairs) < len(here) else ""
+    if not pairs:
+        return f"{name}{at} left no run of '{variant}' with a figure ({len(here)} asked for)."
+    return f"{name}{at}: {_change(pairs, variant)}{lost}."
+
+
+def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
+    """How the mean error changes from the first of each pair to the second, if it measurably does."""
+    before, after = np.mean(pairs, axis=0)
+    runs = f"over {len(pairs)} run{'s' if len(pairs) > 1 else ''}"
+    if len(pairs) > 1:
+        more = np.diff(pairs)
+        within = "" if _measurable(pairs) else ", within its spread"
+        runs += f" (change {' ± '.join(rounded(float(more.mean()), float(more.std(ddof=1)), '+'))} mm{within})"
+        if within:
+            return f"no measurable change of the mean error of '{variant}', {before:.3g} mm, {runs}"
+    if abs(after - before) < _NOTHING * before:
+        return f"the mean error of '{variant}' stays at {after:.3g} mm {runs}"
+    way = "rises" if after > before else "falls"
+    return f"the mean error of '{variant}' {way} from {before:.3g} to {after:.3g} mm {runs}"
+
+
+def _measurable(pairs: Sequence[tuple[float, float]]) -> bool:
+    """Whether the mean change exceeds its spread, or of many runs what chance makes of it; one run has no spread."""
+    if len(pairs) < 2:
+        return True
+    more, n = np.diff(pairs), len(pairs)
+    spread = float(more.std(ddof=1))
+    by_chance = float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
+    return abs(float(more.mean())) > min(spread, by_chance)
+
+
+def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
+    """What a variant changes against the first one, where that is most: the same recordings, failures and seeds.
+
+    Returns:
+        A sentence; None if no run of both gave a figure.
+    """
+    first = suite.variants[0].name
+    found = []
+    for failure, severity in rows(suite):
+        theirs = {(r.cell.recording, r.cell.seed): ATE.of(r.record) for r in select(runs, failure, severity, variant)}
+        pairs = [
+            (ours, other)
+            for r in select(runs, failure, severity, first)
+            if (ours := ATE.of(r.record)) is not None
+            and (other := theirs.get((r.cell.recording, r.cell.seed))) is not None
+        ]
+        if pairs:
+            ours, other = np.mean(pairs, axis=0).tolist()
+            ratio = other / max(ours, 1e-9)
+            found.append((_measurable(pairs), ratio, failure, severity, ours, other, len(pairs)))
+    if not found:
+        return None
+    plain = next((f for f in found if f[2] == NOTHING), None)
+    measurable, ratio, failure, severity, ours, other, n = max(found, key=lambda f: f[:2])
+    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
+    at = "" if severity is None else f" at {severity:g} {units.get(failure, '')}".rstrip()
+    under = "without failure" if failure == NOTHING else f"under '{failure}'{at}"
+    count = f"{n} run{'s' if n > 1 else ''}"
+    if not measurable:
+        most = f"{other:.3g} mm instead of {ours:.3g} mm {under}"
+        return (
+            f"'{variant}': no measurable change against '{first}'; the largest, {most}, is within its spread ({count})."
+        )
+    text = f"'{variant}': mean error {other:.3g} mm instead of {ours:.3g} mm of '{first}' {under} "
+    text += f"({ratio:.1f} times, {count})"
+    if plain is not None and failure != NOTHING:
+        text += f"; without failure {plain[5]:.3g} instead of {plain[4]:.3g} mm"
+        text += "" if plain[0] else ", within its spread"
+    return f"{text}."
+
+
+def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
+    """The run of the first variant with the largest error; None if none has a track."""
+    variant = suite.variants[0].name
+    found = [
+        (ate, k)
+        for k, run in enumerate(runs)
+        if (run.cell.failure, run.cell.variant) == (failure, variant)
+        and run.record.track is not None
+        and (ate := ATE.of(run.record)) is not None
+    ]
+    return runs[max(found)[1]] if found else None
+
+
+def matrix_csv(entries: Iterable[Entry]) -> str:
+    """The matrix, one figure a row, in the units that the labels name."""
+    head = ("failure", "severity", "variant", "figure", "mean", "spread", "low_95", "high_95", "n", "runs")
+    out = [
+        (
+            e.failure,
+            e.severity,
+            e.variant,
+            e.metric.label,
+            e.mean,
+            e.spread,
+            *(e.interval or (None, None)),
+            len(e.values),
+            e.runs,
+        )
+        for e in entries
+    ]
+    return _csv(head, out)
+
+
+def runs_csv(runs: Iterable[Run]) -> str:
+    """Every run with its figures, in the units that the labels name."""
+    head = ("recording", "failure", "severity", "variant", "seed", "outcome", *(m.label for m in METRICS), "key")
+    out = [
+        (
+            run.cell.recording,
+            run.cell.failure,
+            run.cell.severity,
+            run.cell.variant,
+            run.cell.seed,
+            run.record.outcome,
+            *(metric.of(run.record) for metric in METRICS),
+            run.key,
+        )
+        for run in runs
+    ]
+    return _csv(head, out)
+
+
+def _csv(head: Sequence[str], content: Iterable[Sequence[object]]) -> str:
+    buffer = io.StringIO()
+    table = csv.writer(buffer, lineterminator="\n")
+    table.writerow(head)
+    table.writerows(content)
+    return buffer.getvalue()
+
+
+# --- Pictures: error over severity, and the worst track of each failure -----------------------------------------------
+
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#555555")  # Okabe and Ito
+_COLUMNS = 3
+_SINGLE_WIDTH = 3.5  # inches: one column of a page
+FEWEST_FOR_BAND = 5  # runs: of fewer each is drawn, as an interval would say more about Student's t than about them
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A mean at one severity, with its interval if there is one, and the values of the runs."""
+
+    severity: float
+    mean: float
+    interval: tuple[float, float] | None
+    values: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """One small plot: error over the severity of a failure, one curve per variant."""
+
+    title: str
+    unit: str
+    curves: Mapping[str, Sequence[Point]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """One small map: positions of estimate and truth [m]."""
+
+    title: str
+    estimate: Sequence[tuple[float, float]]
+    truth: Sequence[tuple[float, float]]
+
+
+def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
+    """Small plots side by side, all with one meaning of color.
+
+    Bands are the intervals of five runs or more; of fewer runs every one is a dot.
+    """
+    names = list(dict.fromkeys(name for plot in plots for name in plot.curves))
+    columns = 1 if len(plots) == 1 else 2 if len(plots) == 2 else 4  # of the legend: what the plots' width has room for
+    figure, axes = _grid(len(plots), 1.9, below=0.18 * math.ceil(len(names) / columns))
+    for ax, plot in zip(axes, plots, strict=True):
+        for name, points in plot.curves.items():
+            _draw_curve(ax, name, points, _COLORS[names.index(name) % len(_COLORS)])
+        ax.set_title(plain_label(plot.title), fontsize=NORMAL)
+        ax.set_xlabel(plain_label(plot.unit), fontsize=SMALL)
+        ax.set_ylim(bottom=0.0)
+    axes[0].set_ylabel(label, fontsize=SMALL)
+    handles = {name: h for ax in axes for h, name in zip(*ax.get_legend_handles_labels(), strict=True)}
+    look: dict[str, Any] = dict(ncols=columns, fontsize=SMALL, frameon=False)
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", **look)
+    return figure
+
+
+def _draw_curve(axes: Axes, name: str, points: Sequence[Point], color: str) -> None:
+    axes.plot(
+        [p.severity for p in points],
+        [p.mean for p in points],
+        "o-",
+        color=color,
+        lw=1.3,
+        ms=3.5,
+        label=plain_label(name),
+    )
+    banded = [(p.severity, *p.interval) for p in points if p.interval and len(p.values) >= FEWEST_FOR_BAND]
+    if banded:
+        severity, low, high = np.array(banded).T
+        axes.fill_between(severity, np.maximum(low, 0.0), high, color=color, alpha=0.15, lw=0)
+    single = [(p.severity, v) for p in points if 1 < len(p.values) < FEWEST_FOR_BAND for v in p.values]
+    if single:
+        axes.plot(*np.array(single).T, ".", color=color, ms=3, alpha=0.6)
+
+
+def plot_tracks(plots: Sequence[Tracks]) -> Figure:
+    """Small maps side by side: the estimate over the truth, axes equal."""
+    figure, axes = _grid(len(plots), 2.2, below=0.2)
+    for ax, plot in zip(axes, plots, strict=True):
+        ax.plot(*np.array(plot.truth).T, color="#999999", lw=2.4)
+        ax.plot(*np.array(plot.estimate).T, color=BLUE, lw=1.1)
+        ax.plot(*plot.truth[0], marker="o", ms=4.5, color=GREEN, mec="white")
+        ax.set_title(plain_label(plot.title), fontsize=SMALL)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_xlabel("x [m]", fontsize=SMALL)
+    axes[0].set_ylabel("y [m]", fontsize=SMALL)
+    handles = [
+        Line2D([], [], color=BLUE, lw=1.1, label="estimate"),
+        Line2D([], [], color="#999999", lw=2.4, label="truth"),
+        Line2D([], [], color=GREEN, marker="o", ms=4.5, mec="white", linestyle="none", label="start"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=SMALL, frameon=False)
+    return figure
+
+
+def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[Axes]]:
+    columns = min(_COLUMNS, count)
+    rows = math.ceil(count / columns)
+    width = max(WIDTH * columns / _COLUMNS, _SINGLE_WIDTH)
+    figure = Figure(figsize=(width, height * rows + 0.4 + below), dpi=DPI, layout="constrained")
+    axes = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
+    for ax in axes:
+        tidy(ax)
+    return figure, axes
+
+
+# --- The report -------------------------------------------------------------------------------------------------------
 
 _SEVERITY = (
     f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, of {FEWEST_FOR_BAND} runs or more; "

@@ -45,7 +45,7 @@ def export(
 def write_for_viewers(result: RunResult, rrd: Path | None, mcap: Path | None) -> None:
     """Write what ``--rrd`` and ``--mcap`` ask for. A truth in another frame than the map's is left out."""
     if rrd is not None:
-        from fgloc.view.file import write_rrd
+        from fgloc.view.scene import write_rrd
 
         write_rrd(result, rrd)
     if mcap is not None:

@@ -138,7 +138,7 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
     """A page that shows the run; what is to be told goes there too."""
     from fgloc.recording.truth import base_pose
     from fgloc.types import Event, TruthEvent
-    from fgloc.view.server import Page
+    from fgloc.view.page import Page
 
     with Page() as page:
         scene = page.scene(config.truth.max_gap_s)

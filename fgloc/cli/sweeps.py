@@ -15,7 +15,7 @@ from fgloc.cli.terminal import EXIT_BAD_INPUT, EXIT_LOST, kept_on_interrupt, num
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
-    from fgloc.ablation.records import Record
+    from fgloc.ablation.jobs import Record
 
 
 def ablate(
@@ -28,8 +28,7 @@ def ablate(
     retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
 ) -> None:
     """Tell what the failure of each sensor costs. The same command goes on with a killed sweep."""
-    from fgloc.ablation.jobs import make_jobs
-    from fgloc.ablation.records import only_sweep
+    from fgloc.ablation.jobs import make_jobs, only_sweep
     from fgloc.ablation.report import failed, write_report
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
@@ -61,9 +60,8 @@ def smooth_many(
     scheduler: str | None,
 ) -> None:
     """Smooth each bag into a folder of its own; one that fails is listed and tried again next time."""
-    from fgloc.ablation.bags import plan_bags
-    from fgloc.ablation.records import only_sweep
-    from fgloc.ablation.sweep import sweep
+    from fgloc.ablation.jobs import only_sweep
+    from fgloc.ablation.sweep import plan_bags, sweep
 
     need("sweep", "fgloc smooth of several bags")
     check_out(out)

@@ -45,7 +45,7 @@ def evaluate(
 ) -> None:
     """Compare two TUM trajectories."""
     from fgloc.evaluation import metrics
-    from fgloc.evaluation.matching import match
+    from fgloc.evaluation.metrics import match
     from fgloc.files.outputs import read_tum
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"

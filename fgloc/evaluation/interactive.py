@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.evaluation.error_scale import ErrorScale
-from fgloc.evaluation.matching import Matched
-from fgloc.evaluation.style import BLUE, MODE_LOOKS, after_gaps, mode_runs, seconds
-from fgloc.evaluation.time_axis import TimeAxis
-from fgloc.evaluation.trajectory_plot import relocated, stands
+from fgloc.evaluation.metrics import Matched
+from fgloc.evaluation.plots import relocated, stands
+from fgloc.evaluation.style import BLUE, MODE_LOOKS, ErrorScale, TimeAxis, after_gaps, mode_runs, seconds
 from fgloc.types import Decision, FloatArray, IntArray, Landmark, RunResult
 
 _MOST = 4000  # points of a curve

@@ -8,7 +8,9 @@ takes the frame that fits best by the covariances (`in_own_gauge`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, TypeVar
@@ -18,11 +20,254 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.evaluation.consistency import coverage, nees
+from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Judgement, judgements
-from fgloc.evaluation.matching import FEWEST, Matched, in_own_gauge, match, matchable
-from fgloc.evaluation.warnings import all_findings
-from fgloc.types import Finding, FloatArray, RunResult
+from fgloc.stats import chi2_bound
+from fgloc.types import Finding, FloatArray, IntArray, RunResult, Severity, Trajectory, ordered
+
+# --- Pairs of estimated and true poses at the same times --------------------------------------------------------------
+
+FEWEST = 2  # matched poses; one cannot be aligned, and is no trajectory
+_TRUTH = np.diag([0.005, 0.005, 0.01]) ** 2  # m², rad²: no positioning system, brought to other stamps, knows better
+_ROUNDS = 10  # of Gauss-Newton; the problem is linear but for one angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """An estimate and a truth at the same stamps, both in the map frame."""
+
+    stamps_ns: IntArray  # (n,)
+    estimate: FloatArray  # (n, 3)
+    truth: FloatArray  # (n, 3)
+    covs: FloatArray | None  # (n, 3, 3) of the estimate
+    T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
+    ground: FloatArray | None = None  # (n, 3) estimated height, roll and pitch; None: the floor is flat
+    true_ground: FloatArray | None = None  # (n, 3); None: not known
+    ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw
+
+    @property
+    def spatial_errors(self) -> FloatArray | None:
+        """``(n, 6)`` estimate minus truth of x, y, z [m], roll, pitch and yaw; None where they were not estimated."""
+        if self.ground is None or self.true_ground is None:
+            return None
+        planar, off = self.errors, self.ground - self.true_ground
+        return np.column_stack(
+            [planar[:, :2], off[:, 0], se2.wrap_array(off[:, 1]), se2.wrap_array(off[:, 2]), planar[:, 2]]
+        )
+
+    @property
+    def errors(self) -> FloatArray:
+        """``(n, 3)`` estimate minus truth: x, y [m] and wrapped yaw [rad]."""
+        difference = self.estimate - self.truth
+        difference[:, 2] = se2.wrap_array(difference[:, 2])
+        return difference
+
+    @property
+    def distances(self) -> FloatArray:
+        """``(n,)`` distance from the truth [m]."""
+        return np.asarray(np.hypot(*(self.estimate - self.truth)[:, :2].T))
+
+
+def match(
+    estimate: Trajectory, truth: Trajectory, align: Literal["none", "se2"] = "none", max_gap_s: float = 0.2
+) -> Matched:
+    """Bring the truth to the estimate's stamps and, if asked, into its frame.
+
+    Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
+    interpolated; elsewhere the estimate has no partner and is left out.
+
+    Raises:
+        TrajectoryError: fewer than two poses have a partner.
+    """
+    indices = matchable(estimate, truth, max_gap_s)
+    if len(indices) < FEWEST:
+        raise TrajectoryError(
+            f"{len(indices)} of {len(estimate)} poses have a truth at their time, expected {FEWEST} or more: the "
+            f"estimate spans {_span(estimate)}, the truth {_span(truth)}, gaps over {max_gap_s} s are not bridged; "
+            "check the clocks, or raise the largest gap"
+        )
+    stamps = estimate.stamps_ns[indices]
+    poses = estimate.poses[indices]
+    reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
+    T_map_truth = np.zeros(3)
+    if align == "se2":
+        T_map_truth = se2.rigid(reference[:, :2], poses[:, :2])
+        reference = se2.compose_array(T_map_truth, reference)
+    covs = None if estimate.covs is None else estimate.covs[indices]
+    if estimate.ground is None or estimate.ground_covs is None or truth.ground is None or align == "se2":
+        return Matched(stamps, poses, reference, covs, T_map_truth)
+    true = np.column_stack([np.interp(stamps, truth.stamps_ns, column) for column in truth.ground.T])
+    ground, spatial = estimate.ground[indices], estimate.ground_covs[indices]
+    return Matched(stamps, poses, reference, covs, T_map_truth, ground, true, spatial)
+
+
+def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
+    """Errors ``(n, 3)`` and their covariances ``(n, 3, 3)`` where the truth's frame is fitted.
+
+    Without a map the covariance is relative to the first pose, which is the origin, while a frame that is fitted to all
+    positions alike spreads the drift over the whole path. So the frame is fitted by the covariances: weighted least
+    squares over its rigid motion, the truth's own noise added.
+    """
+    assert matched.covs is not None
+    covs = matched.covs + _TRUTH
+    weights, truth = np.linalg.inv(covs), matched.truth
+    errors = matched.errors
+    for _ in range(_ROUNDS):
+        J = np.zeros((len(truth), 3, 3))  # of the moved truth by x, y and yaw of the frame
+        J[:] = np.eye(3)
+        J[:, 0, 2], J[:, 1, 2] = -truth[:, 1], truth[:, 0]
+        H, b = np.einsum("nij,nik,nkl->jl", J, weights, J), np.einsum("nij,nik,nk->j", J, weights, errors)
+        step = np.linalg.lstsq(H, b, rcond=None)[0]
+        truth = se2.compose_array(step, truth)
+        errors = matched.estimate - truth
+        errors[:, 2] = se2.wrap_array(errors[:, 2])
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    return errors, covs
+
+
+def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
+    """Indices of the estimate's poses that have a truth at, or around, their stamp."""
+    if len(estimate) == 0 or len(truth) == 0:
+        return np.array([], dtype=np.int64)
+    after = np.searchsorted(truth.stamps_ns, estimate.stamps_ns)
+    inside = np.clip(after, 0, len(truth) - 1)
+    exact = truth.stamps_ns[inside] == estimate.stamps_ns
+    between = (after > 0) & (after < len(truth))
+    gap_ns = truth.stamps_ns[inside] - truth.stamps_ns[np.maximum(inside - 1, 0)]
+    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(max_gap_s * 1e9)))))
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "nothing"
+    first, last = trajectory.stamps_ns[[0, -1]].tolist()
+    return f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s"
+
+
+# --- Honesty of the covariance (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications ...", 2001, section 5.4) ---
+
+
+def nees(errors: FloatArray, covs: FloatArray) -> FloatArray:
+    """Normalized estimation error squared ``(n,)``, ``eᵀ P⁻¹ e``; its mean is d for an honest covariance.
+
+    Args:
+        errors: ``(n, d)``.
+        covs: ``(n, d, d)`` in the errors' frame.
+
+    Raises:
+        CovarianceError: a covariance is not positive definite.
+    """
+    try:
+        whitening = np.linalg.cholesky(covs)
+    except np.linalg.LinAlgError as error:
+        bad = int(np.argmin(np.linalg.eigvalsh(covs)[:, 0]))
+        raise CovarianceError(
+            f"covariance {bad} is not positive definite: {covs[bad].tolist()}; it cannot weigh an error"
+        ) from error
+    whitened = np.linalg.solve(whitening, errors[..., None])[..., 0]
+    return np.asarray(np.sum(whitened**2, axis=1))
+
+
+def coverage(errors: FloatArray, covs: FloatArray, k: float) -> float:
+    """Share of error components, over all times and axes, that lie inside ±k of their own standard deviation.
+
+    An honest Gaussian covariance gives 0.683, 0.954, 0.997 for k = 1, 2, 3, whatever the correlation of the axes.
+    """
+    sigmas = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+    return float(np.mean(np.abs(errors) <= k * sigmas))
+
+
+def mean_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[float, float]:
+    """Interval that holds the mean of `samples` independent χ² variables of `dof` with the given probability.
+
+    For the mean NEES or NIS over independent runs or seeds; successive poses of one run are not independent.
+    """
+    tail = 0.5 * (1.0 - probability)
+    low, high = (chi2_bound(p, dof * samples) / samples for p in (tail, 1.0 - tail))
+    return low, high
+
+
+# --- Warnings that follow from the figures ----------------------------------------------------------------------------
+
+_MOST_NEES = 3.0  # NEES/3: errors of √3 = 1.7 times what the covariance says; sound runs as installed stay below 2
+_MOST_DROPPED = 0.2  # share of a sensor's messages
+_FEWEST = 20  # dropped ones
+_PRIOR = re.compile(r"(position|scale)_sigma")  # of a section's settings, the one that says most of its installation
+_SETTINGS = {  # of a sensor whose messages are dropped
+    "odometry": "gate.max_speed, gate.max_yaw_rate or recording.received_stamps",
+    "joints": "gate.max_wheel_rate or recording.received_stamps",
+    "command": "gate.max_speed, gate.max_yaw_rate",
+    "imu": "gate.max_yaw_rate or recording.received_stamps",
+    "image": "camera.file, recording.topics.image",
+    "sightings": "markers.sigma_px, map.position_sigma_m, gate.max_range",
+}
+
+
+def all_findings(
+    result: RunResult, nees_over_3: float | None, rejections: Mapping[str, int], keyframes: int
+) -> tuple[Finding, ...]:
+    """Findings of a run and the warnings by its figures, the gravest first.
+
+    Args:
+        result: the run.
+        nees_over_3: mean normalised squared error over 3; None: there is no truth.
+        rejections: rejected items by ``sensor.reason``.
+        keyframes: number of poses.
+    """
+    warned = [*_optimistic(result, nees_over_3), *_dropped(result, rejections, keyframes)]
+    return ordered([*result.findings, *warned])
+
+
+def _optimistic(result: RunResult, nees: float | None) -> Iterator[Finding]:
+    if nees is None or nees <= _MOST_NEES:
+        return
+    yield Finding(
+        "covariance.optimistic",
+        f"NEES/3 is {nees:.1f}, expected about 1: the errors are {nees**0.5:.1f} times what the covariance says. "
+        "Something is off by more than its sigma: see the faults that the report lists, and raise "
+        f"{_prior_sigmas(result)} to what your installation really is.",
+        Severity.WARNING,
+        value=nees,
+    )
+
+
+def _dropped(result: RunResult, rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
+    dropped: Counter[str] = Counter()
+    for reason, count in rejections.items():
+        dropped[reason.partition(".")[0]] += count
+    most = max((topic.count for topic in result.spans.values()), default=0)
+    for sensor, count in dropped.most_common():
+        if sensor not in _SETTINGS:
+            continue
+        received = keyframes if sensor in ("image", "sightings") else most
+        if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
+            reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
+            too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
+            unit = " Angles that change so fast are ticks or degrees, not radians." if 2 * too_fast > count else ""
+            yield Finding(
+                f"{sensor}.dropped",
+                f"{count} messages of {sensor} were dropped ({reasons}); look at {_SETTINGS[sensor]}.{unit}",
+                Severity.WARNING,
+                value=float(count),
+            )
+
+
+def _prior_sigmas(result: RunResult) -> str:
+    """Settings that say how far off this run's installation may be."""
+    found = result.found
+    sections = [] if found is None else [setting.name.partition(".")[0] for setting in found.settings]
+    if found is not None and found.landmarks is not None:
+        sections.insert(0, "map")
+    names = []
+    for section in dict.fromkeys(sections):
+        field = Config.model_fields.get(section)  # "stamp_offset_s" is of the clocks
+        keys = () if field is None else getattr(field.annotation, "model_fields", ())
+        names += [f"{section}.{key}" for key in keys if _PRIOR.search(key)][:1]
+    return " or ".join(names) or "the sigmas of its settings"
+
+
+# --- Figures of a run -------------------------------------------------------------------------------------------------
 
 _Figure = TypeVar("_Figure")
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled

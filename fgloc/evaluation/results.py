@@ -16,6 +16,7 @@ import numpy as np
 from fgloc.errors import TrajectoryError
 from fgloc.files.documents import read_text
 from fgloc.files.outputs import read_tum
+from fgloc.sensors.maps import load_map
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, Trajectory
 
 _MOST_BYTES = 1 << 30  # of each file
@@ -56,8 +57,6 @@ def read_results(folder: Path) -> Results:
         TrajectoryError: a file is missing, or a line of it is not what a run writes; the message names both.
         MapError: its map cannot be read.
     """
-    from fgloc.sensors.maps import load_map
-
     if not folder.is_dir():
         raise TrajectoryError(f"{folder}: no such folder; {_REMEDY}")
     if not (folder / "trajectory.tum").is_file():

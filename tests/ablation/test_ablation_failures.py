@@ -11,9 +11,10 @@ from event_makers import command, corners, image, imu, joints, marker_pose, odom
 from pydantic import TypeAdapter, ValidationError
 
 from fgloc import se2
-from fgloc.ablation.failures import AnyFailure, Scene, corrupt, generators
+from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.config import Config
 from fgloc.frames import quaternion_yaw
+from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import decode
 from fgloc.sensors.range_bearing import RangeBearingEvent

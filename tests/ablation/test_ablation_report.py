@@ -14,13 +14,26 @@ from typer.testing import CliRunner
 import fgloc
 from fgloc import cli
 from fgloc.ablation.failures import AnyFailure
-from fgloc.ablation.jobs import Job, execute, make_jobs
-from fgloc.ablation.records import Cost, Record
-from fgloc.ablation.report import _curves, write_report
+from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
+from fgloc.ablation.report import (
+    ATE,
+    Curves,
+    Point,
+    Tracks,
+    _curves,
+    _measurable,
+    join,
+    matrix,
+    plot_severity,
+    plot_tracks,
+    rows,
+    sentence,
+    worst,
+    worth,
+    write_report,
+)
 from fgloc.ablation.suite import Cell, Suite, expand, load_suite
-from fgloc.ablation.tables import ATE, _measurable, join, matrix, rows, sentence, worst, worth
 from fgloc.config import Config
-from fgloc.evaluation.ablation_plots import Curves, Point, Tracks, plot_severity, plot_tracks
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 SUITE = Suite.model_validate(

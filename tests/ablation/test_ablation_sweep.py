@@ -16,8 +16,7 @@ import pytest
 import yaml
 
 from fgloc import se2
-from fgloc.ablation.jobs import execute, make_jobs
-from fgloc.ablation.records import attempts, read_record, record_path
+from fgloc.ablation.jobs import attempts, execute, make_jobs, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
 from fgloc.errors import ConfigError

@@ -6,9 +6,8 @@ import shutil
 import pytest
 from test_cli import FILES, fgloc, refused, write_circle
 
-from fgloc.ablation.bags import folder_names, plan_bags
-from fgloc.ablation.jobs import execute
-from fgloc.ablation.records import attempts
+from fgloc.ablation.jobs import attempts, execute
+from fgloc.ablation.sweep import folder_names, plan_bags
 from fgloc.config import Config, load_config
 from fgloc.errors import ConfigError
 

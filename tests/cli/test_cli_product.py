@@ -16,8 +16,7 @@ from fgloc import instrumentation as progress
 from fgloc.cli import extras
 from fgloc.cli.progress import LINE_S, Lines
 from fgloc.config import Config, load_config
-from fgloc.evaluation.metrics import compute_metrics
-from fgloc.evaluation.warnings import all_findings
+from fgloc.evaluation.metrics import all_findings, compute_metrics
 from fgloc.runner import run
 from fgloc.sensors.settings import WheelsConfig
 from fgloc.types import Finding, Severity, ordered

@@ -10,8 +10,7 @@ import yaml
 from live_feed import PATIENCE_S
 from sim_ramp import estimated, record_ramp
 
-from fgloc.ablation.jobs import execute, make_jobs
-from fgloc.ablation.records import read_record
+from fgloc.ablation.jobs import execute, make_jobs, read_record
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import ground_metrics, match_result

@@ -8,9 +8,9 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, TrajectoryError
-from fgloc.evaluation import consistency, metrics
-from fgloc.evaluation.matching import Matched, in_own_gauge, match
-from fgloc.evaluation.metrics import relative_error
+from fgloc.evaluation import metrics
+from fgloc.evaluation import metrics as consistency
+from fgloc.evaluation.metrics import Matched, in_own_gauge, match, relative_error
 from fgloc.frames import yaw_quaternion
 from fgloc.stats import rounded
 from fgloc.types import Trajectory

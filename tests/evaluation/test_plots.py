@@ -13,14 +13,13 @@ from matplotlib.colors import to_rgba
 from run_results import figure_eight
 
 from fgloc.config import Config
-from fgloc.evaluation import style, timeline
-from fgloc.evaluation.html import script_data
+from fgloc.evaluation import plots as timeline
+from fgloc.evaluation import style
 from fgloc.evaluation.interactive import interactive
 from fgloc.evaluation.metrics import match_result
-from fgloc.evaluation.plots import plot_error
-from fgloc.evaluation.time_axis import TimeAxis
-from fgloc.evaluation.timeline import plot_timeline
-from fgloc.evaluation.trajectory_plot import plot_trajectory
+from fgloc.evaluation.plots import plot_error, plot_timeline, plot_trajectory
+from fgloc.evaluation.report import script_data
+from fgloc.evaluation.style import TimeAxis
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
 from fgloc.types import Decision, Landmark, LandmarkMap, Mode, TopicTimes, Trajectory

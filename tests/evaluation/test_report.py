@@ -15,8 +15,8 @@ from run_results import figure_eight
 from fgloc.config import Config
 from fgloc.errors import OutputError
 from fgloc.evaluation import report
-from fgloc.evaluation.html import plotly
 from fgloc.evaluation.metrics import compute_metrics
+from fgloc.evaluation.report import plotly
 from fgloc.files.outputs import read_tum
 from fgloc.types import Mode, Trajectory
 

@@ -11,7 +11,7 @@ import yaml
 from test_ablation_sweep import SUITE, write_circle
 from test_graph import corner_sighting, wall_map
 
-from fgloc.ablation.records import attempts, log_attempt, only_sweep, read_record, record_path
+from fgloc.ablation.jobs import attempts, log_attempt, only_sweep, read_record, record_path
 from fgloc.config import Config, EstimatorConfig
 from fgloc.errors import OutputError
 from fgloc.graph.estimators import IncrementalEstimator

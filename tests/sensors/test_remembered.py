@@ -7,8 +7,7 @@ import pytest
 from event_makers import image
 from marker_scenes import forward_camera, render, standing
 
-from fgloc.ablation.jobs import execute, make_jobs
-from fgloc.ablation.records import read_record
+from fgloc.ablation.jobs import execute, make_jobs, read_record
 from fgloc.ablation.suite import Suite, expand
 from fgloc.sensors.markers.detector import MarkerDetector, RememberedDetections
 from fgloc.sensors.markers.images import ImageError

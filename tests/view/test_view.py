@@ -19,9 +19,8 @@ from fgloc.errors import OutputError
 from fgloc.sensors.maps import load_map
 from fgloc.types import Decision, Estimate, Finding, Mode, RunResult, Trajectory
 from fgloc.view import scene as scenes
-from fgloc.view.file import write_rrd
-from fgloc.view.private import PrivatePage
-from fgloc.view.server import Page
+from fgloc.view.page import Page, PrivatePage
+from fgloc.view.scene import write_rrd
 
 rerun = pytest.importorskip("rerun")
 SAMPLE = Path(fgloc.__file__).parent.parent / "datasets" / "samples" / "first_run"

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from fgloc.ablation.failures import AnyFailure, Failure
+from fgloc.ablation.failures import AnyFailure
+from fgloc.sensors.failures import Failure
 from fgloc_datasets.sim.floor import Floor
 from fgloc_datasets.sim.following.loop import Drive
 from fgloc_datasets.sim.following.path import load_path

@@ -9,14 +9,12 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from fgloc.ablation.failures import Failure, Scene, corrupt, generators
-from fgloc.ablation.failures.kidnap import Kidnap
-from fgloc.ablation.failures.lift import Lift
-from fgloc.ablation.failures.timing import Truncated
+from fgloc.ablation.failures import Kidnap, Lift, Truncated, corrupt, generators
 from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config
 from fgloc.errors import ConfigError
 from fgloc.files.settings import sentences
+from fgloc.sensors.failures import Failure, Scene
 from fgloc.types import Event, LandmarkMap, TruthEvent
 from fgloc_datasets.sim.sensors import EPOCH_NS
 

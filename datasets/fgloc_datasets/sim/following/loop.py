@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.ablation.failures import Failure
 from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_folder
 from fgloc.recording.reader import events_of
+from fgloc.sensors.failures import Failure
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent
 from fgloc.types import Event, FloatArray
 from fgloc_datasets.bag import BagWriter

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from fgloc.ablation.failures import Failure
+from fgloc.sensors.failures import Failure
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.following.path import Curve, WaypointPath
 from fgloc_datasets.sim.following.pursuit import State
