@@ -1,6 +1,9 @@
 """The command line. Only this package prints and exits.
 
 Exit codes: 0 done, 1 bad input, 2 usage, 3 finished but LOST for part of the run, 130 interrupted.
+
+Its modules import at the top what is light. What takes long to load (pydantic, gtsam, OpenCV, matplotlib, rosbags) is
+imported by the command that needs it: ``fgloc --help`` and shell completion do not wait for it.
 """
 
 from __future__ import annotations
@@ -12,9 +15,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from fgloc.cli import begin, convert, exports, live, runs, sim, surveys, sweeps, tools, training
-from fgloc.cli.progress import shown
-from fgloc.cli.terminal import EXIT_BAD_INPUT, kept_on_interrupt, say
+from fgloc.cli import data, live, robot, runs
+from fgloc.cli.terminal import EXIT_BAD_INPUT, kept_on_interrupt, say, shown
 from fgloc.errors import FglocError
 
 
@@ -53,7 +55,7 @@ def _version(wanted: bool) -> None:
 
 
 @app.callback()
-def options(
+def common(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
     ] = False,
@@ -62,21 +64,21 @@ def options(
 
 
 app.command()(runs.demo)
-app.command()(tools.info)
-app.command(name="init")(begin.init)
+app.command()(robot.info)
+app.command()(robot.init)
 app.command()(runs.smooth)
 app.command()(runs.online)
-app.command(name="live")(live.live)
-app.command(name="play")(live.play)
-app.command()(tools.evaluate)
-app.command()(exports.export)
-app.command(name="map")(surveys.make_map)
-app.command()(runs.calibrate)
-app.command()(training.train)
-app.command(name="evaluate-model")(training.evaluate_model)
-app.command()(sweeps.ablate)
-app.add_typer(sim.app, name="sim")
-app.add_typer(convert.app, name="convert")
+app.command()(live.live)
+app.command()(live.play)
+app.command()(runs.evaluate)
+app.command()(runs.export)
+app.command(name="map")(robot.make_map)
+app.command()(robot.calibrate)
+app.command()(data.train)
+app.command()(data.evaluate_model)
+app.command()(runs.ablate)
+app.add_typer(data.sim_app, name="sim")
+app.add_typer(data.convert_app, name="convert")
 
 
 def main(*command: str) -> None:

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgloc.cli.extras import need
-from fgloc.cli.options import Bag, ModelOption, configured
-from fgloc.cli.progress import run_bar
-from fgloc.cli.terminal import EXIT_LOST, columns, say, say_remark
+from fgloc.cli.options import Bag, ModelOption, configured, need
+from fgloc.cli.terminal import EXIT_LOST, columns, run_bar, say, say_remark
 from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -60,7 +58,6 @@ def live(
     need("live", "fgloc live")
     if view:
         need("view", "fgloc live --view")
-    # Imported here: gtsam and OpenCV take a second to load, which `fgloc --help` need not wait for.
     from fgloc.live.wire.node import Node
     from fgloc.live.wire.participant import Participant
     from fgloc.sensors.maps import configured_map

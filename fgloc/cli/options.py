@@ -1,7 +1,10 @@
-"""Arguments that several commands share, and what is taken where they are not given."""
+"""Arguments that several commands share, what is taken where they are not given, and the extras that commands need."""
 
 from __future__ import annotations
 
+import shlex
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -11,6 +14,7 @@ from fgloc.errors import ConfigError
 
 if TYPE_CHECKING:
     from fgloc.config import Config
+
 
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
@@ -88,3 +92,30 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
         return registry.motion_model().given(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+
+
+# --- Extras -----------------------------------------------------------------------------------------------------------
+
+_NEEDED = {  # extra of pyproject.toml: what it brings
+    "train": ("torch",),
+    "sim": ("mujoco",),
+    "sweep": ("dask", "distributed"),
+    "live": ("cyclonedds",),
+    "view": ("rerun",),
+}
+_HINTS = {"train": "; on Linux, --extra-index-url https://download.pytorch.org/whl/cpu spares 2 GB of CUDA"}
+
+
+def need(extra: str, command: str) -> None:
+    """Find out before a command runs whether its extra is installed.
+
+    Raises:
+        ConfigError: it is not; the message says how to install it.
+    """
+    missing = [name for name in _NEEDED[extra] if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"{command} needs {' and '.join(missing)}, which the base install leaves out; "
+            f"install the extra '{extra}': {shlex.quote(sys.executable)} -m pip install 'fgloc[{extra}]'"
+            f"{_HINTS.get(extra, '')}"
+        )

@@ -1,16 +1,16 @@
-"""Commands of one robot: ``demo``, ``smooth``, ``online`` and ``calibrate``."""
+"""Commands that run the localizer on recordings (``demo``, ``smooth``, ``online``, ``ablate``), and on results."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fgloc.cli.exports import write_for_viewers
 from fgloc.cli.options import (
     Bag,
     Bags,
@@ -26,27 +26,33 @@ from fgloc.cli.options import (
     WorkersOption,
     configured,
     figure_formats,
+    need,
 )
-from fgloc.cli.progress import run_bar
-from fgloc.cli.sweeps import smooth_many
 from fgloc.cli.terminal import (
+    EXIT_BAD_INPUT,
+    EXIT_LOST,
     exit_code,
     exit_unless_trusted,
-    next_step,
+    jobs_bar,
+    kept_on_interrupt,
     number,
+    run_bar,
     say,
     say_remark,
     say_table,
-    shown_path,
     typed,
 )
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
+    from fgloc.ablation.jobs import Record
     from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
     from fgloc.types import RunResult
+
+
+# --- One run: demo, smooth, online ------------------------------------------------------------------------------------
 
 _TOLD = 3  # judgements in the short form
 
@@ -127,33 +133,6 @@ def online(
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
-def calibrate(
-    bags: Bags,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="ROBOT.yaml", dir_okay=False, help="configuration file to be written")
-    ],
-    map_file: MapOption = None,
-    config: ConfigOption = None,
-) -> None:
-    """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
-    from fgloc.calibration.installation import found_text, given_text, setting_unit
-    from fgloc.calibration.multi_run import calibrate as calibrated
-    from fgloc.config import yaml_of
-    from fgloc.files.outputs import write_text
-
-    check_out(out, folder=False)
-    before = configured(bags[0], config, None)
-    with run_bar("calibrate") as progress:
-        after, settings = calibrated(bags, map_file, before, progress)
-    write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
-    rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
-    say_table(("setting", "unit", "given", "found"), rows)
-    say(f"configuration: {out}")
-    paths = " ".join(shown_path(bag) for bag in bags)
-    next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
-    next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")
-
-
 def _localize(
     bag: Path,
     map_file: Path | None,
@@ -163,7 +142,6 @@ def _localize(
     pace: float | None = None,
 ) -> RunResult:
     """Run a recording, once it is certain that the results can be written."""
-    # Imported here: gtsam, OpenCV and matplotlib take a second to load, which `fgloc --help` need not wait for.
     from fgloc.recording.storage import find_beside
     from fgloc.runner import run
 
@@ -215,3 +193,190 @@ def _demo_row(mode: str, metrics: Metrics) -> tuple[str, ...]:
         number(metrics.nees_over_3, "{:.2f}"),
         number(metrics.real_time_factor, "{:.1f} x"),
     )
+
+
+# --- Many runs: smooth of several bags, ablate ------------------------------------------------------------------------
+
+
+def ablate(
+    suite: Annotated[
+        Path, typer.Argument(metavar="SUITE.yaml", help="recordings, failures and variants (docs/ablation.md)")
+    ],
+    out: Out,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
+) -> None:
+    """Tell what the failure of each sensor costs. The same command goes on with a killed sweep."""
+    from fgloc.ablation.jobs import make_jobs, only_sweep
+    from fgloc.ablation.report import failed, write_report
+    from fgloc.ablation.suite import expand, load_suite
+    from fgloc.ablation.sweep import sweep
+
+    need("sweep", "fgloc ablate")
+    check_out(out)
+    plan = load_suite(suite)
+    jobs = make_jobs(expand(plan, suite.parent))
+    kept = f"finished runs are kept in {out}; the same command goes on with the others"
+    with only_sweep(out):
+        with kept_on_interrupt(kept), jobs_bar("runs") as show:
+            records = sweep(jobs, out, workers, scheduler, retry, show)
+        sentences = write_report(plan, jobs, records, out, typed())
+    for sentence in sentences:
+        say(sentence)
+    without = failed(jobs, records)
+    if without:
+        say(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    say(f"report: {out / 'report.html'}")
+
+
+def smooth_many(
+    bags: Sequence[Path],
+    out: Path,
+    map_file: Path | None,
+    model: Path | None,
+    config_file: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Smooth each bag into a folder of its own; one that fails is listed and tried again next time."""
+    from fgloc.ablation.jobs import only_sweep
+    from fgloc.ablation.sweep import plan_bags, sweep
+
+    need("sweep", "fgloc smooth of several bags")
+    check_out(out)
+    if config_file is not None:
+        configured(bags[0], config_file, model)  # a wrong one is wrong for all
+    plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
+    kept = f"finished bags are kept in {out}; the same command goes on with the others"
+    with kept_on_interrupt(kept), only_sweep(out), jobs_bar("bags") as show:
+        records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
+    by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
+    head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
+    say_table(head, [_row(name, by_name.get(name)) for name in plan.names])
+    errors = plan.errors | {name: _reason(record) for name, record in by_name.items() if record.outcome != "done"}
+    for name in plan.names:
+        if name in errors:
+            say(f"{name}: {errors[name]}", err=True)
+    for name, record in by_name.items():
+        for mistake in record.mistakes:
+            say(f"{name}: {mistake}", err=True)
+    say(f"reports: {out / '*' / 'report.html'}")
+    if errors:
+        say(f"{len(errors)} of {len(bags)} bags gave no result", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
+    lost = any(record.modes.get("LOST") for record in by_name.values())
+    if lost:
+        say("LOST for part of a run: do not trust it there", err=True)
+    if lost or any(record.mistakes for record in by_name.values()):
+        raise typer.Exit(EXIT_LOST)
+
+
+def _reason(record: Record) -> str:
+    """The message of a refused run; the last line of a crashed one's traceback."""
+    return record.error if record.outcome == "refused" else record.error.strip().splitlines()[-1]
+
+
+def _row(name: str, record: Record | None) -> tuple[str, ...]:
+    if record is None or record.outcome != "done":
+        return name, *("-" for _ in range(5)), "failed"
+    figures = record.figures
+    return (
+        name,
+        f"{figures['duration_s']:.1f} s",
+        str(figures["keyframes"]),
+        number(figures["ate_mean_m"], "{:.4f} m"),
+        number(figures["yaw_mae_deg"], "{:.3f} deg"),
+        number(figures["nees_over_3"], "{:.2f}"),
+        f"{100.0 * record.modes.get('LOST', 0.0):.1f} %",
+    )
+
+
+# --- Results for other tools: export, --mcap, --rrd -------------------------------------------------------------------
+
+_BASE = "base_link"
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", file_okay=False, help="results of smooth or online")],
+    mcap: Annotated[
+        Path | None, typer.Option(metavar="FILE", dir_okay=False, help="a bag of standard ROS 2 messages")
+    ] = None,
+    kitti: Annotated[
+        Path | None, typer.Option(metavar="FILE", dir_okay=False, help="poses as KITTI has them, without stamps")
+    ] = None,
+) -> None:
+    """Write a finished run for other tools. TUM, CSV and JSON are in its folder already."""
+    if mcap is None and kitti is None:
+        raise ConfigError("nothing to write: give --mcap FILE or --kitti FILE, or both")
+    from fgloc.evaluation.results import read_results
+    from fgloc.files.outputs import write_kitti
+    from fgloc.recording.mcap_export import write_mcap
+
+    results = read_results(folder)
+    if mcap is not None:
+        write_mcap(results, mcap, _base_frame(results.provenance.get("config")))
+        say(f"MCAP: {mcap}")
+    if kitti is not None:
+        write_kitti(kitti, results.trajectory)
+        say(f"KITTI: {kitti}")
+
+
+def write_for_viewers(result: RunResult, rrd: Path | None, mcap: Path | None) -> None:
+    """Write what ``--rrd`` and ``--mcap`` ask for. A truth in another frame than the map's is left out."""
+    if rrd is not None:
+        from fgloc.view.scene import write_rrd
+
+        write_rrd(result, rrd)
+    if mcap is not None:
+        from fgloc.recording.mcap_export import write_mcap
+
+        elsewhere = result.config is not None and result.config.truth.align != "none"
+        base = None if result.config is None else result.config.recording.base_frame
+        write_mcap(replace(result, truth=None) if elsewhere else result, mcap, base or _BASE)
+
+
+def _base_frame(config: Any) -> str:
+    """Of a configuration as ``config.json`` has it."""
+    recording = config.get("recording") if isinstance(config, dict) else None
+    base = recording.get("base_frame") if isinstance(recording, dict) else None
+    return base if isinstance(base, str) else _BASE
+
+
+# --- evaluate ---------------------------------------------------------------------------------------------------------
+
+
+class Align(StrEnum):
+    """How an estimate and a truth in different frames are brought together."""
+
+    NONE = "none"
+    SE2 = "se2"
+
+
+def evaluate(
+    estimate: Annotated[Path, typer.Argument(metavar="EST.tum", help="trajectory to be compared")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH.tum", help="reference trajectory")],
+    align: Annotated[
+        Align, typer.Option(help="se2: the best rigid motion between the two, without scale")
+    ] = Align.NONE,
+    max_gap: Annotated[float, typer.Option(metavar="S", help="the truth is not interpolated across longer gaps")] = 0.2,
+) -> None:
+    """Compare two TUM trajectories."""
+    from fgloc.evaluation import metrics
+    from fgloc.evaluation.metrics import match
+    from fgloc.files.outputs import read_tum
+
+    kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
+    matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
+    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0, "m")
+    rows = [
+        ("poses matched", f"{len(matched.stamps_ns)}"),
+        ("ATE mean", f"{metrics.ate_mean_m(matched):.6f} m"),
+        ("ATE rmse", f"{metrics.ate_rmse_m(matched):.6f} m"),
+        ("yaw MAE", f"{metrics.yaw_mae_deg(matched):.6f} deg"),
+        ("end error", f"{metrics.end_error_m(matched):.6f} m"),
+        ("drift", "-" if drift is None else f"{drift:.4f} %"),
+        ("RPE per metre, position", "-" if relative is None else f"{relative.translation_m:.6f} m"),
+        ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
+    ]
+    say_table(None, rows)

@@ -13,8 +13,8 @@ from command_line import fgloc
 from test_cli import write_circle
 
 from fgloc import instrumentation as progress
-from fgloc.cli import extras
-from fgloc.cli.progress import LINE_S, Lines
+from fgloc.cli import options
+from fgloc.cli.terminal import LINE_S, Lines
 from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
 from fgloc.runner import run
@@ -72,9 +72,9 @@ def test_completion_is_offered():
 )
 def test_a_missing_extra_is_named_with_its_remedy(extra, command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    there = extras.find_spec
-    absent = extras._NEEDED[extra]
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else there(name))
+    there = options.find_spec
+    absent = options._NEEDED[extra]
+    monkeypatch.setattr(options, "find_spec", lambda name: None if name in absent else there(name))
     code, out, err = fgloc(*command)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert f"-m pip install 'fgloc[{extra}]'" in err

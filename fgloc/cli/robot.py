@@ -1,4 +1,4 @@
-"""``fgloc map``: landmarks surveyed."""
+"""Commands that set up a robot: ``init``, ``info``, ``map`` and ``calibrate``."""
 
 from __future__ import annotations
 
@@ -7,16 +7,81 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgloc.cli.options import Bags, ConfigOption, ModelOption, configured
-from fgloc.cli.progress import run_bar
-from fgloc.cli.terminal import exit_unless_trusted, next_step, say, say_table, shown_path
-from fgloc.errors import ConfigError, RecordingError
+from fgloc.cli.options import Bag, Bags, ConfigOption, MapOption, ModelOption, configured
+from fgloc.cli.terminal import exit_unless_trusted, next_step, run_bar, say, say_table, shown_path, typed, warn
+from fgloc.errors import ConfigError, MapError, OutputError, RecordingError
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
     from fgloc.calibration.survey import Distance, Survey
     from fgloc.config import Config
     from fgloc.types import LandmarkMap
+
+
+# --- init and info ----------------------------------------------------------------------------------------------------
+
+
+def init(
+    bag: Bag,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="ROBOT.yaml", dir_okay=False, help="configuration to be written")
+    ] = Path("robot.yaml"),
+    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+) -> None:
+    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning.
+
+    Exit code 1: no topic of it measures motion.
+    """
+    check_out(out, folder=False)
+    if out.exists() and not force:
+        raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
+    from fgloc.calibration.first_settings import first_settings
+    from fgloc.config import load_config
+    from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import find_beside
+
+    found = first_settings(bag)
+    write_text(out, found.text)
+    load_config(out)
+    say_table(("role", "topic"), list(found.roles.items()))
+    for finding in found.found:
+        if finding.lines:
+            say(f"found: {finding.text.replace(': set ', '; written: ', 1)}")
+    for sentence in found.missing:
+        warn(sentence)
+    say(f"configuration: {out}")
+    next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
+    if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
+        raise typer.Exit(1)  # no run is possible
+    if not {"image", "sightings"} & found.roles.keys():
+        return  # nothing to survey, or to calibrate on
+    beside = find_beside(bag, "map.yaml")
+    if beside is None:
+        next_step(f"fgloc map {shown_path(bag)} --config {shown_path(out)} --out map.yaml", "survey the markers")
+    else:
+        next_step(
+            f"fgloc calibrate {shown_path(bag)} --map {shown_path(beside)} --config {shown_path(out)} "
+            "--out calibrated.yaml",
+            "find what wheels, camera and clocks are off by",
+        )
+
+
+def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> None:
+    """Tell what a recording holds. Topics, rates, gaps, what a run would use, what looks wrong (also with the map)."""
+    from fgloc.diagnosis.mistakes import inspect_all
+    from fgloc.recording.info import format_info
+    from fgloc.recording.storage import find_beside
+
+    if map_file is not None and not map_file.exists():
+        raise MapError(f"{map_file}: there is no such file; give the map, or leave --map out")
+    map_path = map_file or find_beside(bag, "map.yaml")
+    found = inspect_all(bag, map_path, configured(bag, config, None))
+    say(format_info(found), nl=False)
+    if found.exit_code:
+        raise typer.Exit(found.exit_code)
+
+
+# --- map --------------------------------------------------------------------------------------------------------------
 
 
 def make_map(
@@ -132,3 +197,33 @@ def _distance(text: str) -> Distance:
     if made is None or made.first == made.second or not 0.0 < made.metres < 1e4:
         raise ConfigError(f"--distance {text}: expected two ids and metres, such as 3,7,2.415")
     return made
+
+
+# --- calibrate --------------------------------------------------------------------------------------------------------
+
+
+def calibrate(
+    bags: Bags,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="ROBOT.yaml", dir_okay=False, help="configuration file to be written")
+    ],
+    map_file: MapOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
+    from fgloc.calibration.installation import found_text, given_text, setting_unit
+    from fgloc.calibration.multi_run import calibrate as calibrated
+    from fgloc.config import yaml_of
+    from fgloc.files.outputs import write_text
+
+    check_out(out, folder=False)
+    before = configured(bags[0], config, None)
+    with run_bar("calibrate") as progress:
+        after, settings = calibrated(bags, map_file, before, progress)
+    write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
+    rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
+    say_table(("setting", "unit", "given", "found"), rows)
+    say(f"configuration: {out}")
+    paths = " ".join(shown_path(bag) for bag in bags)
+    next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
+    next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")
