@@ -43,9 +43,9 @@ from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.ablation.failures import Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import FglocError
+from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import match
 from fgloc.files.atomic import atomic_file
-from fgloc.localizer import Localizer
 from fgloc.types import Estimate, Step, Trajectory
 
 CASES = ("none", "slip", "mu01", "dark30", "dark60", "ids30", "moved", "frozen", "onewheel", "kidnap")

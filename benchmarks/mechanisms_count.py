@@ -18,11 +18,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent.parent / "fgloc"
 DECIDING = (
-    "localizer.py",
     "replay.py",
     "stats.py",
-    "robust/*.py",
-    "relocalization/*.py",
+    "estimation/*.py",
     "sensors/learned/network.py",
     "sensors/gyro.py",
     *(f"graph/{name}.py" for name in ("batch", "estimators", "joint", "noise")),

@@ -19,7 +19,7 @@ from benchmarks.mechanisms_switch import (
 )
 from fgloc.graph.noise import NoiseBudget
 
-_TRUST = "fgloc.robust.motion_faults"
+_TRUST = "fgloc.estimation.motion"
 _BUDGET = "fgloc.graph.noise"
 
 
@@ -35,6 +35,10 @@ def _without_wheels(result: Any, before: Any, budget: NoiseBudget, *args: Any) -
     return "wheels" in budget.rejected
 
 
+def _as_given(real: Any) -> property:
+    return property(lambda test: 1.0)
+
+
 def _model_contradicted(found: Any, *_: Any) -> bool:
     return found is not None and "learned" in found.sources
 
@@ -43,25 +47,25 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_test",
         "GLR test of wheels against learned motion or gyro: slipping or dead wheels are left out.",
-        ("robust/glr_test.py", "robust/motion_faults.py"),
-        (Switch("fgloc.robust.glr_test:GlrTest._nis_of_windows", Returns(np.zeros(1))),),
-        Probe("fgloc.robust.glr_test:GlrTest.judge", lambda verdict, *_: verdict.flagged),
+        ("estimation/faults.py", "estimation/motion.py"),
+        (Switch("fgloc.estimation.faults:GlrTest._nis_of_windows", Returns(np.zeros(1))),),
+        Probe("fgloc.estimation.faults:GlrTest.judge", lambda verdict, *_: verdict.flagged),
         batch=True,
         case="onewheel",
     ),
     Mechanism(
         "fault_attribution",
         "Where wheels and learned motion differ, the one that sightings contradict is left out.",
-        ("robust/fault_attribution.py", "robust/motion_faults.py"),
-        (Switch("fgloc.robust.fault_attribution:FaultAttribution.contradicted", Returns(None)),),
-        Probe("fgloc.robust.fault_attribution:FaultAttribution.contradicted", _model_contradicted),
+        ("estimation/faults.py", "estimation/motion.py"),
+        (Switch("fgloc.estimation.faults:FaultAttribution.contradicted", Returns(None)),),
+        Probe("fgloc.estimation.faults:FaultAttribution.contradicted", _model_contradicted),
         batch=True,
         case="foreign",
     ),
     Mechanism(
         "disagreement_scale",
         "Covariances of motion sources that disagree are scaled before the alarm.",
-        ("robust/glr_test.py", "graph/noise.py"),
+        ("estimation/faults.py", "graph/noise.py"),
         (Switch(f"{_BUDGET}:NoiseBudget.combine", _unscaled),),
         Probe(f"{_BUDGET}:NoiseBudget.combine", _scaled),
         batch=True,
@@ -70,9 +74,9 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "disagreement_level",
         "Differences of the motion sources are compared with what is usual, not with their covariances alone.",
-        ("robust/glr_test.py",),
-        (Switch("fgloc.robust.glr_test:COVARIANCE_FACTOR", Constant(1.0)),),
-        Probe("fgloc.robust.glr_test:GlrTest.judge", lambda _, before, test, *args: test._level < 1.0),
+        ("estimation/faults.py",),
+        (Switch("fgloc.estimation.faults:GlrTest._level", _as_given),),
+        Probe("fgloc.estimation.faults:GlrTest.judge", lambda _, before, test, *args: test._level < 1.0),
         batch=True,
         case="dark60",
     ),
@@ -88,16 +92,16 @@ OF_MOTION: tuple[Mechanism, ...] = (
     Mechanism(
         "onset_reweighing",
         "Steps between the likeliest onset of a fault and its detection are weighed again.",
-        ("robust/motion_judge.py", "graph/estimators.py"),
-        (Switch("fgloc.robust.motion_judge:MotionJudge._revise", Returns(())),),
-        Probe("fgloc.robust.motion_judge:MotionJudge._revise", lambda result, _, self, verdict: verdict.span > 1),
+        ("estimation/motion.py", "graph/estimators.py"),
+        (Switch("fgloc.estimation.motion:MotionJudge._revise", Returns(())),),
+        Probe("fgloc.estimation.motion:MotionJudge._revise", lambda result, _, self, verdict: verdict.span > 1),
         batch=True,
         case="foreign",
     ),
     Mechanism(
         "failure_kind",
         "Distinguishes frozen encoders and one dead wheel from slip.",
-        ("robust/motion_faults.py",),
+        ("estimation/motion.py",),
         (Switch(f"{_TRUST}:MotionFaultMonitor._failure", Returns("slip")),),
         Probe(f"{_TRUST}:MotionFaultMonitor._failure", lambda kind, *_: kind != "slip"),
         case="onewheel",

@@ -14,17 +14,17 @@ from benchmarks.mechanisms_switch import (
     something,
 )
 
-_GATE = "fgloc.robust.association"
-_POSE_FIT = "fgloc.relocalization.pose_fit"
+_GATE = "fgloc.estimation.sightings"
+_POSE_FIT = "fgloc.estimation.pose_fit"
 _NO_KERNEL = 1e6  # sigmas
-_MODES = "fgloc.robust.landmark_modes:LandmarkModes"
+_MODES = "fgloc.estimation.landmark_modes:LandmarkModes"
 
 
 OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "fit_kernel",
         "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not corrupt the pose.",
-        ("relocalization/pose_fit.py",),
+        ("estimation/pose_fit.py",),
         (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
         batch=True,
         case="carried30",
@@ -32,7 +32,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "gate",
         "Chi-square gate online, with the test of joint compatibility: unlikely sightings are not fused.",
-        ("robust/association.py",),
+        ("estimation/sightings.py",),
         (Switch(f"{_GATE}:chi2_bound", Returns(math.inf)),),
         batch=True,
         case="kidnap",
@@ -40,7 +40,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "joint_compatibility",
         "Of sightings that exclude each other, an uncertain prediction keeps the largest set that agrees.",
-        ("robust/association.py",),
+        ("estimation/sightings.py",),
         (Switch(f"{_GATE}:Association._agreed", Argument(3)),),
         Probe(f"{_GATE}:Association._agreed", lambda result, _, *args: result != args[3]),
         batch=True,
@@ -49,7 +49,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "misread_ids",
         "A refused marker where exactly one other marker of the map would be seen is taken for that other one.",
-        ("robust/association.py", "graph/factors.py"),
+        ("estimation/sightings.py", "graph/factors.py"),
         (Switch(f"{_GATE}:Association._reassociate", Returns(())),),
         Probe(f"{_GATE}:Association._reassociate", something),
         batch=True,
@@ -58,7 +58,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
     Mechanism(
         "overruled_prediction",
         "Refused sightings of two landmarks that agree on a place nearby widen the motion and are fused.",
-        ("robust/association.py", "robust/sighting_judge.py"),
+        ("estimation/sightings.py",),
         (Switch(f"{_GATE}:Association.nearby_consensus", Returns(None)),),
         Probe(f"{_GATE}:Association.nearby_consensus", not_none),
         batch=True,
@@ -70,7 +70,7 @@ OF_LANDMARKS: tuple[Mechanism, ...] = (
     Mechanism(
         "landmark_modes",
         "A landmark whose displacement explains what is seen much better is named as moved and left out.",
-        ("robust/landmark_modes.py",),
+        ("estimation/landmark_modes.py",),
         (Switch(f"{_MODES}.observe", Returns(None)),),
         Probe(f"{_MODES}.observe", not_none),
         batch=True,

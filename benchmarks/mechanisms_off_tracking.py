@@ -14,10 +14,10 @@ from benchmarks.mechanisms_switch import (
     something,
 )
 
-_GATE = "fgloc.robust.association"
-_SEARCH = "fgloc.relocalization.place_search"
-_CONSENSUS = "fgloc.relocalization.pose_consensus:PoseConsensus"
-_WHERE = "fgloc.relocalization.tracking_state:Tracking"
+_GATE = "fgloc.estimation.sightings"
+_SEARCH = "fgloc.estimation.place"
+_CONSENSUS = "fgloc.estimation.pose_fit:PoseConsensus"
+_WHERE = "fgloc.estimation.tracking:Tracking"
 _BATCH = "fgloc.graph.batch:BatchSmoother"
 
 
@@ -30,10 +30,9 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "place_search",
         "While every sighting is refused, another place that explains them is searched for on the map.",
         (
-            "relocalization/tracking_state.py",
-            "relocalization/global_search.py",
-            "relocalization/place_search.py",
-            "relocalization/gaussian_sum.py",
+            "estimation/tracking.py",
+            "estimation/place.py",
+            "estimation/beacons.py",
         ),
         (Switch(f"{_WHERE}.search", Returns(None)),),
         Probe(f"{_WHERE}.search", not_none),
@@ -43,7 +42,7 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "lost_by_covariance",
         "A pose too uncertain for any sighting to be judged by makes the robot lost.",
-        ("relocalization/tracking_state.py",),
+        ("estimation/tracking.py",),
         (Switch(f"{_WHERE}.is_unlocalized", Returns(False)),),
         Probe(f"{_WHERE}.is_unlocalized", something),
         batch=True,
@@ -52,16 +51,16 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "lift",
         "A robot that rises, or turns though it stands, is carried: no source knows its motion.",
-        ("robust/lift.py", "robust/motion_judge.py"),
-        (Switch("fgloc.robust.lift:LiftMonitor.observe", Returns([])),),
-        Probe("fgloc.robust.lift:LiftMonitor.observe", something),
+        ("estimation/faults.py", "estimation/motion.py"),
+        (Switch("fgloc.estimation.faults:LiftMonitor.observe", Returns([])),),
+        Probe("fgloc.estimation.faults:LiftMonitor.observe", something),
         batch=True,
         case="lifted",
     ),
     Mechanism(
         "given_pose_held",
         "A given first pose holds against sightings that contradict it from the start.",
-        ("relocalization/tracking_state.py", "robust/sighting_judge.py"),
+        ("estimation/tracking.py", "estimation/sightings.py"),
         (Switch(f"{_WHERE}.keeps_initial_pose", _never),),
         Probe(f"{_WHERE}.gate_initial_pose", lambda _, before, where, *args: where.keeps_initial_pose),
         batch=True,
@@ -70,14 +69,14 @@ OF_TRACKING: tuple[Mechanism, ...] = (
     Mechanism(
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
-        ("relocalization/place_search.py",),
+        ("estimation/place.py",),
         (Switch(f"{_SEARCH}:MOST_STEPS", Constant(0)),),
         case="ids30",
     ),
     Mechanism(
         "jump_compelling",
         "A place other than the tracked one needs two landmarks, and nearly all sightings of an image or two images.",
-        ("relocalization/pose_consensus.py",),
+        ("estimation/pose_fit.py",),
         (Switch(f"{_CONSENSUS}.overrides_prior", Returns(True)),),
         Probe(f"{_CONSENSUS}.overrides_prior", lambda result, *_: not result),
         batch=True,

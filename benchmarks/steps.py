@@ -25,13 +25,13 @@ import numpy as np
 from benchmarks.common import Row, main
 from fgloc import se2
 from fgloc.config import Config, load_config
+from fgloc.estimation.localizer import Localizer
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.estimators import FixedLag, isam2_params
 from fgloc.graph.factors import pose_key
 from fgloc.instrumentation import Stopwatch
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
-from fgloc.localizer import Localizer
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model

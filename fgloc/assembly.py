@@ -10,9 +10,9 @@ from fgloc.config import Config
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.diagnosis.sanity import Sanity
+from fgloc.estimation.localizer import Localizer
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator, reported_bounds
-from fgloc.localizer import Localizer
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, StreamFacts, recorded_setup, sensor_setup
 from fgloc.sensors import registry

@@ -27,8 +27,8 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
+from fgloc.estimation.pose_fit import fit_pose
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.relocalization.pose_fit import fit_pose
 from fgloc.sensors.equipment import compensated
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.markers.images import CornersEvent

@@ -21,8 +21,8 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.diagnosis.signals import Path, Signals
+from fgloc.estimation.faults import LiftMonitor
 from fgloc.frames import rotation_of
-from fgloc.robust.lift import LiftMonitor
 from fgloc.sensors import registry
 from fgloc.sensors.cameras import up_in_base
 from fgloc.sensors.equipment import AttitudeSensor, LandmarkSensor, Odometer

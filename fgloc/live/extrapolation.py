@@ -14,6 +14,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.motion import MotionSources, source_difference
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict, spatial
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -21,8 +22,6 @@ from fgloc.graph.noise import NoiseBudget
 from fgloc.intake.clocks import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
-from fgloc.robust.motion_sources import MotionSources
-from fgloc.robust.source_difference import source_difference
 from fgloc.sensors import registry
 from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionSensors, Odometer
 from fgloc.stats import chi2_bound

@@ -21,9 +21,9 @@ from benchmarks.mechanisms_report import report, without_effect
 from benchmarks.mechanisms_rows import Scope, over_before, wanted
 from benchmarks.mechanisms_runs import file_name, named, outcome
 from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
-from fgloc.relocalization import place_search
-from fgloc.robust import association
-from fgloc.robust.association import Association
+from fgloc.estimation import place as place_search
+from fgloc.estimation import sightings as association
+from fgloc.estimation.sightings import Association
 from fgloc.types import LandmarkMap
 
 SOURCE = '''
@@ -104,7 +104,7 @@ def test_probes_watch_what_is_there_and_put_it_back():
 
 def test_a_switch_of_what_is_gone_says_so():
     with pytest.raises(AttributeError, match="delete its row"):
-        Switch("fgloc.robust.association:Association._never_there", Returns(None)).place()
+        Switch("fgloc.estimation.sightings:Association._never_there", Returns(None)).place()
 
 
 def test_without_the_gate_nothing_is_refused_and_the_probes_count_the_votes():

@@ -13,8 +13,8 @@ from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config
 from fgloc.diagnosis.sanity import Track, Watch, gyro_agrees, judged
 from fgloc.errors import FglocError
+from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
-from fgloc.localizer import Localizer
 from fgloc.runner import run
 from fgloc.types import Estimate, Mode, MotionMeasurement, Step
 from fgloc_datasets.bag import BagWriter

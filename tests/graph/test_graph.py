@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.errors import CovarianceError, EstimatorError
+from fgloc.estimation.sightings import Association
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors, landmark_key, motion_factor, pose_key
@@ -21,7 +22,6 @@ from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 from fgloc.graph.noise import gaussian
 from fgloc.graph.observation import cartesian
-from fgloc.robust.association import Association
 from fgloc.sensors.equipment import compensated
 from fgloc.types import (
     Camera,

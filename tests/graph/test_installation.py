@@ -25,6 +25,7 @@ from robot_world import (
 
 from fgloc import se2
 from fgloc.config import BatchConfig, Config, EstimatorConfig
+from fgloc.estimation.motion import MotionSources
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
@@ -32,7 +33,6 @@ from fgloc.graph.ground import predict
 from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationEstimate, installation_of
 from fgloc.graph.joint import correct, fuse_installed, joint_cov
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.robust.motion_sources import MotionSources
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.markers.images import CornersEvent

@@ -14,10 +14,10 @@ from robot_world import CAMERA, START_NS, World, beacons, config, room
 
 from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
+from fgloc.estimation.pose_fit import PoseFit
 from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.facts import LiveFacts
 from fgloc.live.run import OnlineRun
-from fgloc.relocalization.pose_fit import PoseFit
 from fgloc.types import Mode, MotionEvent
 
 SECOND = 1_000_000_000

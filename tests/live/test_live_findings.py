@@ -16,11 +16,11 @@ from fgloc import se2
 from fgloc.cli.live import _exit_if_wrong
 from fgloc.cli.terminal import EXIT_LOST
 from fgloc.diagnosis.mistakes import Diagnosis
+from fgloc.estimation.localizer import Localizer
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
 from fgloc.live.status import LiveStatus
 from fgloc.live.wire.node import described
-from fgloc.localizer import Localizer
 from fgloc.recording.standard_messages import diagnostics
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent

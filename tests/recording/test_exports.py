@@ -15,10 +15,10 @@ import fgloc
 from fgloc import se2
 from fgloc.cli import app
 from fgloc.errors import OutputError, TrajectoryError
+from fgloc.estimation.log import mode_decisions
 from fgloc.evaluation.results import read_results
 from fgloc.files.outputs import write_kitti
 from fgloc.recording.mcap_export import TYPES, write_mcap
-from fgloc.robust.decision_log import mode_decisions
 from fgloc.types import Mode, Trajectory
 
 MODES = [Mode.UNCONFIRMED] * 20 + [Mode.OK] * 130 + [Mode.DEAD_RECKONING] * 50 + [Mode.OK] * 100

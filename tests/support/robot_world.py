@@ -10,10 +10,10 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.localizer import Localizer
 from fgloc.frames import yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
-from fgloc.localizer import Localizer
 from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent

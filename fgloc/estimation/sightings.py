@@ -1,28 +1,118 @@
-"""Data association: the covariance of each sighting, and whether it is accepted."""
+"""Sightings that enter the graph, and the causes of others: a moved or misread landmark, a wrong motion or pose.
+
+`Association` is the chi-square gate with its better explanations; `SightingJudge` asks it, `LandmarkModes` for moved
+landmarks and `Tracking` for another place on the map in turn.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.faults import InnovationBias
+from fgloc.estimation.landmark_modes import LandmarkModes
+from fgloc.estimation.log import OVERRULED, moved_decision, moved_notes, place_decision
+from fgloc.estimation.motion import JudgedMotion
+from fgloc.estimation.place import InitialPose
+from fgloc.estimation.pose_fit import Fit, apart, fit_pose
+from fgloc.estimation.tracking import CONTRADICTS, Tracking
+from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
-from fgloc.relocalization.pose_consensus import apart
-from fgloc.relocalization.pose_fit import Fit, fit_pose
-from fgloc.robust.landmark_modes import LandmarkModes
-from fgloc.robust.sensor_measurements import SensorMeasurements, kind_of, row_id, source_of
+from fgloc.sensors import registry
 from fgloc.stats import chi2_bound
-from fgloc.types import (
-    Decision,
-    LandmarkMeasurement,
-    PixelMeasurement,
-    PoseMeasurement,
-)
+from fgloc.types import Decision, LandmarkMeasurement, PixelMeasurement, PointMeasurement, PoseMeasurement, Step
+
+# --- Measurements of registered sensors beyond the gate ---------------------------------------------------------------
+
+Judged = list[tuple[float, int, str]]
+"""Of each measurement: NIS, degrees of freedom, and why it is rejected ("" if it is not)."""
+Judge = Callable[[Sequence[LandmarkMeasurement], PoseWithCovariance], Judged]
+
+
+class SensorMeasurements:
+    """Revises what the gate makes of measurements of registered sensors; those of landmarks are left as they are."""
+
+    def __init__(self, config: Config, factors: LandmarkFactors) -> None:
+        self._adaptive = config.weights.adaptive
+        self._factors = factors
+        self._bias = InnovationBias(config.estimator.gate_probability, config.weights.window_s)
+
+    def forget(self) -> None:
+        """The pose was set anew."""
+        self._bias.forget()
+
+    def revise(
+        self, measurements: Sequence[LandmarkMeasurement], judged: Judged, predicted: PoseWithCovariance, judge: Judge
+    ) -> tuple[Sequence[LandmarkMeasurement], Judged]:
+        """The measurements to be used, and the verdict on each.
+
+        Args:
+            measurements: of one step.
+            judged: what the gate makes of them.
+            predicted: the pose.
+            judge: the gate, for other explanations.
+        """
+        if not any(isinstance(m, PoseMeasurement) for m in measurements):
+            return measurements, judged
+        taken, verdicts = list(measurements), list(judged)
+        for i, (m, verdict) in enumerate(zip(measurements, judged, strict=True)):
+            if not isinstance(m, PoseMeasurement):
+                continue
+            if not verdict[2] and self._adaptive and self._is_biased(m, predicted):
+                verdicts[i] = verdict[0], verdict[1], "biased"
+            if verdicts[i][2]:
+                taken[i], verdicts[i] = _explained_otherwise(m, verdicts[i], predicted, judge)
+        return taken, verdicts
+
+    def _is_biased(self, m: PoseMeasurement, predicted: PoseWithCovariance) -> bool:
+        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
+        return self._bias.is_biased((m.source, m.target), m.stamp_ns, one, predicted.cov)
+
+
+def _explained_otherwise(
+    m: PoseMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance, judge: Judge
+) -> tuple[PoseMeasurement, tuple[float, int, str]]:
+    """The first alternative of a rejected measurement that the gate accepts; else the measurement itself.
+
+    Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the most probable
+    component of a mixture stands for all of it; here the gate decides which.
+    """
+    if verdict[2] in ("gate", "biased"):
+        for other in m.alternatives(predicted.pose):
+            (found,) = judge([other], predicted)
+            if not found[2]:
+                return other, found
+    return m, verdict
+
+
+def kind_of(m: LandmarkMeasurement) -> str:
+    """Of a measurement's row in ``steps.csv``: of a registered sensor with the number of what it measured."""
+    if not isinstance(m, PoseMeasurement):
+        return registry.kind_of(type(m))
+    return m.source if m.target < 0 else f"{m.source}.{m.target}"
+
+
+def row_id(m: LandmarkMeasurement) -> int:
+    """Of a landmark in a measurement's row in ``steps.csv``; -1: none."""
+    return -1 if isinstance(m, PoseMeasurement) else m.landmark_id
+
+
+def source_of(m: LandmarkMeasurement) -> str:
+    """Of a measurement's rejections."""
+    return m.source if isinstance(m, PoseMeasurement) else "sightings"
+
+
+# --- The gate, joint compatibility, misread ids -----------------------------------------------------------------------
 
 
 class Association:
@@ -283,3 +373,150 @@ class Association:
         """The clock jumped: nothing is known of when landmarks were seen last."""
         self._last_used_ns.clear()
         self.forget_contradictions()
+
+
+# --- The verdict on a step's sightings --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedSightings:
+    """The sightings of one step as they enter the graph.
+
+    Attributes:
+        accepted: to be fused.
+        rejected: not to be fused.
+        logged: those of them that the batch smoother and the landmark modes may know of.
+        decisions: rows of ``steps.csv``, one per sighting.
+        places: rows for places that sightings tell beside the predicted one.
+        predicted: the pose that they were held against.
+        elsewhere: where on the map the robot is instead; None: it is where it was predicted.
+    """
+
+    accepted: Sequence[LandmarkFactor]
+    rejected: Sequence[LandmarkFactor]
+    logged: Sequence[LandmarkFactor]
+    decisions: Sequence[Decision]
+    predicted: PoseWithCovariance
+    places: Sequence[Decision] = ()
+    elsewhere: InitialPose | None = None
+
+    @property
+    def observes_yaw(self) -> bool:
+        """Whether any accepted one determines the yaw by itself."""
+        return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.observes_yaw for s in self.accepted)
+
+    def dropped(self, reason: str) -> JudgedSightings:
+        """The same where the graph could not take any of them."""
+        decisions = [replace(d, weight=0.0, reason=d.reason or reason) for d in self.decisions]
+        return replace(self, accepted=(), decisions=decisions)
+
+
+class SightingJudge:
+    """Holds the sightings of each step against the predicted pose."""
+
+    def __init__(self, config: Config, estimator: Estimator, tracking: Tracking) -> None:
+        """Take what knows the pose, and where else the robot may be."""
+        self._estimator = estimator
+        self._tracking = tracking
+        self._association = Association(config, estimator.factors)
+        self._rejections: Counter[str] = Counter()
+
+    @property
+    def modes(self) -> LandmarkModes:
+        """Which landmarks were moved."""
+        return self._association.modes
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What was not used so far, by reason."""
+        return self._rejections + self._association.rejections
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of landmarks, one sentence each."""
+        return tuple(moved_notes(self.modes.displacements))
+
+    @property
+    def contradicting(self) -> int:
+        """How many landmarks were rejected since a sighting was accepted."""
+        return self._association.contradicting
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of when landmarks were seen last."""
+        self._association.begin_segment()
+
+    def restart(self) -> None:
+        """The robot was found at another place."""
+        self._association.forget_contradictions()
+
+    def judge(
+        self, step: Step, sightings: Sequence[LandmarkMeasurement], motion: JudgedMotion
+    ) -> tuple[JudgedMotion, JudgedSightings]:
+        """Sort the sightings of a step; the motion is returned too, with more noise where they found it to be wrong."""
+        predicted = self._estimator.predict(motion.factors)
+        seen = self.associate(step, sightings, predicted)
+        if seen.accepted:
+            return motion, seen
+        outliers = [m for m in (s.measurement for s in seen.rejected) if self._may_tell_place(m)]
+        found = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
+        if found is not None and self._tracking.keeps_initial_pose:
+            self._tracking.record_conflict(predicted, found.newest)
+            row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, found.newest, CONTRADICTS)
+            return motion, replace(seen, places=(row,))
+        if found is not None or self._tracking.keeps_initial_pose:
+            return motion, replace(seen, elsewhere=found)
+        fit = self._association.nearby_consensus(seen.rejected, seen.decisions, predicted)
+        if fit is None:
+            return motion, seen
+        nearby = PoseWithCovariance(fit.pose, fit.cov)
+        row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, nearby, OVERRULED)
+        self._rejections["motion.overruled"] += 1
+        motion = motion.overruled(np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2))
+        seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
+        return motion, replace(seen, places=(row,))
+
+    def _may_tell_place(self, m: LandmarkMeasurement) -> bool:
+        """Whether the search may know of a rejected sighting: it judges by itself whether a beacon was moved."""
+        return isinstance(m, PointMeasurement) or not self.modes.excludes(m.landmark_id)
+
+    def associate(
+        self, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
+    ) -> JudgedSightings:
+        """Accept or reject each sighting against one pose; against a given first pose that holds, reject all."""
+        judged = self._association.judge(self._estimator.k + 1, step.stamp_ns, sightings, predicted)
+        accepted, rejected, decisions = self._tracking.gate_initial_pose(*judged)
+        if held := sum(d.reason == CONTRADICTS for d in decisions):
+            self._rejections["sightings.contradict_initial_pose"] += held
+        if self._tracking.keeps_initial_pose:
+            self.modes.forget()  # they all seem moved from there
+        logged = () if self._tracking.keeps_initial_pose else rejected
+        return JudgedSightings(accepted, rejected, logged, decisions, predicted)
+
+    def exclude_displaced(self, k: int, step: Step, found: InitialPose) -> list[Decision]:
+        """Leave out what the search found to be moved, and no longer what it found in place."""
+        return [
+            moved_decision(k, step.stamp_ns, landmark_id, one.evidence, self.modes.alarm)
+            for landmark_id, one in (found.displaced or {}).items()
+            if self.modes.exclude_if_moved(landmark_id, one.by, one.evidence)
+        ]
+
+    def begin_graph(self, seen: JudgedSightings, belief: PoseWithCovariance) -> None:
+        """The graph begins with these sightings, which made a pose of the predicted one."""
+        self.modes.restart()
+        self.modes.observe((), seen.predicted, belief, seen.accepted)
+
+    def exclude_moved(self, step: Step, motion: JudgedMotion, seen: JudgedSightings) -> tuple[list[Decision], bool]:
+        """Leave out a landmark that was moved; take back what it did to the newest pose.
+
+        Returns:
+            The rows of ``steps.csv``, and whether the pose was set anew.
+        """
+        k = self._estimator.k
+        belief = self._estimator.log.keyframes[k].belief
+        moved = self.modes.observe(motion.factors, seen.predicted, belief, seen.accepted, seen.logged)
+        if moved is None:
+            return [], False
+        without, nis = self.modes.exclude(moved, belief)
+        if without is not belief:
+            self._estimator.correct(without, moved)
+        return [moved_decision(k, step.stamp_ns, moved, nis, self.modes.alarm)], without is not belief

@@ -13,9 +13,9 @@ from test_initializer import landmark_map, point, seen_point
 from world_bags import write_world
 
 from fgloc import se2
+from fgloc.estimation.beacons import GaussianSum
+from fgloc.estimation.landmark_modes import MOST_HYPOTHESES
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.relocalization.gaussian_sum import GaussianSum
-from fgloc.robust.landmark_modes import MOST_HYPOTHESES
 from fgloc.runner import run
 from fgloc.types import Mode, MotionMeasurement
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-import fgloc.relocalization.place_search
+import fgloc.estimation.place
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.localizer import Localizer
-from fgloc.relocalization.pose_fit import fit_pose
+from fgloc.estimation.localizer import Localizer
+from fgloc.estimation.pose_fit import fit_pose
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -127,7 +127,7 @@ def test_the_search_does_not_grow_with_what_was_seen(monkeypatch):
     standing = LandmarkMap({i: Landmark(i, np.array([*p, 0.5]), _WALL, 0.2) for i, p in enumerate(PLACES)})
     run = Localizer(Config(), standing, MotionSensors(Wheels()), PoseSensors(Nonsense()))
     fits = []
-    search = fgloc.relocalization.place_search
+    search = fgloc.estimation.place
     monkeypatch.setattr(search, "fit_pose", lambda *a: fits.append(len(a[1])) or fit_pose(*a))
     sums = []
     for k in range(40):

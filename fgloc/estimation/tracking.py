@@ -9,11 +9,11 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.beacons import CARRIED, WRONG_LANDMARK
+from fgloc.estimation.place import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
+from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.relocalization.gaussian_sum import CARRIED, WRONG_LANDMARK
-from fgloc.relocalization.global_search import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
-from fgloc.relocalization.pose_consensus import MAX_SIGMA, apart
 from fgloc.types import (
     Decision,
     FloatArray,

@@ -14,16 +14,15 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.faults import FaultVerdict
+from fgloc.estimation.log import motion_decisions
+from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, source_difference
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
-from fgloc.robust.decision_log import motion_decisions
-from fgloc.robust.motion_faults import FaultVerdict, MotionFaultMonitor
-from fgloc.robust.motion_sources import MotionSources
-from fgloc.robust.source_difference import source_difference
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.network import JointCalibration

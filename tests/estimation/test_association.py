@@ -9,8 +9,8 @@ import pytest
 from exact import exact
 from robot_world import START_NS, Chain, polar, project, standing
 
+from fgloc.estimation import sightings as association
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.robust import association
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.types import Decision, Landmark, LandmarkMap, Step

@@ -12,7 +12,7 @@ from robot_world import START_NS, Chain, World, config, room
 from test_ablation_failures import apply, driving, make, of
 
 from fgloc.ablation.failures import corrupt
-from fgloc.robust.lift import LiftMonitor
+from fgloc.estimation.faults import LiftMonitor
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent

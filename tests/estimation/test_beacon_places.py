@@ -11,8 +11,8 @@ from robot_world import Chain, World, beacons, config, position_error
 from test_initializer import landmark_map, point, seen_point
 
 from fgloc import se2
+from fgloc.estimation.beacons import GaussianSum
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.relocalization.gaussian_sum import GaussianSum
 from fgloc.types import Event, Mode
 
 TRUTH = np.array([0.4, -0.3, 0.35])

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from fgloc import se2
+from fgloc.estimation.faults import FaultVerdict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
-from fgloc.robust.motion_faults import FaultVerdict
 from fgloc.sensors import registry
 from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
 

@@ -9,9 +9,9 @@ import pytest
 from robot_world import CAMERA, config, polar, project, standing
 
 from fgloc import se2
+from fgloc.estimation.place import GlobalSearch, InitialPose
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.relocalization.global_search import GlobalSearch, InitialPose
 from fgloc.types import (
     FrameMeasurement,
     Landmark,

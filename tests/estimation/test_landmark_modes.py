@@ -172,7 +172,7 @@ def test_what_a_displacement_does_to_the_estimate_is_predicted():
 
 
 def test_of_more_landmarks_than_there_are_hypotheses_those_seen_last_are_followed(monkeypatch):
-    monkeypatch.setattr("fgloc.robust.landmark_modes.MOST_HYPOTHESES", 6)
+    monkeypatch.setattr("fgloc.estimation.landmark_modes.MOST_HYPOTHESES", 6)
     world = room()
     made = World(world, seconds=22.0, rate=5, shown=moved(world, 7))
     chain = Chain(exact(), world)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from fgloc.config import Config, WeightsConfig
-from fgloc.robust.glr_test import GlrTest
-from fgloc.robust.motion_faults import MotionFaultMonitor
-from fgloc.robust.motion_sources import MotionSources
+from fgloc.estimation.faults import GlrTest
+from fgloc.estimation.motion import MotionFaultMonitor, MotionSources
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import MotionMeasurement, MotionReadings, Step

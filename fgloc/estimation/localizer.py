@@ -1,0 +1,383 @@
+"""The core loop and how it begins: measure, judge, fuse, record. Replay and live streams call `Localizer.update`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config
+from fgloc.estimation.log import JUMP, mode_decisions, place_decision, segment_decision
+from fgloc.estimation.motion import MotionJudge
+from fgloc.estimation.place import InitialPose
+from fgloc.estimation.sightings import SightingJudge, kind_of
+from fgloc.estimation.tracking import Tracking
+from fgloc.graph.estimators import Estimator, make_estimator
+from fgloc.graph.ground import spatial
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.instrumentation import Stopwatch
+from fgloc.sensors.equipment import MotionCompensation, MotionSensors, PoseSensors
+from fgloc.types import (
+    Decision,
+    Estimate,
+    FloatArray,
+    Ground,
+    LandmarkMap,
+    LandmarkMeasurement,
+    Mode,
+    MotionReadings,
+    Step,
+)
+
+# --- Record -----------------------------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Adds to the graph's covariance what the graph does not know: clock, kidnapping, the whole map where lost.
+
+    Attributes:
+        counts: factors added, by kind.
+        rejections: what was not used, by reason, beside what the judges rejected.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        tracking: Tracking,
+        motion: MotionJudge,
+        sightings: SightingJudge,
+        compensation: MotionCompensation,
+    ) -> None:
+        """Take the parts that know it."""
+        self.counts: Counter[str] = Counter()
+        self.rejections: Counter[str] = Counter()
+        self._clock_sigma_s = config.recording.clock_sigma_s
+        self._dead_reckoning_after_s = config.estimator.dead_reckoning_after_s
+        self._tracking, self._motion, self._sightings, self._compensation = tracking, motion, sightings, compensation
+        self._installation = tracking.installation
+        self._last_ground: FloatArray | None = None
+        self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
+
+    def count(self, frame: Keyframe) -> None:
+        """Count the factors of a new keyframe."""
+        self.counts.update(() if frame.prior is None else ("prior",))
+        self.counts.update(m.source for m in frame.motions)
+        self.counts.update(kind_of(s.measurement) for s in frame.sightings)
+
+    def clock_jumped(self, k: int, step: Step) -> None:
+        """Note a new segment, to be reported with its first estimate."""
+        self._clock_jumps.append(segment_decision(k, step.start_ns))
+
+    def record(self, step: Step, frame: Keyframe, decisions: Sequence[Decision]) -> Estimate:
+        """The estimate of the newest keyframe; its mode and added covariance are kept in the log for the smoother."""
+        tracking, belief = self._tracking, frame.belief
+        frame.step, frame.mode = step, tracking.mode
+        if self._motion.is_carried and frame.mode is Mode.OK and tracking.since_fix_s > 0.0:
+            frame.mode = Mode.DEAD_RECKONING
+        twist = self._compensation.twist(step, step.stamp_ns)
+        by_clock = np.asarray(np.outer(twist, twist) * self._clock_sigma_s**2)
+        frame.added_cov = by_clock + tracking.kidnapped_cov(self._sightings.contradicting, belief)
+        if frame.mode is Mode.LOST:
+            frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
+        modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)
+        before, self._clock_jumps = [*self._clock_jumps, *self._motion.take_signs()], []
+        cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
+        ground = spatial(belief, self._installation, frame.added_cov)
+        if ground is not None:
+            frame.ground_clock_cov = self._ground_by_clock(step, ground)
+            ground = replace(ground, cov=ground.cov + frame.ground_clock_cov)
+        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes), ground)
+
+    def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:
+        """Covariance ``(6, 6)`` of height, roll and pitch for a clock that is off, as `record` has it of x, y, yaw."""
+        now, before = np.array([ground.z, ground.roll, ground.pitch]), self._last_ground
+        self._last_ground = now
+        rates: FloatArray = np.zeros(6)
+        if before is not None and step.dt > 0.0:
+            rates[2:5] = (now - before) / step.dt
+        return np.asarray(np.outer(rates, rates) * self._clock_sigma_s**2)
+
+    def unconfirmed(self, k: int, step: Step) -> Estimate | None:
+        """The pose before the sightings are enough to begin the graph with; None: they hardly tell it."""
+        belief = self._tracking.unconfirmed()
+        if belief is None:
+            return None
+        cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+        rows = mode_decisions(k, step.stamp_ns, Mode.UNCONFIRMED, self._tracking.since_fix_s, np.nan)
+        return Estimate(step.stamp_ns, belief.pose, cov, Mode.UNCONFIRMED, rows)
+
+    def never_confirmed(self, estimates: Sequence[Estimate], frames: Sequence[Keyframe], mode: Mode) -> list[Estimate]:
+        """Estimates of a segment whose first pose was never found, in the mode for it.
+
+        Args:
+            estimates: as recorded from the most probable place on.
+            frames: their keyframes.
+            mode: ``UNCONFIRMED``; or ``LOST``, with a covariance that allows for the whole map.
+        """
+        for frame in frames:
+            if mode is Mode.LOST is not frame.mode:
+                frame.added_cov = frame.added_cov + self._tracking.lost_cov(frame.belief)
+            frame.mode = mode
+        if mode is not Mode.LOST:
+            return [replace(e, mode=mode) for e in estimates]
+        covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
+        return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
+
+
+def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:
+    if cov is None:
+        return estimate
+    ground = estimate.ground
+    return replace(estimate, cov=cov, ground=None if ground is None else ground.with_planar(cov))
+
+
+# --- Begin: at the first pose, after a jump of the clock, where a lost robot is found ---------------------------------
+
+Advance = Callable[[Step, MotionReadings, Sequence[LandmarkMeasurement]], Estimate]
+"""Takes a step that follows the newest keyframe through the loop."""
+
+
+class Initialization:
+    """Collects steps until a first pose is clear, then runs them all through the loop."""
+
+    def __init__(
+        self,
+        tracking: Tracking,
+        estimator: Estimator,
+        motion: MotionJudge,
+        sightings: SightingJudge,
+        recorder: Recorder,
+        advance: Advance,
+        keep_all: bool,
+    ) -> None:
+        """Take the parts of the loop.
+
+        Args:
+            tracking: searches the map.
+            estimator: to be started.
+            motion: is begun anew with it.
+            sightings: likewise.
+            recorder: makes the estimates.
+            advance: see there.
+            keep_all: a segment that never got a pose is made up for when it ends; otherwise when the run does.
+        """
+        self._tracking, self._estimator = tracking, estimator
+        self._motion, self._sightings, self._recorder = motion, sightings, recorder
+        self._advance, self._keep_all = advance, keep_all
+        self._segment = -1
+        self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
+        self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
+
+    def restart_at(self, pose: PoseWithCovariance) -> None:
+        """At the next step, go on from a pose that is known from elsewhere: see `Localizer.restart_at`."""
+        self._restart = pose
+
+    def prepare(self, step: Step) -> None:
+        """Before a step is measured: begin a segment where nothing connects it to the last, or search if lost."""
+        if step.segment != self._segment or self._restart is not None:
+            self._begin_segment(step)
+        elif not self._tracking.initializing and self._tracking.is_unlocalized(self._estimator.belief):
+            self._sightings.modes.forget()
+            self._tracking.get_lost()
+
+    def _begin_segment(self, step: Step) -> None:
+        if self._keep_all:
+            self.finish()
+        if self._segment not in (-1, step.segment):
+            self._recorder.clock_jumped(self._estimator.k + 1, step)
+        self._segment = step.segment
+        self._motion.begin_segment(step)
+        self._sightings.begin_segment()
+        known, self._restart = self._restart, None
+        self._prior = self._tracking.begin_segment(self._estimator.belief, known)
+
+    def add(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
+        """Take in a step while the pose is looked for; the estimate of it, if there is one by now."""
+        if self._prior is not None:
+            prior, self._prior = self._prior, None  # it does not hold once the robot got lost
+            self._tracking.start_known()
+            return self._start(step, prior, sightings)
+        motions = self._motion.combine(step, readings)
+        self._estimator.level(motions)
+        found = self._tracking.collect(step, motions, sightings, readings)
+        if found is None and self._tracking.lost:
+            return self._advance(step, readings, ())
+        if found is None:
+            return self._recorder.unconfirmed(self._estimator.k + 1, step)
+        if self._tracking.lost:
+            return self.jump(step, found, ())
+        estimates = self._replay(found)
+        return replace(estimates[-1], decisions=tuple(d for estimate in estimates for d in estimate.decisions))
+
+    def jump(self, step: Step, found: InitialPose, decisions: Sequence[Decision]) -> Estimate:
+        """Go on from a place that nothing connects with the estimated pose; ``decisions``: that led there."""
+        before, place = self._estimator.belief, found.newest
+        if before is not None:
+            decisions = [*decisions, place_decision(self._estimator.k + 1, step.stamp_ns, before, place, JUMP)]
+            self._tracking.found(before, place)
+        self._motion.restart()
+        self._sightings.restart()
+        self._recorder.rejections["motion.jump"] += 1
+        decisions = [*decisions, *self._sightings.exclude_displaced(self._estimator.k + 1, step, found)]
+        estimate = self._start(step, place, ())
+        return replace(estimate, decisions=(*decisions, *estimate.decisions))
+
+    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
+        """The segment is over: if its first pose was never found, start from the most probable place.
+
+        Args:
+            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
+
+        Returns:
+            The estimates of its steps; none if there is nothing to make up for.
+        """
+        found = self._tracking.give_up(no_landmark_sensor)
+        if found is None:
+            return []
+        first, mode = self._estimator.k + 1, Mode.LOST if self._tracking.lost else Mode.UNCONFIRMED
+        estimates = self._replay(found)
+        frames = [frame for k, frame in self._estimator.log.keyframes.items() if k >= first]
+        return self._recorder.never_confirmed(estimates, frames, mode)
+
+    def _replay(self, found: InitialPose) -> list[Estimate]:
+        """Run the collected steps through the loop."""
+        first, *rest = found.steps
+        self._motion.begin_replay()
+        displaced = self._sightings.exclude_displaced(self._estimator.k + 1, first.step, found)
+        estimates = [self._start(first.step, found.first, first.sightings)]
+        estimates[0] = replace(estimates[0], decisions=(*displaced, *estimates[0].decisions))
+        return estimates + [self._advance(later.step, later.readings, later.sightings) for later in rest]
+
+    def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        self._estimator.forget_ground()
+        seen = self._sightings.associate(step, sightings, prior)
+        pose = self._estimator.start(step.stamp_ns, prior, seen.accepted)
+        self._sightings.begin_graph(seen, pose)
+        self._tracking.record_fix(bool(seen.accepted))
+        self._motion.record_fix()
+        self._recorder.count(self._estimator.newest)
+        return self._recorder.record(step, self._estimator.newest, seen.decisions)
+
+
+# --- The loop ---------------------------------------------------------------------------------------------------------
+
+
+class Localizer:
+    """Estimates ``T_map_base``, one Step at a time.
+
+    Attributes:
+        estimator: the filter, whose log the batch smoother starts from.
+        factors: maker of landmark factors, shared with the batch smoother.
+        motion: what of the motion sources enters the graph.
+        sightings: what of the sightings enters the graph.
+        tracking: whether the robot is where it is estimated to be.
+        counts: factors added, by kind.
+        stopwatch: time spent in each phase.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        motion: MotionSensors,
+        poses: PoseSensors,
+        keep_all: bool = False,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            config: everything tunable.
+            landmark_map: the known map; None: landmarks become variables and the first pose is the origin.
+            motion: sensors of the motion.
+            poses: sensors of landmarks, and registered ones.
+            keep_all: keep the measurement log of the whole run, for the batch smoother.
+        """
+        self.estimator = make_estimator(config, landmark_map, motion, poses, keep_all)
+        self.factors = self.estimator.factors
+        self.motion = MotionJudge(config, motion, self.estimator)
+        self.tracking = Tracking(config, landmark_map, self.factors, keep_all)
+        self.sightings = SightingJudge(config, self.estimator, self.tracking)
+        self.stopwatch = Stopwatch()
+        self._compensation = MotionCompensation(poses, motion, config.camera.time_jitter_s)
+        self._recorder = Recorder(config, self.tracking, self.motion, self.sightings, self._compensation)
+        self.counts = self._recorder.counts
+        self._initialization = Initialization(
+            self.tracking, self.estimator, self.motion, self.sightings, self._recorder, self._advance, keep_all
+        )
+
+    def update(self, step: Step) -> Estimate | None:
+        """Take in one step; return the newest pose, or None while the first pose is not yet known."""
+        since_fix_s = self.tracking.since_fix_s
+        self.tracking.advance_time(step.dt)
+        self._initialization.prepare(step)
+        # 1. Measure: one call per sensor; a sensor without data yields nothing
+        with self.stopwatch("motion"):
+            readings = self.motion.read(step, since_fix_s)
+        with self.stopwatch("sightings"):
+            sightings = self._compensation.measure(step, self.factors.time_offset_s)
+        # 2. No pose yet, or lost: collect steps and search the map
+        if self.tracking.initializing:
+            return self._initialization.add(step, readings, sightings)
+        return self._advance(step, readings, sightings)
+
+    def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        """The loop from one keyframe to the next."""
+        # 3. Judge: the motion sources against each other, the sightings against the predicted pose
+        with self.stopwatch("weigh"):
+            motion = self.motion.judge(step, readings)
+            motion, seen = self.sightings.judge(step, sightings, motion)
+        if seen.elsewhere is not None:
+            return self._initialization.jump(step, seen.elsewhere, [*motion.revisions, *seen.decisions])
+        # 4. Fuse: if the graph cannot be solved with them, the estimator leaves the sightings out
+        with self.stopwatch("fuse"):
+            rebuilt = self.estimator.rebuilt
+            belief = self.estimator.update(
+                step.stamp_ns, step.dt, motion.factors, seen.accepted, seen.logged, seen.predicted
+            )
+        frame = self.estimator.newest
+        frame.readings, frame.budget = motion.readings, motion.budget
+        if self.estimator.rebuilt > rebuilt:
+            self._recorder.rejections["estimator.window_rebuilt"] += 1
+            seen = seen.dropped("window_rebuilt")
+        self._recorder.count(frame)
+        # 5. Judge by the fused pose: the motion sources' drift, and landmarks that were moved
+        if seen.accepted:
+            self.tracking.record_fix()
+        self.motion.commit(motion, belief if seen.accepted else None, seen.observes_yaw)
+        moved, pose_changed = self.sightings.exclude_moved(step, motion, seen)
+        if pose_changed:
+            self.motion.restart()
+        # 6. Record
+        rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
+        return self._recorder.record(step, frame, rows)
+
+    def restart_at(self, pose: PoseWithCovariance) -> None:
+        """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
+
+        Sightings that contradict it do not hold: the map is searched.
+        """
+        self._initialization.restart_at(pose)
+
+    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
+        """The run is over: if its first pose was never found, start from the most probable place.
+
+        Args:
+            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
+
+        Returns:
+            The estimates of its steps; none if there is nothing to make up for.
+        """
+        return self._initialization.finish(no_landmark_sensor)
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What was not used so far, by reason."""
+        return self._recorder.rejections + self.motion.rejections + self.sightings.rejections
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        return (*self.tracking.notes, *self.sightings.notes, *self.motion.notes)

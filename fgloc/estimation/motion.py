@@ -1,0 +1,652 @@
+"""Motion that enters the graph: the sources are read, tested against each other, and combined to factors.
+
+Three things can be wrong with a motion, each with its own test: a source is faulty (`MotionFaultMonitor`), the robot
+is carried (`LiftMonitor`), or sightings agree on a place nearby that the motion did not lead to
+(`JudgedMotion.overruled`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.config import Config, WeightsConfig
+from fgloc.estimation.faults import Contradicted, FaultAttribution, FaultVerdict, GlrResult, GlrTest, LiftMonitor
+from fgloc.estimation.log import flag_notes, motion_decisions
+from fgloc.graph.estimators import Estimator
+from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.ground import planar_turn
+from fgloc.graph.joint import FAR_M2
+from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
+from fgloc.graph.noise import COVARIANCE_FACTOR, FusionRules, NoiseBudget, with_yaw
+from fgloc.sensors import registry
+from fgloc.sensors.base import MotionRole, Turn
+from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.wheels.motion import commanded_to_move
+from fgloc.stats import GATE, chi2_bound
+from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
+
+# --- Read -------------------------------------------------------------------------------------------------------------
+
+_MEMORIES = 2.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
+
+
+class MotionSources:
+    """Reads wheels, learned motion and gyro, and follows what is known of their drift."""
+
+    def __init__(self, config: Config, sensors: MotionSensors, factors: LandmarkFactors | None = None) -> None:
+        """Take the sensors.
+
+        Args:
+            config: of all of them.
+            sensors: to be read.
+            factors: hold what is known of the installation; None: motions are taken as they are reported.
+        """
+        self._config = config
+        # Sigma of a speed that is not measured, as a share of the gate's bound: the bound is the quantile of GATE
+        self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
+        self.factors = LandmarkFactors(None) if factors is None else factors
+        # m²/s of wheels that stand, with the way of encoders that jitter; of silent ones it is hundreds of times more
+        self._known_rest = 10.0 * registry.odometer().errors(config).noise.xy_per_sqrt_s ** 2
+        self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
+        self.gyro, self.attitude = sensors.gyro, sensors.attitude
+        self._turn: Turn | None = None  # by the gyro, of the step that was read last
+        self._yaw_indirect_s = 0.0  # how far back the yaw rests on the gyro, where fixes observe it along the way only
+        self._silent_s = 0.0  # how long there was neither a motion source nor a fix
+
+    @property
+    def rules(self) -> FusionRules:
+        """How the sources depend on each other."""
+        return FusionRules(
+            wheels_are_commands=self._wheels.from_commands,
+            learned_has_gyro=self._learned_has_gyro,
+            joint=self._joint,
+            stopped_speed=self._likely * self._config.gate.max_speed,
+            stopped_turn=self._likely * self._config.gate.max_yaw_rate,
+        )
+
+    @property
+    def learned_is_independent(self) -> bool:
+        """Whether the learned motion can be held against the wheels: it does not read them."""
+        return self._learned is not None and not self._learned.model.card.reads(MotionRole.ODOMETER)
+
+    @property
+    def _learned_has_gyro(self) -> bool:
+        return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
+
+    def read(self, step: Step, since_fix_s: float = 0.0) -> MotionReadings:
+        """Read every source once.
+
+        Args:
+            step: its events.
+            since_fix_s: time before the step without a fix.
+        """
+        if step.dt <= 0.0:
+            return MotionReadings()
+        reported = wheels = self._wheels.measure(step)
+        if reported is not None:
+            by = self._wheels.derivatives(step, reported, self.factors.installation.index)
+            wheels = self._installed(reported, by)
+        motion = np.zeros(3) if wheels is None else wheels.motion
+        gyro = self._turn = None
+        if self.gyro is not None:
+            without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
+            turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
+            if turn is not None:
+                cov = np.diag([FAR_M2, FAR_M2, turn.variance])
+                name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
+                gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
+                gyro = self._installed(gyro, self.gyro.derivatives(turned))
+                self._turn = turn
+                if reported is not None and wheels is not None:
+                    wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
+        learned = self._with_drift(self._measure_learned(step))
+        inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
+        readings = MotionReadings(wheels, learned, gyro, inertial, self._at_rest(step, reported))
+        if readings.wheels is not None or readings.learned is not None:
+            self._silent_s = 0.0
+        return readings
+
+    def _at_rest(self, step: Step, wheels: MotionMeasurement | None) -> bool:
+        """Whether the wheels stand, as far as encoders tell, no command moves them, and the gyro agrees."""
+        if self.gyro is None or not self.gyro.at_rest or wheels is None or self._wheels.from_commands:
+            return False
+        return bool(wheels.cov[0, 0] <= self._known_rest * step.dt + 1e-11)
+
+    def _by_fused_turn(
+        self, step: Step, reported: MotionMeasurement, turn: Turn, known: Mapping[str, tuple[FloatArray, float]]
+    ) -> dict[str, tuple[FloatArray, float]]:
+        """Derivatives of the wheels' motion where its turn is that of wheels and gyro together.
+
+        The derivative by a scale is the motion itself. With the wheels' own noise in it, derivative and residual are
+        correlated, and the estimate of the scale is biased, the more certain the longer the run (errors in variables).
+        The gyro is the instrument, as far as it is the better of the two. Source: Fuller 1987, "Measurement Error
+        Models", section 1.4.
+        """
+        assert self.gyro is not None
+        both = reported.cov[2, 2] + turn.noise
+        weight = float(reported.cov[2, 2] / both) if both > 0.0 else 0.0
+        fused = reported.motion[2] + weight * (turn.yaw - reported.motion[2])
+        m = replace(reported, motion=with_yaw(reported.motion, fused))
+        rates = self.gyro.rates_at(step.inertial, (step.start_ns, step.stamp_ns))
+        by = self._wheels.derivatives(step, m, self.factors.installation.index, (weight, rates))
+        return {name: (by[name], assumed) for name, (_, assumed) in known.items()}
+
+    def _with_drift(self, learned: MotionMeasurement | None) -> MotionMeasurement | None:
+        """The learned motion with the drift of the gyro that it reads, where no fix observes the yaw by itself."""
+        if learned is None or self._turn is None or not self._learned_has_gyro or self._yaw_indirect_s == 0.0:
+            return learned
+        drift = max(self._turn.variance - self._turn.noise, 0.0)
+        return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
+
+    def _installed(self, m: MotionMeasurement, *derivatives: Mapping[str, FloatArray]) -> MotionMeasurement:
+        """The motion as reported with the installation as it is known now; its derivatives are those of the sensors."""
+        index, mean = self.factors.installation.index, self.factors.estimated.mean
+        by = {name: d for each in derivatives for name, d in each.items()}
+        kept = {name: (d, float(mean[index[name]])) for name, d in by.items() if name in index}
+        correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
+        return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
+
+    def _measure_learned(self, step: Step) -> MotionMeasurement | None:
+        if self._learned is None:
+            return None
+        m = self._learned.measure_scaled(step, 0.0 if self.gyro is None else self.gyro.bias)
+        if m is None:
+            return None
+        by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
+        return self._installed(m, self._learned.derivatives(m.motion), *by_turn)
+
+    def unknown(
+        self, step: Step, readings: MotionReadings | None = None, carried_s: float | None = None
+    ) -> MotionMeasurement:
+        """No source measured the motion: sigma grows with the time since the last, however many steps it is cut into.
+
+        A gyro, if there is one, still measures the turn.
+
+        Args:
+            step: over which.
+            readings: of it.
+            carried_s: since when the robot is carried, so that its wheels do not measure [s]; None: it is not.
+        """
+        before = self._silent_s if carried_s is None else carried_s
+        after = before + step.dt
+        if carried_s is None:
+            self._silent_s = after
+        gate = self._config.gate
+        speed, turn = self._likely * gate.max_speed, self._likely * gate.max_yaw_rate
+        cov = np.diag(np.square([speed, speed, turn])) * (after**2 - before**2)
+        motion, gyro = np.zeros(3), None if readings is None else readings.gyro
+        if gyro is not None:
+            motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
+        inertial = None if readings is None else readings.inertial
+        return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov, inertial=inertial)
+
+    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, observes_yaw: bool = True) -> None:
+        """The robot went on by a step.
+
+        Args:
+            readings: of that step.
+            fix: where sightings have it now; None if there were none.
+            observes_yaw: whether one of them observes the yaw by itself. Positions and ranges do along the way: the yaw
+                of a fix then rests on the gyro too, and only two fixes far apart correct its bias.
+        """
+        if fix is not None:
+            self._silent_s = 0.0
+        if self.gyro is None:
+            return
+        if readings.gyro is None:
+            self.gyro.forget_fix()
+            return
+        turn = readings.gyro
+        seconds = (turn.stamp_ns - turn.start_ns) * 1e-9
+        turned = float(turn.motion[2])
+        if self.factors.installation.ground:  # the gyro turns about the robot's axis, the yaw about the map's
+            known, inertial = self.factors.estimated.mean, readings.inertial
+            turned = planar_turn(turn.motion, inertial, known, self.factors.installation)
+        self.gyro.turned(turned, seconds)
+        if fix is None:
+            return
+        yaw, variance = float(fix.pose[2]), float(fix.cov[2, 2])
+        if observes_yaw:
+            self._yaw_indirect_s = 0.0
+            self.gyro.fix(yaw, variance)
+        else:
+            memory_s = self._yaw_memory_s(variance)
+            self._yaw_indirect_s = min(self._yaw_indirect_s + seconds, memory_s, self._config.estimator.lag_s)
+            self.gyro.fix(yaw, variance, apart_s=_MEMORIES * memory_s)
+
+    def _yaw_memory_s(self, variance: float) -> float:
+        """How far back [s] a yaw of this variance [rad²] can rest on the gyro alone.
+
+        Over a time t its noise and its bias make a variance of q t + b² t²: where the yaw is known better than that,
+        fixes have replaced the turns before.
+        """
+        if self.gyro is None or self._turn is None:
+            return 0.0
+        noise, bias = 0.5 * self._turn.noise_density, self.gyro.bias_variance
+        return variance / (noise + math.sqrt(noise**2 + bias * variance))
+
+    def begin_segment(self) -> None:
+        """The clock jumped: nothing is known of what happened in between."""
+        self._silent_s = self._yaw_indirect_s = 0.0
+        if self.gyro is not None:
+            self.gyro.forget_fix()
+
+
+# --- Difference of two sources ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Difference:
+    """Of two motion sources over a step, in the body frame.
+
+    Attributes:
+        value: ``(3,)``.
+        cov: ``(3, 3)`` if both are right, of what differs from step to step.
+        by_installation: ``(3, p)`` derivative by the parameters of the sources, whose error is always the same ...
+        installation_cov: ... and their covariance ``(p, p)``.
+    """
+
+    value: FloatArray
+    cov: FloatArray
+    by_installation: FloatArray
+    installation_cov: FloatArray
+
+
+def source_difference(readings: MotionReadings, sources: MotionSources) -> Difference | None:
+    """How far the wheels and their reference source are apart over the step.
+
+    Returns:
+        None where there is no reference source: a model that reads the wheels is none, nor is one of the commands
+        that replace wheels.
+    """
+    wheels, learned, gyro, rules = readings.wheels, readings.learned, readings.gyro, sources.rules
+    if wheels is None or rules.wheels_are_commands:
+        return None
+    if learned is not None and sources.learned_is_independent:
+        d = se2.log(se2.between(wheels.motion, learned.motion))
+        cov = wheels.cov + learned.cov
+        if rules.joint is not None:
+            cov = rules.joint.difference_cov(wheels.cov, learned.cov)
+        return Difference(d, cov, *_systematic(wheels, learned, sources.factors))
+    if gyro is None:
+        return None
+    d = np.array([0.0, 0.0, se2.wrap(float(gyro.motion[2] - wheels.motion[2]))])
+    cov = np.diag([1.0, 1.0, wheels.cov[2, 2] + gyro.cov[2, 2]])
+    return Difference(d, cov, *_systematic(wheels, gyro, sources.factors))
+
+
+def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFactors) -> tuple[FloatArray, FloatArray]:
+    """Derivative ``(3, p)`` of ``b`` less ``a`` by all parameters that are not of sightings, and their covariance.
+
+    By all: steps are summed although the reference source may be another one in each.
+    """
+    installation = factors.installation
+    rows = installation.motion_rows
+    D = np.zeros((3, len(rows)))
+    for i, row in enumerate(rows):
+        name = installation.names[row]
+        for m, sign in ((a, -1.0), (b, 1.0)):
+            if name in m.depends_on:
+                D[:, i] += sign * m.depends_on[name][0]
+    return D, factors.estimated.cov[np.ix_(rows, rows)]
+
+
+# --- Which sources are rejected, and since when -----------------------------------------------------------------------
+
+_MOVED = 0.25  # of the reference source's travel: a wheel that turned less stood still, one that lacks less turned
+# Travel by the reference source from which a wheel is known to have turned or to have stood. Over a shorter way a robot
+# slides on with its wheels at rest: 0.08 m from 0.4 m/s at a friction of 0.1.
+_LEAST_M = 0.15
+KNOWN = "distrusted"  # a failure that the configuration states
+CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
+
+
+class MotionFaultMonitor:
+    """Tests wheels against their reference source; known failures are taken as given.
+
+    Where the two differ, wheels are taken to be wrong, unless sightings contradict the learned motion instead.
+
+    Attributes:
+        flags: how often wheels were flagged, by "source.reason".
+        compared_s: for how long there was a motion model to be compared with the wheels [s] ...
+        left_out_s: ... and for how long it was left out, as sightings contradict it.
+    """
+
+    def __init__(
+        self,
+        config: WeightsConfig,
+        sources: MotionSources,
+        track_m: float | None,
+        attribution: FaultAttribution | None = None,
+    ) -> None:
+        """Set up.
+
+        Args:
+            config: thresholds, and known failures.
+            sources: gives the difference of two readings with its covariance.
+            track_m: distance of the wheels, to distinguish left from right; None: unknown.
+            attribution: tells by sightings which of the two is wrong; None: always the wheels.
+        """
+        self.flags: Counter[str] = Counter()
+        self.compared_s = self.left_out_s = 0.0
+        self._config = config
+        self._sources = sources
+        self._attribution = attribution
+        self._track_m = track_m
+        self._glr = GlrTest(config)
+        self._travels: deque[FloatArray] = deque()  # (5,): dt, ways of left and right wheel by wheels and by reference
+        self._first_ns: int | None = None  # of the run
+        self._wrong_before: dict[str, str] = {}  # as of the step before: sources, and why
+        self._reason = "slip"  # of the wheels
+        self._model_wrong_s = 0.0  # for how long the model is still left out
+        self._tested_s = 0.0  # since a model that is left out was last tested
+        self._differing_steps = 0  # for how many steps the two have differed
+
+    def begin(self, step: Step) -> None:
+        """The first step of the run, or of a segment."""
+        if self._first_ns is None:
+            self._first_ns = step.start_ns
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing connects what comes with what was."""
+        self._glr.reset()
+        self._travels.clear()
+
+    def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
+        """Take in the readings of a step that follows the last one."""
+        rejected = self._known_failures(step)
+        if registry.motion_names().odometer in rejected:  # nothing to be found out
+            self.reset()
+        readings = _without(readings, rejected)
+        left_out = {registry.motion_names().model} if self._model_wrong_s > 0.0 else set()
+        difference = None
+        if self._config.adaptive:
+            difference = source_difference(_without(readings, left_out), self._sources)
+        verdict = GlrResult(False, 0, math.nan, math.nan)
+        if difference is not None:
+            verdict = self._glr.judge(
+                step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
+            )
+            self._travelled(step.dt, readings)
+        wrong, span = self._wrong_sources(step, readings, verdict)
+        scale = 1.0 if verdict.flagged else verdict.scale
+        self.compared_s += step.dt * (readings.learned is not None)
+        self.left_out_s += step.dt * (registry.motion_names().model in wrong)
+        budget, earlier = NoiseBudget({**wrong, **rejected}, scale), NoiseBudget(wrong if span else {}, scale)
+        return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
+
+    def _wrong_sources(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
+        """The sources that are wrong with the reason, and of how many of the newest steps that is news."""
+        names, since, was_left_out = registry.motion_names(), verdict.since, self._model_wrong_s > 0.0
+        self._differing_steps = since or self._differing_steps + 1
+        found = self._contradicted(step, readings, verdict)
+        contradicted = frozenset() if found is None else found.sources
+        if self._attribution is not None and names.model in contradicted:
+            self._model_wrong_s = self._attribution.memory_s  # until it has agreed for as long: it mostly stays wrong
+            if not was_left_out:
+                self._glr.reset()  # wheels are compared with another source from now on
+        elif found is not None:
+            self._model_wrong_s = max(self._model_wrong_s - self._config.window_s, 0.0)
+        if verdict.flagged:
+            self._reason = self._failure(since)
+        wrong = {names.model: CONTRADICTED} if self._model_wrong_s > 0.0 else {}
+        by_default = verdict.flagged and (was_left_out or names.model not in contradicted)
+        if names.odometer in contradicted or by_default:
+            wrong[names.odometer] = self._reason
+        before, self._wrong_before = self._wrong_before, wrong
+        if verdict.flagged:
+            self._count(before.get(names.odometer), wrong.get(names.odometer), since)
+        news = names.odometer in contradicted or (names.model in contradicted and not was_left_out)
+        if since or found is None or not news or before.keys() == wrong.keys():
+            return wrong, since
+        return wrong, found.steps
+
+    def _contradicted(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> Contradicted | None:
+        """What sightings exclude; None: they cannot tell, or need not be asked.
+
+        They are asked while wheels and learned motion differ; of a model that is left out, once every window.
+        """
+        if self._attribution is None or readings.learned is None:
+            return None
+        if self._model_wrong_s == 0.0:
+            self._tested_s = 0.0
+            return self._attribution.contradicted(self._differing_steps) if verdict.flagged else None
+        self._tested_s += step.dt
+        if self._tested_s < self._config.window_s:
+            return None
+        found = self._attribution.contradicted(None)
+        if found is not None:
+            self._tested_s = 0.0
+        return found
+
+    def _count(self, before: str | None, why: str | None, since: int) -> None:
+        """Count a failure of the wheels that is new; one that is seen better now takes the place of the one before."""
+        odometer = registry.motion_names().odometer
+        if why is not None and (since or why != before):
+            self.flags[f"{odometer}.{why}"] += 1
+        if before is not None and not since and why != before:
+            self.flags -= Counter({f"{odometer}.{before}": 1})
+
+    def _known_failures(self, step: Step) -> dict[str, str]:
+        start = (step.start_ns - (self._first_ns or 0)) * 1e-9
+        end = start + step.dt
+        return {d.source: KNOWN for d in self._config.distrust if start < d.end_s and end > d.start_s}
+
+    def _travelled(self, dt: float, readings: MotionReadings) -> None:
+        reference = readings.learned or readings.gyro
+        if readings.wheels is None or reference is None:
+            return
+        self._travels.append(np.array([dt, *self._sides(readings.wheels.motion), *self._sides(reference.motion)]))
+        total = np.sum(self._travels, axis=0)
+        while len(self._travels) > 1 and (
+            total[0] > self._config.window_s or (total[3:] - self._travels[0][3:] > _LEAST_M).all()
+        ):
+            total -= self._travels.popleft()
+
+    def _failure(self, since: int) -> str:
+        """What kind of failure it looks like: which wheel stood still while the robot went on, and which one turned."""
+        if since:  # what was before is no evidence
+            self._travels = deque(list(self._travels)[-since:])
+        _, *ways = np.sum(self._travels, axis=0)
+        by_wheels, did = np.reshape(ways, (2, 2))
+        went = did > _LEAST_M
+        stood, turned = went & (by_wheels < _MOVED * did), went & (by_wheels > (1.0 - _MOVED) * did)
+        if stood.all():
+            return "frozen"
+        if self._track_m is not None and stood[0] and turned[1]:
+            return "left_wheel_dead"
+        if self._track_m is not None and stood[1] and turned[0]:
+            return "right_wheel_dead"
+        return "slip" if since else self._reason
+
+    def _sides(self, motion: FloatArray) -> tuple[float, float]:
+        """How far the left and the right wheel went [m]."""
+        forward, turn = float(motion[0]), 0.5 * (self._track_m or 0.0) * float(motion[2])
+        return abs(forward - turn), abs(forward + turn)
+
+
+def _without(readings: MotionReadings, sources: Iterable[str]) -> MotionReadings:
+    """The readings of the other sources."""
+    gone: dict[str, Any] = dict.fromkeys(sources)
+    return replace(readings, **gone)
+
+
+# --- Judge, and revise past steps -------------------------------------------------------------------------------------
+
+_CARRIED = "carried"  # why nothing of a robot that was lifted enters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedMotion:
+    """The motion over one step as it enters the graph.
+
+    Attributes:
+        factors: independent of each other; at least one.
+        readings: what they were made of, to make them anew; empty if the robot was carried.
+        budget: the noise that they were made with.
+        verdict: on the sources, back to the onset of a fault.
+        revisions: rows of ``steps.csv`` of earlier steps whose motion was combined anew.
+    """
+
+    factors: tuple[MotionMeasurement, ...]
+    readings: MotionReadings
+    budget: NoiseBudget
+    verdict: FaultVerdict
+    revisions: tuple[Decision, ...] = ()
+
+    def overruled(self, cov: FloatArray) -> JudgedMotion:
+        """The motion where sightings found it to be wrong: ``cov (3, 3)`` is added to each factor."""
+        budget = replace(self.budget, overruled_cov=cov)
+        return replace(self, factors=tuple(budget.overruled(m) for m in self.factors), budget=budget)
+
+    def decisions(self, k: int) -> list[Decision]:
+        """Rows of ``steps.csv``, with those of earlier steps first."""
+        return motion_decisions(k, self.factors, self.readings, self.budget, self.verdict)
+
+
+class MotionJudge:
+    """Reads the motion sources of each step and decides what of them enters the graph.
+
+    Attributes:
+        sources: wheels, learned motion, gyro.
+        rejections: steps without a usable motion, by reason.
+    """
+
+    def __init__(self, config: Config, sensors: MotionSensors, estimator: Estimator) -> None:
+        """Take the sensors, and the estimator whose past motions are revised."""
+        self.sources = MotionSources(config, sensors, estimator.factors)
+        self.rejections: Counter[str] = Counter()
+        self._estimator = estimator
+        attribution = FaultAttribution(config, estimator) if self.sources.learned_is_independent else None
+        self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m, attribution)
+        self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
+        self._signs: list[Decision] = []  # of a lift, in the newest step
+
+    def begin_segment(self, step: Step) -> None:
+        """The clock jumped, or this is the first step: nothing connects it to what was before."""
+        self.sources.begin_segment()
+        self._faults.begin(step)
+        self._lift.reset()
+
+    def begin_replay(self) -> None:
+        """What comes next are earlier steps of the segment, collected until the first pose was known."""
+        self.sources.begin_segment()
+        self._lift.reset()
+
+    def restart(self) -> None:
+        """The pose was set anew: no motion led there."""
+        self.sources.begin_segment()
+        self._faults.reset()
+
+    def read(self, step: Step, since_fix_s: float) -> MotionReadings:
+        """Read every source once; one without data yields nothing.
+
+        Args:
+            step: the newest one.
+            since_fix_s: time before it without a fix.
+        """
+        readings = self.sources.read(step, since_fix_s)
+        self._signs = self._lift.observe(self._estimator.k + 1, step, readings)
+        return readings
+
+    def combine(
+        self, step: Step, readings: MotionReadings, budget: NoiseBudget | None = None
+    ) -> list[MotionMeasurement]:
+        """Factors of a step: of the sources, or of a robot that is carried, or of one whose motion nothing measures."""
+        if self._lift.carried:
+            return [self.sources.unknown(step, readings, self._lift.carried_s(step))]
+        made = (budget or NoiseBudget()).combine(readings, self.sources.rules)
+        return made or [self.sources.unknown(step, readings)]
+
+    def judge(self, step: Step, readings: MotionReadings) -> JudgedMotion:
+        """Test the sources against each other, back to where they began to differ, and combine what is left of them."""
+        verdict = self._faults.judge(step, readings)
+        revisions = self._revise(verdict)
+        factors = tuple(self.combine(step, readings, verdict.budget))
+        if self._lift.carried:
+            return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
+        if factors[0].source == "unknown":
+            self.rejections["motion.silent"] += 1
+        return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
+
+    def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
+        """The robot went on by a step: see `MotionSources.commit`."""
+        if fix is not None:
+            self.record_fix()
+        self.sources.commit(motion.readings, fix, observes_yaw)
+
+    def record_fix(self) -> None:
+        """Sightings, or a given pose, tell where the robot is."""
+        self._lift.fix()
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether the robot may be in the air, or was set down a short time ago."""
+        return self._lift.carried
+
+    def take_signs(self) -> list[Decision]:
+        """Rows of ``steps.csv`` for signs of a lift in the newest step; each is given once."""
+        signs, self._signs = self._signs, []
+        return signs
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of the sources, one sentence each."""
+        return (*self._model_notes(), *flag_notes(self._faults.flags))
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """The sentence on a motion model that sightings contradict most of the time."""
+        return self._model_notes() if self._faults.left_out_s > 0.5 * self._faults.compared_s else ()
+
+    def _model_notes(self) -> tuple[str, ...]:
+        left_out_s = self._faults.left_out_s
+        return (registry.motion_model().left_out(left_out_s),) if left_out_s > 0.0 else ()
+
+    def _revise(self, verdict: FaultVerdict) -> tuple[Decision, ...]:
+        """Combine the motion of earlier steps anew, back to where the sources began to differ.
+
+        Wheels that are wrong are left out; before that is certain, covariances are scaled.
+        """
+        if not verdict.earlier.rejected and verdict.earlier.scale < COVARIANCE_FACTOR:
+            return ()
+        log, newest = self._estimator.log.keyframes, self._estimator.k
+        changed: dict[int, Sequence[MotionMeasurement]] = {}
+        decisions: list[Decision] = []
+        frames = (log[i] for i in range(newest - verdict.span + 2, newest + 1) if i in log)
+        for frame in (f for f in frames if f.prior is None):
+            revised = _revised(frame, verdict.earlier)
+            if revised is None:
+                continue
+            frame.budget = revised
+            if motions := revised.combine(frame.readings, self.sources.rules):
+                changed[frame.k] = motions
+                decisions += motion_decisions(frame.k, motions, frame.readings, revised, verdict)
+        self._estimator.revise(changed)
+        return tuple(decisions)
+
+
+def _carried() -> NoiseBudget:
+    names = registry.motion_names()
+    return NoiseBudget({names.odometer: _CARRIED, names.model: _CARRIED})
+
+
+def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:
+    """The budget of an earlier step by what is known now; None: it stays."""
+    before = frame.budget
+    if now.rejected:
+        known = {name: why for name, why in before.rejected.items() if why in (KNOWN, _CARRIED)}
+        if {**now.rejected, **known}.keys() == before.rejected.keys():
+            return None
+        return replace(before, rejected={**now.rejected, **known})
+    if now.scale >= COVARIANCE_FACTOR * max(before.scale, 1.0):
+        return replace(before, scale=now.scale)
+    return None

@@ -1,1 +1,0 @@
-"""Robustness: noise and faults of the motion sources, association and faults of landmarks."""
