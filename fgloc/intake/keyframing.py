@@ -101,7 +101,7 @@ class Punctuality:
     """One topic's punctuality, as it is measured."""
 
     newest_ns: int
-    received_ns: int  # of its last message
+    heard_ns: int  # at its last message: how long events came in
     least_ns: int  # of `patience_ns`
     held: bool = False  # a message's value holds until the next
     late_ns: Peak = field(default_factory=Peak)  # by the newest stamp of all, of messages that came too late
@@ -123,7 +123,8 @@ class Punctuality:
 
 _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
-_ALIVE_NS = 2_000_000_000  # a source without messages for longer is not waited for
+_ALIVE_NS = 2_000_000_000  # a source without messages for longer is not waited for ...
+_SILENCE_NS = 500_000_000  # ... of which a silence of all sources counts no more than this
 _USED_LATE = (SightingsEvent, SensorEvent)
 
 
@@ -177,6 +178,7 @@ class KeyframeBuilder:
         self._first_ns = 0  # the segment's first keyframe
         self._newest_ns = 0  # newest stamp
         self._received_ns = 0  # when the last event was received
+        self._heard_ns = 0  # how long events came in, without the silences of all sources
         self._reached: deque[tuple[int, int]] = deque(maxlen=_MOST_REACHED)  # newest stamps of late, and when they came
         self._sources: dict[str, Punctuality] = {}
         self._pending: list[SightingsEvent | SensorEvent] = []  # that get a keyframe, by stamp
@@ -231,14 +233,16 @@ class KeyframeBuilder:
         if stamp > self._newest_ns:
             self._newest_ns = stamp
             self._reached.append((stamp, event.received_ns))
+        if self._received_ns:
+            self._heard_ns += min(max(event.received_ns - self._received_ns, 0), _SILENCE_NS)
         self._received_ns = event.received_ns
         source = self._sources.get(event.topic)
         if source is None:
             held = isinstance(event, ControlEvent)
-            source = self._sources[event.topic] = Punctuality(stamp, event.received_ns, self._reorder_ns, held)
+            source = self._sources[event.topic] = Punctuality(stamp, self._heard_ns, self._reorder_ns, held)
         elif stamp > source.newest_ns:
             source.newest_ns = stamp
-        source.received_ns = event.received_ns
+        source.heard_ns = self._heard_ns
         source.disorder_ns.add(min(source.newest_ns - stamp, self._reorder_ns), self._newest_ns)
         late = self._last_ns is not None and stamp < self._last_ns
         late_ns = self._newest_ns - stamp if late else 0
@@ -340,7 +344,7 @@ class KeyframeBuilder:
             source.newest_ns >= stamp_ns + source.disorder_ns.ns
             or (newest >= stamp_ns + source.patience_ns and waited_ns >= source.patience_ns // 2)
             or (source.held and min(newest - stamp_ns, waited_ns) >= source.settled_ns)
-            or (newest > source.newest_ns + _ALIVE_NS and self._received_ns - source.received_ns >= _ALIVE_NS // 2)
+            or (newest > source.newest_ns + _ALIVE_NS and self._heard_ns - source.heard_ns >= _ALIVE_NS // 2)
             for source in self._sources.values()
         )
 

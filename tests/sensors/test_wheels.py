@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from event_makers import command, corners, in_order_of_receipt, joints, ns, odometry, run, stepper, times
+from event_makers import command, corners, in_order_of_receipt, joints, ns, odometry, range_bearing, run, stepper, times
 
 from fgloc import se2
 from fgloc.errors import ConfigError
@@ -281,6 +281,32 @@ def test_the_pose_bridges_a_long_gap_in_which_the_robot_hardly_moves():
     pose, _, wheels = total(steps, WheelsConfig())
     assert pose[0] == pytest.approx(2.2 + 0.3 * 5.0, abs=0.1)
     assert not wheels.rejections
+
+
+def test_the_pose_bridges_a_silence_of_the_whole_robot_however_far_it_drove(drive):
+    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 20, 20) if not 6.0 < t < 15.0]
+    seen = [range_bearing(t) for t in (5.5, 15.0, 16.0)]  # received with the first odometry after the gap, or before
+    for order in (events + seen, seen + events):
+        steps = run(stepper(), in_order_of_receipt(order))
+        pose, _, wheels = total(steps, WheelsConfig())
+        assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.02)
+        assert not wheels.rejections
+
+
+def test_steps_that_ended_within_a_gap_are_not_followed_by_their_share_of_the_way(drive):
+    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 20, 20) if not 6.0 < t < 15.0]
+    seen = [range_bearing(t) for t in times(5.0, 16.0, 5)]
+    steps = run(stepper(), in_order_of_receipt(events, seen))
+    _, _, wheels = total(steps, WheelsConfig())
+    assert wheels.rejections["wheels.silence"] > 10
+
+
+def test_the_heading_of_a_pose_of_few_noisy_messages_is_not_doubted():
+    rng = np.random.default_rng(3)
+    poses = [se2.exp(np.array([0.3, 0.0, 0.05]) * 0.4 * k) + rng.normal(0.0, [0.004, 0.004, 0.01]) for k in range(12)]
+    events = [odometry(0.4 * k, pose, (0.3, 0.05)) for k, pose in enumerate(poses)]
+    _, _, wheels = total(run(stepper(), events), WheelsConfig())
+    assert not any("heading" in note for note in wheels.notes)
 
 
 def test_an_odometry_that_begins_anew_after_a_long_gap_is_not_connected_with_what_was():

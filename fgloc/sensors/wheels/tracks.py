@@ -220,10 +220,12 @@ class Track:
         self._config = config
         self._hold_ns = int(config.hold_s * 1e9)
         self._last_ns: int | None = None  # the newest stamp taken in
+        self._given_ns = 0  # motion before this time was given to earlier steps
         self._forget()
 
     def ingest(self, step: Step) -> None:
-        """Take in the step's events that are newer than all before."""
+        """Add the step's events that are newer than all before to the timeline."""
+        self._given_ns = step.start_ns
         found: Sequence[Any] = step.of(self.events)
         first = 0 if self._last_ns is None else bisect_right(found, self._last_ns, key=lambda e: e.stamp_ns)
         for event in found[first:]:
@@ -326,6 +328,7 @@ class OdometryTrack(Track):
         self._compared = self._mode == "pose"
         self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
         self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
+        self._across = np.zeros(3)  # sums over these products of |.|², |.|² angle, |.|² angle² [m⁴]
 
     def _forget(self) -> None:
         self._pose: Pose | None = None
@@ -363,16 +366,19 @@ class OdometryTrack(Track):
         return moved if any(moved) else mean
 
     def _bridges(self, pose: Pose) -> bool:
-        """Whether the pose tells the motion over a long gap: it is used, it moves little, and it was not begun anew.
+        """Whether the pose's difference is the motion over a long gap: it is used, and was not begun anew.
 
-        Where it moved far only the end is known, and what is seen meanwhile would contradict a way made up between.
+        Steps that ended within the gap had no motion. Then only a small difference is used: the last piece of the gap
+        would be given its share of a way that the steps before do not have.
         """
+        assert self._last_ns is not None
         before = self._pose or pose
         stands = pose == before and self._twist is not None and any(self._twist)
         restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
         dx, dy, dyaw = _difference(before, pose)
         little = math.hypot(dx, dy) < _BRIDGED_M and abs(dyaw) < _BRIDGED_RAD
-        return self._mode != "twist" and little and not stands and not restarted
+        whole = self._given_ns <= self._last_ns + self._hold_ns
+        return self._mode != "twist" and (little or whole) and not stands and not restarted
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
         """The constant twist from the last pose to this one; None if that cannot be known."""
@@ -408,16 +414,20 @@ class OdometryTrack(Track):
         """
         for k, value in enumerate((math.hypot(*moved[:2]), moved[2], math.hypot(*mean[:2]), mean[2])):
             self._paths[k] += abs(value) * seconds
-        self._along += complex(*moved[:2]) * complex(*mean[:2]).conjugate() * seconds**2
+        product = complex(*moved[:2]) * complex(*mean[:2]).conjugate() * seconds**2
+        self._along += product
+        self._across += abs(product) ** 2 * np.power(cmath.phase(product), [0, 1, 2])
         pose_path, pose_turn, twist_path, twist_turn = self._paths
         pose_still = pose_path <= _STILL * twist_path and pose_turn <= _STILL * twist_turn
         twist_still = twist_path <= _STILL * pose_path and twist_turn <= _STILL * pose_turn
         moved_enough = pose_turn > _CHECK_TURN or pose_path > _CHECK_PATH
         if not moved_enough and not (pose_still and (twist_turn > _CHECK_TURN or twist_path > _CHECK_PATH)):
             return
-        self._compared = pose_still or pose_path > _CHECK_HEADING
+        heading, spread = self._heading()
+        sure = pose_path > _CHECK_HEADING and spread < _HEADING_RAD
+        self._compared = pose_still or sure or pose_path > _CHECK_PATH
         insists = self._config.source == "twist"
-        ratio, heading = twist_turn / max(pose_turn, 1e-9), cmath.phase(self._along)
+        ratio = twist_turn / max(pose_turn, 1e-9)
         mode = "pose"
         if pose_still:
             mode, text = "twist", "the odometry's pose does not move: its twist is used"
@@ -429,7 +439,7 @@ class OdometryTrack(Track):
             if insists:
                 raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
             text += ": pose differences are used"
-        elif abs(heading) > _HEADING_RAD:
+        elif abs(heading) > _HEADING_RAD + spread:
             mode, text = (
                 "twist",
                 (
@@ -446,6 +456,12 @@ class OdometryTrack(Track):
             text = "differences of the odometry's pose are used; its twist agrees"
         self._mode = "twist" if insists else mode
         self.notes["source"] = text
+
+    def _heading(self) -> tuple[float, float]:
+        """Angle from the twists to the pose's motions, and three standard errors of it [rad]."""
+        angle, (n, na, naa) = cmath.phase(self._along), self._across
+        variance = max(naa - 2.0 * angle * na + angle**2 * n, 0.0) / max(abs(self._along), 1e-12) ** 2
+        return angle, 3.0 * math.sqrt(variance)
 
 
 def _difference(a: Pose, b: Pose) -> Twist:
