@@ -87,7 +87,7 @@ def _said(trap: Trap, line: str) -> bool:
     )
 
 
-_NUMBER = r"(?P<value>[-−]?\d+(?:\.\d+)?)"
+_NUMBER = r"(?<![\d.])(?P<value>[-−]?\d+(?:\.\d+)?)"  # a whole one: a greedy pattern before it leaves no digit behind
 _TB3 = {"17_25_46": (31.5, 43.2), "17_00_32": (20.6, 26.9), "17_30_33": (None, 22.6)}  # held, turned by hand [s]
 
 SHEET: tuple[Trap, ...] = (

@@ -505,8 +505,12 @@ def note(code: str, texts: Iterable[str], severity: Severity = Severity.NOTE) ->
     return [Finding(code, text, severity) for text in texts]
 
 
+REMARKS = ("run", "recording", "batch")
+"""Codes of sentences on what a run does with its recording and settings; nothing was compared."""
+
+
 def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings by severity, the gravest first; else in the given order.
+    """Findings by severity, the gravest first; among those alike remarks come last; else in the given order.
 
     Repetitions are dropped: of equal sentences, and of two findings that set the same key the later one loses that line
     (and is dropped if it is no graver than a note and has no other line).
@@ -514,7 +518,7 @@ def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     kept: list[Finding] = []
     texts: set[str] = set()
     keys: set[str] = set()
-    for finding in sorted(findings, key=lambda f: -f.severity):
+    for finding in sorted(findings, key=lambda f: (-f.severity, f.code in REMARKS)):
         if finding.text in texts:
             continue
         if finding.lines and finding.severity < Severity.ERROR and keys >= finding.lines.keys():

@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from fgloc.config import Config, Role, config_of
 from fgloc.diagnosis.conventions import Conventions, conventions
 from fgloc.diagnosis.pairs import Noise
-from fgloc.diagnosis.signals import read_signals
+from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.info import RecordingInfo, inspect_recording
@@ -26,7 +25,6 @@ from fgloc.types import Event, Finding, ordered
 
 _UNCALIBRATED = {"range_scale_sigma": 0.03, "bearing_bias_sigma_rad": 0.02, "time_offset_sigma_s": 0.05}
 _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
-_OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps further from the receive times are of another clock
 _MEANINGS: dict[Role, str] = {
     "odometry": "the driver's odometry",
     "command": "commanded velocities; learned motion reads them",
@@ -203,7 +201,8 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         yield f"  base_frame: {seen.frames[0]}"
     else:
         yield "  # base_frame: base_link  # no usual name is in tf"
-    if other := _of_other_clocks(seen.info):
+    delays = {r: t.delay_s or 0.0 for t in seen.info.topics for r, topic in seen.info.roles.items() if topic == t.name}
+    if other := other_clocks(delays):  # a topic without stamps counts as 0
         roles = ", ".join(other)
         yield f"  received_stamps: [{roles}]  # their header stamps are of another clock"
         missing.append(f"the header stamps of {roles} are of another clock: receive times are used, which jitter")
@@ -217,11 +216,3 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
             "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
             "errors in the reports"
         )
-
-
-def _of_other_clocks(info: RecordingInfo) -> tuple[Role, ...]:
-    """Roles whose stamps are further from the receive times than those of most; a topic without stamps counts as 0."""
-    delays = {role: t.delay_s or 0.0 for t in info.topics for role, name in info.roles.items() if name == t.name}
-    usual = float(np.median(list(delays.values()))) if delays else 0.0
-    found = tuple(role for role, delay in delays.items() if abs(delay - usual) > _OTHER_CLOCK_S)
-    return found if len(delays) > 2 else ()  # of two, either may be wrong

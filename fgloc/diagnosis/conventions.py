@@ -17,10 +17,11 @@ import numpy as np
 import yaml
 
 from fgloc import se2
-from fgloc.config import Config, config_of
+from fgloc.config import Config, Role, config_of
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
+    FOLLOWS,
     BodyFit,
     Figure,
     Mounting,
@@ -31,13 +32,15 @@ from fgloc.diagnosis.pairs import (
     fit_on_map,
     fit_rate,
     fit_sightings,
+    jackknife,
     planar,
     track_noise,
+    weighted,
 )
 from fgloc.diagnosis.signals import Path, Sightings, Signals
-from fgloc.frames import quaternion_yaw, rotation_of, sensor_pose
+from fgloc.frames import rotation_of, sensor_pose
 from fgloc.sensors import registry
-from fgloc.types import Finding, FloatArray, IntArray, LandmarkMap, Severity, TruthEvent
+from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
@@ -52,10 +55,12 @@ _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
 _BIAS_M = 0.03  # of a range
 _TELLS = 0.7  # share of a turn that another explains: two that tell the same
-_FOLLOWS = 0.5  # likewise: enough for a lag with its sigma
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
+_SAME_YAW = 1e-3  # share of a turn by which a truth's yaw differs from the odometry's that it is
+_WIDE_M, _IN_PLANE, _LEVEL_DEG = 0.3, 0.5, 1.0  # of a truth's places: spread, share off their plane, tilt of it
+_PLANES = 8  # blocks of time of a plane's jackknife
 _SKID = 0.7  # logarithm of a turn over another: a driver may give both of them, by different tracks
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
@@ -67,8 +72,9 @@ _GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
 _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
 _APART_RAD, _WINDOWS, _SAMPLES = 0.05, 6, 4  # rad in half a second, for so many of them with so many messages
 _SAME_TURN = 0.3  # share of the difference of wheels and gyro beyond which an odometry's yaw is not the gyro's
-_WHEELS = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
-_DRIFTED_S, _DRIFT_SIGMAS = 0.06, 3.5  # of the lag's change from half to half; a drift widens the sigmas of both
+_WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
+_DRIFTED_S, _LAG_SIGMAS = 0.06, 3.5  # of the lag's change from half to half; a drift widens the sigmas of both
+
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # share by which a scale may miss a unit's
 
@@ -805,7 +811,7 @@ def _drifts(
         if len(lags) < 2 or max(lag.sigma for lag in lags) > _LATE_S:
             continue
         drift = Figure((lags[1].value - lags[0].value) / seconds, math.hypot(lags[0].sigma, lags[1].sigma) / seconds)
-        if drift.off(0.0, _DRIFTED_S / seconds, _DRIFT_SIGMAS):
+        if drift.off(0.0, _DRIFTED_S / seconds, _LAG_SIGMAS):
             drifting.append(role)
             text = (
                 f"The clock of {role} drifts against the wheels' by {1e3 * drift.value:+.2f} ± {1e3 * drift.sigma:.2f} "
@@ -854,13 +860,16 @@ def _clocks(
         found.compared += [f"{r}: {late[r].value:+.3f} ± {late[r].sigma:.3f} s late" for r in sensors]
     if not off:
         return 0.0
-    of_all = _weighted(list(off.values()))
+    of_all = weighted(list(off.values()))
     same = len(off) > 1 and all(abs(lag.value - of_all.value) < 0.5 * _LATE_S + 3.0 * lag.sigma for lag in off.values())
     if signals.source not in _WHEELS:
         if of_all.value < 0.0 or not (same or len(late) == 1):
             return 0.0
         delay_s = round(found.config.wheels.delay_s + of_all.value, 3)
-        text = f"The robot follows its commands {of_all.value:.3f} ± {of_all.sigma:.3f} s late, by {' and '.join(off)}"
+        text = (
+            f"The robot follows its commands late, after {of_all.value:.3f} s (± {of_all.sigma:.3f}), by "
+            f"{' and '.join(off)}"
+        )
         found.add("commands.delay", text, {"wheels.delay_s": delay_s}, of_all, Severity.WARNING)
         return of_all.value
     wheels = _WHEELS[signals.source]
@@ -879,13 +888,6 @@ def _surely_late(lag: Figure) -> bool:
     return lag.off(0.0, _LATE_S)
 
 
-def _weighted(lags: Sequence[Figure]) -> Figure:
-    """Mean of lags, weighted by their information."""
-    weights = np.array([lag.sigma for lag in lags]) ** -2.0
-    mean = float(weights @ np.array([lag.value for lag in lags]) / weights.sum())
-    return Figure(mean, float(weights.sum() ** -0.5))
-
-
 def _varied(path: Path) -> bool:
     """Whether speed or yaw rate vary: otherwise a lag and a turn of the sensor are the same."""
     at = np.arange(path.times[0] + 0.5, path.times[-1] - 0.5, 0.5)
@@ -896,10 +898,10 @@ def _varied(path: Path) -> bool:
     return max(float(np.std(path.yaw_rate(at, 0.5))), float(np.nanstd(speed))) > _VARIED
 
 
-def _unpunctual(signals: Signals, role: str, other: str) -> bool:
+def _unpunctual(signals: Signals, role: Role, other: Role) -> bool:
     """Whether the first of two roles has the odder delay between stamp and receipt."""
-    delays = [abs(float(np.median(signals.delays[r]))) if signals.delays.get(r) else 0.0 for r in (role, other)]
-    return delays[0] > delays[1] + _LATE_S
+    late_s = signals.late_s()
+    return abs(late_s.get(role, 0.0)) > abs(late_s.get(other, 0.0)) + _LATE_S
 
 
 def _late(found: Conventions, role: str, lag: Figure, against: str, either: bool) -> None:
@@ -952,6 +954,7 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
     if poses is None or path.length_m < 0.3:
         return None
     _frozen(found, signals, path)
+    _tilted(found, signals)
     section = found.config.truth
     own = poses.copy()
     own[:, 1:3] *= section.scale
@@ -963,8 +966,69 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
     if float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
         found.add("truth.no_yaw", "The truth has no yaw: only positions are compared", {}, None, Severity.NOTE)
         return None
+    _shared_yaw(found, signals, own)
     fit = fit_body(path, own)
+    if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0 and fit.turns.off(1.0, _RATE_SCALE):
+        turns = fit.turns
+        if not any(f.code == "wheels.turn" for f in found.findings):
+            scale_omega = round(found.config.wheels.scale_omega * turns.value, 4)
+            text = (
+                f"By the truth the robot turns {turns.value:.3f} ± {turns.sigma:.2g} times as much as its wheels say "
+                f"(a track or a geometry that is not the robot's); if so, wheels.scale_omega is {scale_omega:g}"
+            )
+            found.add("wheels.turn", text, {}, turns, Severity.WARNING)
+        fit = fit_body(path.turned(turns.value), own)
     return None if fit is None or fit.misfit > 0.25 else fit
+
+
+def _shared_yaw(found: Conventions, signals: Signals, truth: FloatArray) -> None:
+    """Name a truth whose yaw is the odometry's: two measurements never agree so well."""
+    if len(signals.odometry) < 50:
+        return
+    rows = np.array(signals.odometry)
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    at = np.arange(max(truth[0, 0], rows[0, 0]), min(truth[-1, 0], rows[-1, 0]), 1.0)
+    if len(at) < 2:
+        return
+    theirs = np.diff(np.interp(at, truth[:, 0], truth[:, 3]))
+    ours = np.diff(np.interp(at, rows[:, 0], np.unwrap(rows[:, 3])))
+    turning = np.abs(ours) > _APART_RAD
+    if turning.sum() < _WINDOWS or np.median(np.abs(theirs - ours)[turning] / np.abs(ours)[turning]) > _SAME_YAW:
+        return
+    text = "The truth's yaw is the odometry's: the two are one measurement, and it judges no yaw"
+    found.add("truth.yaw_is_odometry", text, {}, None, Severity.NOTE)
+
+
+def _tilted(found: Conventions, signals: Signals) -> None:
+    """Name a truth whose positions lie in a plane that is not level."""
+    places = np.array(signals.truth)[:, 1:4]
+    places = places[np.append(True, np.abs(np.diff(places, axis=0)).max(axis=1) > 0.0)]
+    if len(places) < 30 or found.config.estimator.ground != "flat":
+        return
+    normals = [_normal(np.delete(places, part, axis=0)) for part in np.array_split(np.arange(len(places)), _PLANES)]
+    normal, spread, off = _normal(places)
+    tilt = math.acos(min(abs(float(normal[2])), 1.0))
+    sigma = float(np.linalg.norm(jackknife(np.array([n for n, _, _ in normals]))))
+    figure = Figure(math.degrees(tilt), math.degrees(sigma))
+    if spread < _WIDE_M or off > _IN_PLANE * spread * math.sin(tilt) or not figure.off(0.0, _LEVEL_DEG):
+        return
+    text = (
+        f"The truth's plane is tilted by {figure.value:.1f}° (± {figure.sigma:.1f}) against its z axis, or the floor "
+        f"slopes: distances along the slope are {100.0 * (1.0 - math.cos(tilt)):.2g} % short"
+    )
+    found.add("truth.tilt", text, {}, figure, Severity.NOTE)
+
+
+def _normal(places: FloatArray) -> tuple[FloatArray, float, float]:
+    """Upward normal ``(3,)`` of places ``(n, 3)``, their spread in the narrower direction and off the plane [m]."""
+    use = np.ones(len(places), dtype=bool)
+    for _ in range(3):  # without glitches
+        middle = np.median(places[use], axis=0)
+        _, sizes, axes = np.linalg.svd(places[use] - middle, full_matrices=False)
+        off = np.abs((places - middle) @ axes[2])
+        use = off <= 4.0 * float(np.median(off)) + 1e-9
+    size = sizes / math.sqrt(float(use.sum()))
+    return axes[2] * math.copysign(1.0, axes[2, 2]), float(size[1]), float(size[2])
 
 
 def _frozen(found: Conventions, signals: Signals, path: Path) -> None:
@@ -1007,12 +1071,13 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
             {"truth.scale": round(section.scale * factor, 6)},
             fit.scale,
         )
-    if fit.late_s.off(0.0, _LATE_S) and fit.share > _FOLLOWS:
+    if fit.late_s.off(0.0, _LATE_S, _LAG_SIGMAS) and fit.share > FOLLOWS:
         given = {str(r): o for r, o in found.config.recording.stamp_offset_s.items()}.get("truth", 0.0)
         side = "late" if fit.late_s.value > 0 else "early"
         yield (
             "clock.truth",
-            f"The truth's stamps are {abs(fit.late_s.value):.3f} ± {fit.late_s.sigma:.3f} s {side} against the wheels'",
+            f"The truth's stamps are {abs(fit.late_s.value):.3f} s {side} (± {fit.late_s.sigma:.3f}) "
+            "against the wheels'",
             {"recording.stamp_offset_s": {"truth": round(given - fit.late_s.value, 3)}},
             fit.late_s,
         )
@@ -1069,25 +1134,21 @@ def first_pose_sentence(config: Config, started: FloatArray) -> str | None:
     )
 
 
-def truth_sentence(config: Config, truth: Sequence[TruthEvent], stamps_ns: IntArray, poses: FloatArray) -> str | None:
+def truth_sentence(config: Config, truth: FloatArray | None, times: FloatArray, poses: FloatArray) -> str | None:
     """The sentence on a truth in another frame than the map's; None if it is in the map's, or fits neither way.
 
     Args:
         config: as the run uses it.
-        truth: events of the excerpt.
-        stamps_ns: ``(n,)`` of the poses.
+        truth: rows of time, x, y and yaw, in order; None: there is none.
+        times: ``(n,)`` of the poses, of the same clock.
         poses: ``(n, 3)`` by map and sightings.
     """
-    if config.truth.align != "none" or len(truth) < 2:
+    if config.truth.align != "none" or truth is None:
         return None
-    ordered = sorted(truth, key=lambda e: e.stamp_ns)
-    at = np.array([e.stamp_ns for e in ordered], dtype=np.int64)
-    there = (stamps_ns > at[0]) & (stamps_ns < at[-1])
+    there = (times > truth[0, 0]) & (times < truth[-1, 0])
     if there.sum() < 4:
         return None
-    known = np.array([(*e.position[:2], quaternion_yaw(e.orientation)) for e in ordered])
-    t = (stamps_ns[there] - at[0]) * 1e-9
-    path = np.column_stack([np.interp(t, (at - at[0]) * 1e-9, known[:, k]) for k in (0, 1)])
+    path = np.column_stack([np.interp(times[there], truth[:, 0], truth[:, k]) for k in (1, 2)])
     here = poses[there, :2]
     apart = float(np.hypot(*(path - here).T).mean())
     T = se2.rigid_if_spread(path, here)

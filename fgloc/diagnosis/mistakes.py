@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,14 @@ from fgloc.config import Config, Role
 from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.setup import Checked, check_fit
-from fgloc.diagnosis.setup_fit import GRID_S, Excerpt, ExcerptCollector, read_excerpt, wheel_increments
-from fgloc.diagnosis.signals import SightingCollector, SignalCollector, Signals, read_signals
+from fgloc.diagnosis.setup_fit import Excerpt, ExcerptCollector, read_excerpt
+from fgloc.diagnosis.signals import (
+    SightingCollector,
+    SignalCollector,
+    Signals,
+    clock_sentence,
+    other_clocks,
+)
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
@@ -31,37 +37,6 @@ from fgloc.sensors.base import with_values
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberingDetector
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
-
-# --- Stamps of another clock ------------------------------------------------------------------------------------------
-
-_OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps that differ more from the receive times are of another clock
-_FEWEST = 5  # messages of a role
-
-
-def other_clocks(delays: Mapping[Role, Sequence[float]]) -> tuple[Role, ...]:
-    """Roles whose stamps are of another clock than most.
-
-    Args:
-        delays: received minus stamped [s], by role.
-    """
-    middle = {role: float(np.median(values)) for role, values in delays.items() if len(values) >= _FEWEST}
-    if len(middle) < 3:
-        return ()
-    usual = float(np.median(list(middle.values())))
-    return tuple(sorted(role for role, delay in middle.items() if abs(delay - usual) > _OTHER_CLOCK_S))
-
-
-def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, Sequence[float]], given: Sequence[Role]) -> str:
-    """The sentence on such roles; ``given``: those that the configuration lists already."""
-    usual = float(np.median([np.median(values) for role, values in delays.items() if role not in roles]))
-    off = [float(np.median(delays[role])) - usual for role in roles]
-    sentence = " and ".join(
-        f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
-        for role, late in zip(roles, off, strict=True)
-    )
-    line = f"recording.received_stamps: [{', '.join([*given, *roles])}]"
-    return f"Some stamps are of another clock ({sentence}): set {line}."
-
 
 # --- Before a run -----------------------------------------------------------------------------------------------------
 
@@ -185,22 +160,23 @@ class _Search:
 
     def _check(self, recording: Recording, parts: SensorSetup, excerpt: Excerpt) -> bool:
         """All checks, in the order in which one makes the next possible; whether stamps were corrected meanwhile."""
-        roles = other_clocks(excerpt.delays)
+        signals = excerpt.signals
+        delays = signals.late_s()
+        roles = other_clocks(delays)
         given = self.config.recording.received_stamps
         if roles and not set(roles) <= set(given):
-            self.sentences.append(clock_sentence(roles, excerpt.delays, given))
+            self.sentences.append(clock_sentence(roles, delays, given))
             self._change("recording", received_stamps=(*given, *roles))
             return True
         if not self._compared:
             self._compared = True
-            signals = read_signals(recording, self.config)
             found = conventions(signals, self.config, parts.T_base_sensor, parts.imu_up, parts.landmark_map)
             self._conventions += found.findings
             read = (self.config.recording, self.config.map)
             changed, self.config = (found.config.recording, found.config.map) != read, found.config
             if changed:
                 return True
-        for mistake in registry.raw_mistakes(excerpt.motion, self.config):
+        for mistake in registry.raw_mistakes(signals.motion, self.config):
             self.sentences.append(mistake.sentence)
             self._change(mistake.section, **mistake.values)
         if parts.landmark_map is None:
@@ -251,27 +227,24 @@ class _Search:
         assert checked.corrected is not None
         poses = checked.corrected.poses
         stamps = np.array([p.stamp_ns for s in checked.stretches for p in s.pictures], dtype=np.int64)
-        started = self._started(excerpt, int(stamps[0]), poses[0])
+        times = np.asarray((stamps - excerpt.signals.origin_ns) * 1e-9, dtype=np.float64)
+        started = self._started(excerpt.signals, times[0], poses[0])
         sentence = None if started is None else first_pose_sentence(self.config, started)
         if sentence is not None:
             self.sentences.append(sentence)
             self._change("estimator", initial_pose=None)
-        sentence = truth_sentence(self.config, excerpt.truth, stamps, poses)
+        sentence = truth_sentence(self.config, excerpt.signals.true_poses(), times, poses)
         if sentence is not None:
             self.sentences.append(sentence)
             self._change("truth", align="se2")
 
-    def _started(self, excerpt: Excerpt, stamp_ns: int, pose: FloatArray) -> FloatArray | None:
+    def _started(self, signals: Signals, at_s: float, pose: FloatArray) -> FloatArray | None:
         """The pose at the run's start ``(3,)``, by the wheels, if that was not long before."""
-        first = min((e.stamp_ns for e in excerpt.motion), default=stamp_ns)
-        if self.config.estimator.initial_pose is None or not 0 <= stamp_ns - first < _MOST_TRAVEL_S * 1e9:
+        path = None if self.config.estimator.initial_pose is None else signals.path(self.config)
+        if path is None or not 0.0 <= at_s - path.times[0] < _MOST_TRAVEL_S:
             return None
-        grid = np.append(np.arange(first, stamp_ns, round(GRID_S * 1e9)), stamp_ns)
-        steps = wheel_increments(excerpt, self.config, grid) if len(grid) > 1 else None
-        travelled = np.zeros(3)
-        for step in () if steps is None else steps:
-            travelled = se2.compose(travelled, se2.exp(step))
-        return se2.compose(pose, se2.inverse(travelled))
+        first, now = path.at(np.array([path.times[0], at_s]))
+        return se2.compose(pose, se2.between(now, first))
 
     def _change(self, section: str, **values: object) -> None:
         part = getattr(self.config, section).model_copy(update=values)

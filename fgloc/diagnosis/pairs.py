@@ -37,6 +37,7 @@ _RATE_HALF_S = 0.15  # yaw rates are means over twice this
 _TURN_HALF_S = 1.0
 _MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _CLIPPED = 4.0  # standard deviations beyond which a rate counts as this much: spikes of a driver
+FOLLOWS = 0.5  # share of a motion that another explains: enough for a lag with its sigma
 _CAUCHY = 2.385  # tuning constant of 95 % efficiency
 
 
@@ -50,6 +51,13 @@ class Figure:
     def off(self, expected: float, least: float, sigmas: float = 5.0) -> bool:
         """Whether the value is surely, and by more than ``least``, away from the expected one."""
         return abs(self.value - expected) > max(least, sigmas * self.sigma)
+
+
+def weighted(figures: Sequence[Figure]) -> Figure:
+    """Mean of figures of one quantity, weighted by their information."""
+    weights = np.array([figure.sigma for figure in figures]) ** -2.0
+    mean = float(weights @ np.array([figure.value for figure in figures]) / weights.sum())
+    return Figure(mean, float(weights.sum() ** -0.5))
 
 
 # --- landmarks against the wheels -------------------------------------------------------------------------------------
@@ -438,14 +446,14 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
     """
     times, yaw = poses[:, 0], poses[:, 3]
     rate = fit_rate(path, times, yaw)
-    late = 0.0 if rate is None or rate.share < 0.5 else rate.late_s.value
+    late = 0.0 if rate is None or rate.share < FOLLOWS else rate.late_s.value
     start = np.arange(path.times[0], path.times[-1] - window_s, 0.2)
     start = start[path.known(start, start + window_s)]
     start = start[_covered(times, start + late) & _covered(times, start + window_s + late)]
     if len(start) < 40:
         return None
     speeds = _speed_lag(path, poses, start, window_s)
-    if rate is None or rate.share < 0.5:
+    if rate is None or rate.share < FOLLOWS:
         late = speeds
     fits = {m: _body(path, poses, start, window_s, late, m) for m in (False, True)}
     mirrored = fits[True][1] < 0.5 * fits[False][1]
@@ -459,7 +467,7 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
         turned = math.remainder(np.angle(x[0]) - np.angle(alpha), math.tau)
         left_out.append((x[2], abs(x[0]), turned, x[1].real, x[1].imag))
     s = jackknife(np.array(left_out)).tolist()
-    lag = Figure(late, rate.late_s.sigma if rate is not None and rate.share >= 0.5 else 0.05)
+    lag = Figure(late, rate.late_s.sigma if rate is not None and rate.share >= FOLLOWS else 0.05)
     return BodyFit(
         mirrored,
         Figure(turns, s[0]),

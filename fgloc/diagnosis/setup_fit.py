@@ -7,7 +7,7 @@ compared by their costs. Poses of the images are free; wheels and gyro tie each 
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config, Role
+from fgloc.config import Config
+from fgloc.diagnosis.signals import IMAGES, SignalCollector, Signals, take
 from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.graph.observation import CornerBatch
 from fgloc.intake.validation import EventValidator, reported_bounds
@@ -29,16 +30,13 @@ from fgloc.types import (
     Camera,
     Event,
     FloatArray,
-    InertialEvent,
     IntArray,
     Landmark,
     LandmarkMap,
-    MotionEvent,
     PixelMeasurement,
     RawEvent,
     SightingsEvent,
     Step,
-    TruthEvent,
     by_class,
 )
 
@@ -85,18 +83,13 @@ class Excerpt:
     """What was read.
 
     Attributes:
+        signals: of wheels, gyro and truth.
         pictures: by stretch.
-        motion: odometry, joints and commands in order of receipt.
-        imu, truth: likewise.
-        delays: received minus stamped [s] by role.
         wheel_source: as the odometer has it, once stretches were made.
     """
 
+    signals: Signals
     pictures: list[list[Picture]] = field(default_factory=lambda: [[] for _ in range(STRETCHES)])
-    motion: list[MotionEvent] = field(default_factory=list)
-    imu: list[InertialEvent] = field(default_factory=list)
-    truth: list[TruthEvent] = field(default_factory=list)
-    delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
     wheel_source: str = ""
 
     def stretches(self, config: Config, imu_up: FloatArray | None) -> list[Stretch]:
@@ -119,9 +112,9 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         detector: of markers; None: the recording holds corners.
     """
     collector = ExcerptCollector(recording, config, detector)
-    for event in recording.events():
-        if not collector.add(event):
-            break
+    take(recording, [role for role in recording.roles if role not in IMAGES], collector.add)
+    if "image" in recording.roles:
+        take(recording, ["image"], lambda event: collector.add(event) and not collector.pictured)
     return collector.found
 
 
@@ -130,34 +123,30 @@ class ExcerptCollector:
 
     Attributes:
         found: the excerpt, so far.
+        pictured: no later image is looked at.
     """
 
     def __init__(self, recording: Recording, config: Config, detector: Detector | None) -> None:
         """As `read_excerpt`, but nothing is read."""
-        self.found = Excerpt()
+        self._signals = SignalCollector(config, recording.roles)
+        self.found = Excerpt(self._signals.found)
+        self.pictured = False
         self._gate = EventValidator(reported_bounds(config))
         self._detector = detector
-        self._role_of = {topic: role for role, topic in recording.roles.items()}
         self._first_image: int | None = None
         self._last_image = 0
-        self._end_ns: int | None = None
+        self._end_ns = recording.span_ns[0] + round(_PATIENCE_S * 1e9)
 
     def add(self, event: Event) -> bool:
-        """Take what is wanted of an event; False: it came after the excerpt's end."""
-        if self._end_ns is None:
-            self._end_ns = event.received_ns + round(_PATIENCE_S * 1e9)
-        if event.received_ns > self._end_ns:
-            return False
-        role = self._role_of.get(event.topic)
-        if role is not None:
-            self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
+        """Take what is wanted of an event; False: it came after the last that is looked at."""
         if isinstance(event, RawEvent) or (isinstance(event, SightingsEvent) and event.in_pixels):
             self._take_image(event)
-        else:
-            _take_motion(self.found, self._gate, event)
-        return True
+        return self._signals.add(event)
 
     def _take_image(self, event: RawEvent | SightingsEvent) -> None:
+        self.pictured |= event.received_ns > self._end_ns
+        if self.pictured:
+            return
         if self._first_image is None:
             self._first_image = event.stamp_ns
             self._end_ns = event.received_ns + round(((STRETCHES - 1) * PERIOD_S + STRETCH_S + MARGIN_S + 1.0) * 1e9)
@@ -172,16 +161,6 @@ class ExcerptCollector:
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, passed.sightings))
         elif corners is not None:
             self.found.pictures[int(which)].append(Picture(event.stamp_ns, ()))
-
-
-def _take_motion(found: Excerpt, gate: EventValidator, event: Event) -> None:
-    passed = gate.check(event)
-    if isinstance(passed, InertialEvent):
-        found.imu.append(passed)
-    elif isinstance(passed, MotionEvent):
-        found.motion.append(passed)
-    elif isinstance(passed, TruthEvent):
-        found.truth.append(passed)
 
 
 def _corners(event: RawEvent | SightingsEvent, detector: Detector | None) -> SightingsEvent | None:
@@ -204,7 +183,7 @@ def _stretch(excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: 
     wheels = wheel_increments(excerpt, config, grid)
     if wheels is None:
         return None
-    gyro = None if imu_up is None else _gyro_increments(excerpt.imu, imu_up, grid)
+    gyro = None if imu_up is None else _gyro_increments(excerpt.signals, imu_up, grid)
     times = np.array([(p.stamp_ns - start_ns) * 1e-9 for p in pictures])
     return Stretch(times, tuple(pictures), wheels, gyro, start_ns)
 
@@ -212,7 +191,7 @@ def _stretch(excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: 
 def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatArray | None:
     """Twist times time ``(g, 3)`` between the stamps ``(g + 1,)``; None where too few messages were received."""
     reach = 1_000_000_000
-    events = [e for e in excerpt.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
+    events = [e for e in excerpt.signals.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
     wheels = registry.odometer().build(config)
@@ -224,17 +203,16 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     return np.array([se2.log(m) for m in motions])
 
 
-def _gyro_increments(imu: list[InertialEvent], up: FloatArray, grid: IntArray) -> FloatArray | None:
+def _gyro_increments(signals: Signals, up: FloatArray, grid: IntArray) -> FloatArray | None:
     """Rotation ``(g,)`` between the stamps; None where they are not covered."""
-    stamps = np.array([e.stamp_ns for e in imu], dtype=np.int64)
-    inside = (stamps >= grid[0] - 500_000_000) & (stamps <= grid[-1] + 500_000_000)
+    rates, edges = signals.rates(), (grid - signals.origin_ns) * 1e-9
+    if rates is None:
+        return None
+    inside = (rates[0] >= edges[0] - 0.5) & (rates[0] <= edges[-1] + 0.5)
     if inside.sum() < 0.2 * len(grid):
         return None
-    at = (stamps[inside] - grid[0]) * 1e-9
-    rates = np.array([e.angular_velocity for e, used in zip(imu, inside, strict=True) if used]) @ up
-    order = np.argsort(at, kind="stable")
-    middle = (np.arange(len(grid) - 1) + 0.5) * GRID_S
-    return np.asarray(np.interp(middle, at[order], rates[order]) * GRID_S)
+    middle = edges[0] + (np.arange(len(grid) - 1) + 0.5) * GRID_S
+    return np.asarray(np.interp(middle, rates[0][inside], (rates[1] @ up)[inside]) * GRID_S)
 
 
 def usable(picture: Picture, landmark_map: LandmarkMap) -> list[Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,6 +36,7 @@ from fgloc.types import (
 )
 
 LONGEST_S = 600.0  # of a recording is looked at: enough for any convention, and bounded
+IMAGES: tuple[Role, ...] = ("image", "camera_info")
 GRID_S = 0.05  # of the wheels' path
 _FARTHEST = 1e9  # of a distance in any unit: more is no measurement
 _SPIKE = 20.0  # times the rate that one of a hundred exceeds: more is no turn
@@ -84,6 +85,13 @@ class Path:
         yaw = np.interp(times + half_s, self.times, self.poses[:, 2])
         return np.asarray((yaw - np.interp(times - half_s, self.times, self.poses[:, 2])) / (2.0 * half_s))
 
+    def turned(self, factor: float) -> Path:
+        """The path of a robot that turns ``factor`` times as much while it travels as far."""
+        yaw, before = self.poses[:, 2], np.append(self.poses[:1, 2], self.poses[:-1, 2])
+        steps = np.diff(self.poses[:, 0] + 1j * self.poses[:, 1], prepend=complex(*self.poses[0, :2]))
+        place = np.cumsum(steps * np.exp(1j * (factor - 1.0) * 0.5 * (yaw + before)))
+        return Path(self.times, np.column_stack([place.real, place.imag, factor * yaw]), self.gaps)
+
     @property
     def length_m(self) -> float:
         """Distance travelled."""
@@ -118,6 +126,10 @@ class Signals:
     images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
     source: str = ""
+
+    def late_s(self) -> dict[Role, float]:
+        """Median of received minus stamped [s] of each role with enough messages."""
+        return {role: float(np.median(values)) for role, values in self.delays.items() if len(values) >= _FEWEST}
 
     def sightings(self) -> Sightings | None:
         """Sightings in order of time; None: there are none."""
@@ -183,9 +195,15 @@ class Signals:
 class SignalCollector:
     """Takes signals from the events of a recording, one by one."""
 
-    def __init__(self, config: Config) -> None:
-        """``config`` has the bounds of what is plausible; distances may be in any unit."""
-        self.found = Signals()
+    def __init__(self, config: Config, roles: Mapping[Role, str] | None = None) -> None:
+        """Set up.
+
+        Args:
+            config: with the bounds of what is plausible; distances may be in any unit.
+            roles: topics, to note what passes between stamp and receipt; None: that is not noted.
+        """
+        self.found = Signals(images="image" in (roles or {}))
+        self._role_of = {topic: role for role, topic in (roles or {}).items()}
         any_unit = {"max_range": _FARTHEST, "max_position": _FARTHEST}
         self._gate = EventValidator(reported_bounds(config).model_copy(update=any_unit))
         self._first_ns: int | None = None
@@ -196,6 +214,9 @@ class SignalCollector:
             self._first_ns = self.found.origin_ns = event.received_ns
         if event.received_ns - self._first_ns > LONGEST_S * 1e9:
             return False
+        role = self._role_of.get(event.topic)
+        if role is not None:
+            self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
         if isinstance(event, MotionEvent) and event.odometer is not None:
             row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.odometer.pose, *event.odometer.twist)
             if all(map(math.isfinite, row)):
@@ -233,19 +254,44 @@ class SignalCollector:
 
 def read_signals(recording: Recording, config: Config) -> Signals:
     """Signals of a recording's beginning, without its images."""
-    collector = SignalCollector(config)
-    collector.found.images = "image" in recording.roles
-    role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
-    counted = dict(recording.undecodable)
-    for message in recording.messages(role_of.keys()):
-        role = role_of[message[0]]
-        for event in recording.decode(message, role):
-            collector.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
-            if not collector.add(event):
-                recording.undecodable = counted
-                return collector.found
-    recording.undecodable = counted
+    collector = SignalCollector(config, recording.roles)
+    take(recording, [role for role in recording.roles if role not in IMAGES], collector.add)
     return collector.found
+
+
+def take(recording: Recording, roles: Collection[Role], add: Callable[[Event], bool]) -> None:
+    """Hand the events of some roles to a collector, until it wants no more of them."""
+    role_of = {recording.roles[role]: role for role in roles}
+    for message in recording.messages(role_of.keys()):
+        if not all(map(add, recording.decode(message, role_of[message[0]]))):
+            return
+
+
+# --- Stamps of another clock ------------------------------------------------------------------------------------------
+
+_OTHER_CLOCK_S = 5.0  # no driver takes so long: stamps that differ more from the receive times are of another clock
+_FEWEST = 5  # messages of a role
+
+
+def other_clocks(delays: Mapping[Role, float]) -> tuple[Role, ...]:
+    """Roles whose stamps are of another clock than most.
+
+    Args:
+        delays: received minus stamped [s], by role; of two roles either may be wrong, and none is named.
+    """
+    usual = float(np.median(list(delays.values()))) if len(delays) > 2 else math.nan
+    return tuple(sorted(role for role, delay in delays.items() if abs(delay - usual) > _OTHER_CLOCK_S))
+
+
+def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, float], given: Sequence[Role]) -> str:
+    """The sentence on such roles; ``given``: those that the configuration lists already."""
+    usual = float(np.median([delay for role, delay in delays.items() if role not in roles]))
+    sentence = " and ".join(
+        f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
+        for role, late in ((role, delays[role] - usual) for role in roles)
+    )
+    line = f"recording.received_stamps: [{', '.join([*given, *roles])}]"
+    return f"Some stamps are of another clock ({sentence}): set {line}."
 
 
 # --- Sightings of any kind as points ----------------------------------------------------------------------------------

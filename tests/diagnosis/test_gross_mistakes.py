@@ -16,11 +16,11 @@ from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.conventions import first_pose_sentence, truth_sentence
-from fgloc.diagnosis.mistakes import clock_sentence, other_clocks
 from fgloc.diagnosis.setup import check_fit, mirrored, swapped
 from fgloc.diagnosis.setup_fit import Picture, read_excerpt
+from fgloc.diagnosis.signals import clock_sentence, other_clocks
 from fgloc.evaluation.metrics import compute_metrics
-from fgloc.frames import rpy_matrix, yaw_quaternion
+from fgloc.frames import rpy_matrix
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import base_up
@@ -28,7 +28,7 @@ from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.sensor import roll_over
-from fgloc.types import LandmarkMap, TruthEvent
+from fgloc.types import LandmarkMap
 
 SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
@@ -171,11 +171,13 @@ def test_fault_19_late_images(looked):
     ("kind", "role"), [(JointsEvent, "joints"), (ImuEvent, "imu")], ids=["wheels_early", "gyro_early"]
 )
 def test_fault_19_clocks_of_wheels_and_gyro(looked, kind, role):
-    def shifted(events):
-        return [dataclasses.replace(e, stamp_ns=e.stamp_ns - 200_000_000) if isinstance(e, kind) else e for e in events]
-
-    motion, imu = shifted(looked.excerpt.motion), shifted(looked.excerpt.imu)
-    found = looked.check(excerpt=dataclasses.replace(looked.excerpt, motion=motion, imu=imu)).correction
+    signals = looked.excerpt.signals
+    if kind is ImuEvent:
+        signals = dataclasses.replace(signals, imu=[(row[0] - 0.2, *row[1:]) for row in signals.imu])
+    else:
+        early = [dataclasses.replace(e, stamp_ns=e.stamp_ns - 200_000_000) for e in signals.motion]
+        signals = dataclasses.replace(signals, motion=early)
+    found = looked.check(excerpt=dataclasses.replace(looked.excerpt, signals=signals)).correction
     assert value(rf"stamp_offset_s: \{{{role}:", found.sentence) == pytest.approx(0.2, abs=0.03)
 
 
@@ -209,10 +211,10 @@ def test_fault_25_an_encoder_that_restarts_does_not_roll_over():
 
 
 def test_stamps_of_another_clock():
-    delays = {"joints": [0.003] * 9, "odometry": [0.002] * 9, "imu": [0.001] * 9, "image": [0.04] * 9}
+    delays = {"joints": 0.003, "odometry": 0.002, "imu": 0.001, "image": 0.04}
     assert other_clocks(delays) == ()
-    assert other_clocks({role: [d + 3600.0 for d in ds] for role, ds in delays.items()}) == ()  # the recorder's own
-    delays["imu"] = [-1000.0] * 9
+    assert other_clocks({role: d + 3600.0 for role, d in delays.items()}) == ()  # the recorder's own
+    delays["imu"] = -1000.0
     assert other_clocks(delays) == ("imu",)
     said = clock_sentence(("imu",), delays, ("image",))
     assert "imu are 1000 s ahead" in said
@@ -234,23 +236,19 @@ def test_fault_52_map_shifted_against_the_given_first_pose():
 def test_truth_in_another_frame():
     t = np.linspace(0.0, 20.0, 101)
     path = np.column_stack([2.0 * np.sin(0.3 * t), np.cos(0.5 * t), 0.1 * t])
-    stamps = START_NS + (t * 1e9).astype(np.int64)
     c, s = math.cos(0.7), math.sin(0.7)
 
-    def truth(points: np.ndarray) -> list[TruthEvent]:
-        return [
-            TruthEvent(int(k), int(k), "/truth", "world", np.append(p, 0.0), yaw_quaternion(0.0))
-            for k, p in zip(stamps, points, strict=True)
-        ]
+    def truth(points: np.ndarray) -> np.ndarray:
+        return np.column_stack([t, points, np.zeros(len(t))])
 
     moved = path[:, :2] @ np.array([[c, s], [-s, c]]) + [3.0, -1.0]
-    said = truth_sentence(Config(), truth(moved), stamps[1:-1], path[1:-1])
+    said = truth_sentence(Config(), truth(moved), t[1:-1], path[1:-1])
     assert "set truth.align: se2" in said
-    assert truth_sentence(Config(), truth(path[:, :2] + 0.1), stamps[1:-1], path[1:-1]) is None
+    assert truth_sentence(Config(), truth(path[:, :2] + 0.1), t[1:-1], path[1:-1]) is None
     aligned = Config.model_validate({"truth": {"align": "se2"}})
-    assert truth_sentence(aligned, truth(moved), stamps[1:-1], path[1:-1]) is None
+    assert truth_sentence(aligned, truth(moved), t[1:-1], path[1:-1]) is None
     elsewhere = np.random.default_rng(0).normal(size=(len(t), 2))  # fits neither way: not a matter of frames
-    assert truth_sentence(Config(), truth(elsewhere), stamps[1:-1], path[1:-1]) is None
+    assert truth_sentence(Config(), truth(elsewhere), t[1:-1], path[1:-1]) is None
 
 
 # --- all of it ---
