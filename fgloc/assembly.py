@@ -6,6 +6,11 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from fgloc.sensors.gyro import Attitude
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.learned.sensor import LearnedMotion
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.config import Config
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.mistakes import Diagnosis
@@ -15,10 +20,9 @@ from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, StreamFacts, recorded_setup, sensor_setup
-from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor
-from fgloc.sensors.equipment import LandmarkSensor, MotionPredictor, MotionSensors, Odometer, PoseSensors
-from fgloc.sensors.markers.detector import SensorDetector
+from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import Camera, LandmarkMap
 
 
@@ -29,13 +33,13 @@ class Assembly:
     config: Config
     landmark_map: LandmarkMap | None
     gate: EventValidator
-    detector: SensorDetector | None
+    detector: MarkerDetector | None
     detections: EventValidator  # what the detector found has the stamps of its images, which the gate has seen
     stepper: KeyframeBuilder
-    wheels: Odometer
+    wheels: WheelMotion
     landmarks: LandmarkSensor
     camera: Camera | None
-    learned: MotionPredictor | None
+    learned: LearnedMotion | None
     sensors: tuple[Sensor, ...]
     localizer: Localizer
     diagnosis: Diagnosis
@@ -98,11 +102,11 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
 def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, camera = setup.learned, setup.camera
-    joint = None if learned is None else registry.motion_model().correlation(config, learned)
-    wheels = registry.odometer().build(config)
-    gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
-    watched_gyro = None if setup.imu_up is None else registry.rate_sensor().build(config, setup.imu_up)
-    attitude = None if setup.T_base_imu is None else registry.rate_sensor().attitude(config, setup.T_base_imu)
+    joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
+    wheels = WheelMotion(config.wheels)
+    gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
+    watched_gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
+    attitude = None if setup.T_base_imu is None else Attitude(config.gyro, setup.T_base_imu)
     flat = config.estimator.ground == "flat"
     motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)

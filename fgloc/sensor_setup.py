@@ -10,6 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
+from fgloc.sensors.learned.sensor import LearnedMotion
+from fgloc.sensors.learned.sensor import learned_motion
+from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.detector import configured_detector
 from fgloc.config import Config, Role
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
@@ -18,9 +22,8 @@ from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
-from fgloc.sensors.equipment import MotionPredictor
 from fgloc.sensors.maps import configured_map
-from fgloc.sensors.markers.detector import SensorDetector
+from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -168,10 +171,10 @@ class SensorSetup:
 
     config: Config
     landmark_map: LandmarkMap | None
-    detector: SensorDetector | None
+    detector: MarkerDetector | None
     camera: Camera | None
     T_base_sensor: FloatArray | None
-    learned: MotionPredictor | None
+    learned: LearnedMotion | None
     imu_up: FloatArray | None
     T_base_imu: FloatArray | None
     sensors: tuple[Sensor, ...]
@@ -223,10 +226,10 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin; for long runs build the map once with `fgloc map`."
         )
-    detector = registry.raw_landmarks().detector(config, landmark_map) if "image" in facts.roles else None
+    detector = configured_detector(config, landmark_map) if "image" in facts.roles else None
     imu_up = T_base_imu = None
-    learned = registry.motion_model().build(config, lambda: mounted_up(facts, config, facts.first))
-    if "imu" in facts.roles and registry.rate_sensor().is_used(config):
+    learned = learned_motion(config, lambda: mounted_up(facts, config, facts.first))
+    if "imu" in facts.roles and config.gyro.use:
         imu_up = mounted_up(facts, config, facts.first)
         T_base_imu = mounted_imu(facts, config, facts.first)
     return SensorSetup(
@@ -373,12 +376,12 @@ def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Ev
 
     Its length is ``gyro.scale``, so that rates along it are true ones.
     """
-    return np.asarray(registry.rate_sensor().scale(config) * mounted_imu(stream, config, first)[2, :3])
+    return np.asarray(config.gyro.scale * mounted_imu(stream, config, first)[2, :3])
 
 
 def base_up(recording: Recording, config: Config) -> FloatArray | None:
     """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
-    if "imu" not in recording.roles or not registry.rate_sensor().is_used(config):
+    if "imu" not in recording.roles or not config.gyro.use:
         return None
     return mounted_up(recording, config, first_events(recording))
 

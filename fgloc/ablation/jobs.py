@@ -34,7 +34,6 @@ from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensor_setup import recorded_setup, resolved
-from fgloc.sensors import registry
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError
@@ -214,7 +213,7 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
             "code": code_hash(),
         }
         seen = {name: inputs[name] for name in ("bag", "map", "code")} | {
-            "dictionary": registry.raw_landmarks().dictionary(cell.config)
+            "dictionary": cell.config.markers.dictionary
         }
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}

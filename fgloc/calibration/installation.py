@@ -209,7 +209,7 @@ def _of_camera(state: _State, config: Config, camera: Camera | None) -> Iterator
 
 def _clocks(state: _State, config: Config, found: InstallationFound) -> Iterator[Setting]:
     clocks = {"camera.time_offset_s": found.seen_by, "sightings.time_offset_s": found.seen_by}
-    clocks[f"{registry.motion_names().odometer}.time_offset_s"] = found.wheels
+    clocks[f"wheels.time_offset_s"] = found.wheels
     for name, role in clocks.items():
         if not role:
             continue
@@ -250,7 +250,7 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
         )
         for role, s in clocks.items():
             seen = "camera" if "camera.x" in by_name else "landmarks"
-            section = registry.motion_names().odometer if role in _ODOMETER_ROLES else seen
+            section = "wheels" if role in _ODOMETER_ROLES else seen
             spread(f"{section}.time_offset_sigma_s", s.sigma)
     sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
     return config.model_copy(update=sections)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgloc.sensors.base import with_values
+from fgloc.sensors.wheels.sensor import DISTANCE_GAIN, freed
 from fgloc.calibration.installation import found_text, settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
@@ -44,8 +46,8 @@ def calibrate(
     for _ in range(_ROUNDS):
         settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
         values = {_key(s): round(s.found, 7) for s in _of_odometer(settings)}
-        now = with_values(now, registry.motion_names().odometer, values)
-    before = getattr(config, registry.motion_names().odometer)
+        now = with_values(now, "wheels", values)
+    before = config.wheels
     given = {s.name: getattr(before, _key(s)) for s in _of_odometer(settings)}
     settings = tuple(replace(s, given=given.get(s.name, s.given)) for s in settings)
     _check(settings)
@@ -53,7 +55,7 @@ def calibrate(
 
 
 def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:
-    return [s for s in settings if s.name.startswith(f"{registry.motion_names().odometer}.")]
+    return [s for s in settings if s.name.startswith(f"wheels.")]
 
 
 def _key(setting: Setting) -> str:
@@ -73,9 +75,8 @@ def _check(settings: Sequence[Setting]) -> None:
 def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Progress | None) -> RunResult:
     """The bag smoothed with wide priors on the wheels; on commands if there are no wheels."""
     map_path = map_path or find_beside(bag, "map.yaml")
-    odometer = registry.odometer()
-    for freed in odometer.freed(registry.motion_model().without(config)):
-        result = run(bag, map_path, freed, "batch", progress, check=False)
+    for tried in freed(with_values(config, "motion", {"use": False})):
+        result = run(bag, map_path, tried, "batch", progress, check=False)
         if result.found is not None and result.found.wheels != "command":
             break
     if not any(result.counts.get(kind) for kind in registry.landmark_kinds()):
@@ -84,7 +85,7 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
             f"gains of the wheels; see `fgloc info {bag}`"
         )
     assert result.found is not None
-    gain = next((s for s in result.found.settings if s.name == odometer.distance_gain), None)
+    gain = next((s for s in result.found.settings if s.name == DISTANCE_GAIN), None)
     if not result.found.wheels or gain is None or gain.sigma > _UNSEEN * gain.prior_sigma:
         raise EstimatorError(
             f"{bag}: the gains of the wheels cannot be determined: between sightings there are no messages of wheels, "

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fgloc.sensors.markers.detector import fitting_dictionary
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
@@ -28,7 +30,6 @@ from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.observation import Observations
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, smooth_run
-from fgloc.sensors import registry
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors
 from fgloc.sensors.markers.detector import detect_stream
@@ -68,7 +69,7 @@ class Drive:
         """
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
-        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), registry.odometer().build(config)
+        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
         motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
         moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[PixelMeasurement]] = []
@@ -154,13 +155,13 @@ def _checked(
 def _check(bag: Path, recording: Recording, config: Config) -> None:
     if not {"image", "sightings"} & set(recording.roles):
         raise RecordingError(f"{bag}: no images and no corners of markers: nothing to survey; see `fgloc info {bag}`")
-    if "image" in recording.roles and not registry.raw_landmarks().dictionary(config):
-        fitting = registry.raw_landmarks().fitting_dictionary(recording)
+    if "image" in recording.roles and not config.markers.dictionary:
+        fitting = fitting_dictionary(recording)
         listed = (
             f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
         )
         raise ConfigError(f"{bag}: no marker dictionary; {listed}, or markers.dictionary in --config")
-    if registry.raw_landmarks().size(config) is None:
+    if config.markers.default_size_m is None:
         raise ConfigError(
             f"{bag}: the distance of markers follows from their size: give the side of the black square in "
             "metres, --size 0.16, or markers.default_size_m in --config"
@@ -700,7 +701,7 @@ def survey(
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
-    size = registry.raw_landmarks().size(config) or 0.0
+    size = config.markers.default_size_m or 0.0
     sizes = dict.fromkeys(seen, size) | {i: m.size_m for i, m in anchors.items()}
     legs, start, left_out = _joined(drives, sizes, anchors, config.landmarks.min_sightings)
     _need_ends(distances, start, left_out)
@@ -713,7 +714,7 @@ def survey(
         raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
-    dictionary = registry.raw_landmarks().dictionary(config) or (given.dictionary if given is not None else "")
+    dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
     landmarks = LandmarkMap(dict(sorted((kept | unseen).items())), dictionary, "surveyed")
     first = drives[0].parts
     found = found_values(graph.installation, graph.belief, first.config, first.camera, graph.landmark_map)

@@ -82,14 +82,14 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
 
     from fgloc.config import config_of, load_config
     from fgloc.recording.storage import find_beside
-    from fgloc.sensors import registry
+    from fgloc.sensors.learned.sensor import with_model
 
     file = config_file or (None if bag is None else find_beside(bag, "robot.yaml"))
     config = config_of({}) if file is None else load_config(file)
     if model is None:
         return config
     try:
-        return registry.motion_model().given(config, model)
+        return with_model(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgloc.sensors.wheels.sensor import settings_of
 from fgloc import se2
 from fgloc.config import Config, Role, config_of
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
@@ -39,7 +40,6 @@ from fgloc.diagnosis.pairs import (
 )
 from fgloc.diagnosis.signals import Path, Sightings, Signals
 from fgloc.frames import rotation_of, sensor_pose
-from fgloc.sensors import registry
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
@@ -313,7 +313,7 @@ def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None
         return
     by_gyro = np.diff(np.interp(at, times, turned))
     yaw = np.diff(np.interp(at, rows[:, 0], np.unwrap(rows[:, 3])))
-    given = registry.odometer().by_angles(signals.motion)
+    given = settings_of(signals.motion)
     if given is None:  # without the wheels' own turn, a yaw that is the gyro's and a good odometry look alike
         return
     lines = {f"wheels.{key}": value for key, value in given.items()}

@@ -19,13 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.gyro import Attitude
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.config import Config
 from fgloc.diagnosis.signals import Path, Signals
 from fgloc.estimation.faults import LiftMonitor
 from fgloc.frames import rotation_of
-from fgloc.sensors import registry
 from fgloc.sensors.cameras import up_in_base
-from fgloc.sensors.equipment import AttitudeSensor, LandmarkSensor, Odometer
+from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
 from fgloc.types import (
     FloatArray,
@@ -124,7 +126,7 @@ def cut(path: Path, found: Handling) -> Path:
 
 def _steps(signals: Signals, config: Config, up: FloatArray) -> Iterator[tuple[Step, MotionReadings]]:
     """Steps of the whole recording with what wheels and gyro measure."""
-    wheels, gyro = registry.odometer().build(config), registry.rate_sensor().build(config, up)
+    wheels, gyro = WheelMotion(config.wheels), Gyro(config.gyro, up)
     events = sorted((e for e in signals.motion if not isinstance(e, InertialEvent)), key=lambda e: e.stamp_ns)
     stamps = np.array([e.stamp_ns for e in events], dtype=np.int64)
     imu = [_event(row, signals.origin_ns) for row in sorted(signals.imu)]
@@ -208,8 +210,8 @@ class FloorWatch:
 
     def __init__(
         self,
-        attitude: AttitudeSensor | None,
-        wheels: Odometer,
+        attitude: Attitude | None,
+        wheels: WheelMotion,
         landmarks: LandmarkSensor,
         landmark_map: LandmarkMap | None,
     ) -> None:

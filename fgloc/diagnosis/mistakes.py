@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.markers.detector import RememberedDetections
+from fgloc.sensors.wheels.sensor import mistakes
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
@@ -32,10 +34,9 @@ from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
-from fgloc.sensors import registry
 from fgloc.sensors.base import with_values
 from fgloc.sensors.equipment import LandmarkSensor
-from fgloc.sensors.markers.detector import RememberingDetector
+from fgloc.sensors.markers.detector import RememberedDetections
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
 # --- Before a run -----------------------------------------------------------------------------------------------------
@@ -136,7 +137,7 @@ class _Search:
         with open_recording(self._path, self.config.recording) as recording:
             self.go_on(recording, *self._read(recording))
 
-    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberingDetector | None]:
+    def begin(self, recording: Recording) -> tuple[SensorSetup, RememberedDetections | None]:
         """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
         setup = recorded_setup(recording, self._map_path, self.config)[1]
         if setup.detector is None:
@@ -176,14 +177,14 @@ class _Search:
             changed, self.config = (found.config.recording, found.config.map) != read, found.config
             if changed:
                 return True
-        for mistake in registry.raw_mistakes(signals.motion, self.config):
+        for mistake in mistakes(signals.motion, self.config):
             self.sentences.append(mistake.sentence)
             self._change(mistake.section, **mistake.values)
         if parts.landmark_map is None:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):
             return False
-        if registry.raw_landmarks().dictionary(self.config) != registry.raw_landmarks().dictionary(parts.config):
+        if self.config.markers.dictionary != parts.config.markers.dictionary:
             self.detections.clear()
             parts, excerpt = self._read(recording)
         self._fit(recording, excerpt, parts)

@@ -23,11 +23,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
-from fgloc.sensors.equipment import LandmarkSensor, Odometer, RateSensor
+from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.types import (
     Camera,
     Estimate,
@@ -151,8 +153,8 @@ class Sanity:
         landmark_map: LandmarkMap | None,
         camera: Camera | None,
         T_base_sensor: FloatArray | None,
-        wheels: Odometer,
-        gyro: RateSensor | None,
+        wheels: WheelMotion,
+        gyro: Gyro | None,
     ) -> None:
         """Set up for the sensors of a run.
 

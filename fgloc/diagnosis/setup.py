@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.wheels.sensor import correct
 from fgloc.config import Config, Role
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
 from fgloc.frames import OPTICAL_TO_BODY, rotation_of, rpy_matrix, sensor_pose
-from fgloc.sensors import registry
-from fgloc.sensors.base import SetupMistake, with_values
+from fgloc.sensors.wheels.sensor import SetupMistake
+from fgloc.sensors.base import with_values
 from fgloc.types import Camera, FloatArray, Landmark, LandmarkMap
 
 _WIDE = 0.5  # prior sigma of what may be grossly off: a share, rad, m or s
@@ -270,9 +271,9 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
         case "image_clock":
             return _clock(given, image, "images" if image == "image" else "sightings", values["late_s"])
         case "wheel_clock":
-            return _clock(given, wheels, registry.motion_names().odometer, -values["late_s"])
+            return _clock(given, wheels, "wheels", -values["late_s"])
         case "gyro_clock":
-            return _clock(given, "imu", registry.motion_names().rate, -values["gyro_late_s"])
+            return _clock(given, "imu", "gyro", -values["gyro_late_s"])
         case _:
             return _odometer(change, given, source)
 
@@ -401,7 +402,7 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
 def _odometer(change: Change, given: Setup, source: str) -> Correction:
     values = dict(zip(EXTRAS, change.setup.extras.tolist(), strict=True))
     mistake = SetupMistake(change.kind, math.exp(values.get(change.kind, 0.0)), change.setup.turned, source)
-    found = registry.odometer().correct(mistake, given.config)
+    found = correct(mistake, given.config)
     return Correction(found.sentence, _set(given.config, found.section, **found.values), given.landmark_map)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.signals import IMAGES, SignalCollector, Signals, take
@@ -22,7 +23,6 @@ from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.graph.observation import CornerBatch
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
-from fgloc.sensors import registry
 from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
 from fgloc.sensors.markers.detector import Detector
 from fgloc.sensors.markers.images import ImageError
@@ -194,7 +194,7 @@ def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatA
     events = [e for e in excerpt.signals.motion if grid[0] - reach <= e.stamp_ns <= grid[-1] + reach]
     events.sort(key=lambda e: e.stamp_ns)
     step = Step(0, 0, int(grid[0]), int(grid[-1]), by_class(events))
-    wheels = registry.odometer().build(config)
+    wheels = WheelMotion(config.wheels)
     wheels.measure(step)
     if not wheels.source:
         return None
@@ -264,8 +264,8 @@ class Motion:
             config: noise of wheels and gyro.
         """
         self._stretches, self._turned_by = stretches, turned
-        self._noise = registry.odometer().errors(config).noise
-        self._gyro_noise = registry.rate_sensor().errors(config).yaw_per_sqrt_s
+        self._noise = config.wheels.noise
+        self._gyro_noise = config.gyro.yaw_per_sqrt_s
         lengths = [len(s.times) for s in stretches]
         self.stretch_of = np.repeat(np.arange(len(stretches)), lengths)
         self.pairs: IntArray = np.flatnonzero(np.diff(self.stretch_of) == 0)
@@ -366,8 +366,8 @@ class Motion:
 
 def extra_sigmas(config: Config, has_gyro: bool) -> dict[str, float]:
     """Prior sigmas of `EXTRAS` in an ordinary installation; what can be no unknown is held."""
-    wheels, camera = registry.odometer().errors(config), config.camera
-    gyro = registry.rate_sensor().errors(config)
+    wheels, camera = config.wheels, config.camera
+    gyro = config.gyro
     late = float(np.hypot(camera.time_offset_sigma_s, wheels.time_offset_sigma_s))
     sigmas = (
         _SIZE_SIGMA,
@@ -494,7 +494,7 @@ class Problem:
         """
         self._stretches, self._setup = stretches, setup
         ideal = pinhole(setup.camera)
-        sigma = float(np.hypot(registry.raw_landmarks().sigma_px(setup.config), _SIGMA_PX))
+        sigma = float(np.hypot(setup.config.markers.sigma_px, _SIGMA_PX))
         self._motion = Motion(stretches, setup.turned, setup.config)
         self._corners: list[FloatArray] = []
         self._measured: list[PixelMeasurement] = []

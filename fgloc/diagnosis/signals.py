@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
-from fgloc.sensors import registry
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.types import (
@@ -140,7 +140,7 @@ class Signals:
 
     def path(self, config: Config) -> Path | None:
         """Motion by the wheels as configured; None: they have too few messages."""
-        wheels = registry.odometer().build(config)
+        wheels = WheelMotion(config.wheels)
         events = sorted(self.motion, key=lambda e: e.stamp_ns)
         moving = [e for e in events if not isinstance(e, InertialEvent)]
         if len(moving) < 10:
@@ -324,7 +324,7 @@ class SightingCollector:
 
     def sightings(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
         """What was seen where."""
-        if event.in_pixels and self._map is None and registry.raw_landmarks().size(self._config) is None:
+        if event.in_pixels and self._map is None and self._config.markers.default_size_m is None:
             return
         for m in self._sensor.measure(event):
             if isinstance(m, PixelMeasurement):

@@ -18,7 +18,6 @@ from fgloc.graph.joint import MOST_JOINT
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.graph.noise import COVARIANCE_FACTOR, NoiseBudget
 from fgloc.graph.observation import Linearized
-from fgloc.sensors import registry
 from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
 from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
@@ -209,10 +208,9 @@ class FaultAttribution:
         went = se2.between(first.pose, last.pose)
         cov = se2.compose_cov(first.cov, went, last.cov)
         bound = chi2_bound(self._config.estimator.gate_probability, se2.DOF)
-        names = registry.motion_names()
         wrong = set()
-        for name, factor in ((names.odometer, 1.0), (names.model, COVARIANCE_FACTOR)):
-            motions = [r.wheels if name == names.odometer else r.learned for r in (f.readings for f in frames[1:])]
+        for name, factor in (("wheels", 1.0), ("learned", COVARIANCE_FACTOR)):
+            motions = [r.wheels if name == "wheels" else r.learned for r in (f.readings for f in frames[1:])]
             known = [replace(m, cov=factor * m.cov) for m in motions if m is not None]
             if len(known) == len(motions) and self._nis(known, went, cov) > bound:
                 wrong.add(name)

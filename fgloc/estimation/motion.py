@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.learned.sensor import left_out_note
 from fgloc import se2
 from fgloc.config import Config, WeightsConfig
 from fgloc.estimation.faults import Contradicted, FaultAttribution, FaultVerdict, GlrResult, GlrTest, LiftMonitor
@@ -25,7 +26,6 @@ from fgloc.graph.ground import planar_turn
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR, FusionRules, NoiseBudget, with_yaw
-from fgloc.sensors import registry
 from fgloc.sensors.base import MotionRole, Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.wheels.motion import commanded_to_move
@@ -53,7 +53,7 @@ class MotionSources:
         self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
         self.factors = LandmarkFactors(None) if factors is None else factors
         # m²/s of wheels that stand, with the way of encoders that jitter; of silent ones it is hundreds of times more
-        self._known_rest = 10.0 * registry.odometer().errors(config).noise.xy_per_sqrt_s ** 2
+        self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s ** 2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
@@ -74,11 +74,11 @@ class MotionSources:
     @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""
-        return self._learned is not None and not self._learned.model.card.reads(MotionRole.ODOMETER)
+        return self._learned is not None and not self._learned.model.card.reads("wheels")
 
     @property
     def _learned_has_gyro(self) -> bool:
-        return self._learned is not None and self._learned.model.card.reads(MotionRole.RATE)
+        return self._learned is not None and self._learned.model.card.reads("gyro")
 
     def read(self, step: Step, since_fix_s: float = 0.0) -> MotionReadings:
         """Read every source once.
@@ -100,7 +100,7 @@ class MotionSources:
             turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
             if turn is not None:
                 cov = np.diag([FAR_M2, FAR_M2, turn.variance])
-                name, turned = registry.motion_names().rate, with_yaw(motion, turn.yaw)
+                name, turned = "gyro", with_yaw(motion, turn.yaw)
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
                 gyro = self._installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
@@ -363,10 +363,10 @@ class MotionFaultMonitor:
     def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
         """Take in the readings of a step that follows the last one."""
         rejected = self._known_failures(step)
-        if registry.motion_names().odometer in rejected:  # nothing to be found out
+        if "wheels" in rejected:  # nothing to be found out
             self.reset()
         readings = _without(readings, rejected)
-        left_out = {registry.motion_names().model} if self._model_wrong_s > 0.0 else set()
+        left_out = {"learned"} if self._model_wrong_s > 0.0 else set()
         difference = None
         if self._config.adaptive:
             difference = source_difference(_without(readings, left_out), self._sources)
@@ -379,17 +379,17 @@ class MotionFaultMonitor:
         wrong, span = self._wrong_sources(step, readings, verdict)
         scale = 1.0 if verdict.flagged else verdict.scale
         self.compared_s += step.dt * (readings.learned is not None)
-        self.left_out_s += step.dt * (registry.motion_names().model in wrong)
+        self.left_out_s += step.dt * ("learned" in wrong)
         budget, earlier = NoiseBudget({**wrong, **rejected}, scale), NoiseBudget(wrong if span else {}, scale)
         return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
 
     def _wrong_sources(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
         """The sources that are wrong with the reason, and of how many of the newest steps that is news."""
-        names, since, was_left_out = registry.motion_names(), verdict.since, self._model_wrong_s > 0.0
+        since, was_left_out = verdict.since, self._model_wrong_s > 0.0
         self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)
         contradicted = frozenset() if found is None else found.sources
-        if self._attribution is not None and names.model in contradicted:
+        if self._attribution is not None and "learned" in contradicted:
             self._model_wrong_s = self._attribution.memory_s  # until it has agreed for as long: it mostly stays wrong
             if not was_left_out:
                 self._glr.reset()  # wheels are compared with another source from now on
@@ -397,14 +397,14 @@ class MotionFaultMonitor:
             self._model_wrong_s = max(self._model_wrong_s - self._config.window_s, 0.0)
         if verdict.flagged:
             self._reason = self._failure(since)
-        wrong = {names.model: CONTRADICTED} if self._model_wrong_s > 0.0 else {}
-        by_default = verdict.flagged and (was_left_out or names.model not in contradicted)
-        if names.odometer in contradicted or by_default:
-            wrong[names.odometer] = self._reason
+        wrong = {"learned": CONTRADICTED} if self._model_wrong_s > 0.0 else {}
+        by_default = verdict.flagged and (was_left_out or "learned" not in contradicted)
+        if "wheels" in contradicted or by_default:
+            wrong["wheels"] = self._reason
         before, self._wrong_before = self._wrong_before, wrong
         if verdict.flagged:
-            self._count(before.get(names.odometer), wrong.get(names.odometer), since)
-        news = names.odometer in contradicted or (names.model in contradicted and not was_left_out)
+            self._count(before.get("wheels"), wrong.get("wheels"), since)
+        news = "wheels" in contradicted or ("learned" in contradicted and not was_left_out)
         if since or found is None or not news or before.keys() == wrong.keys():
             return wrong, since
         return wrong, found.steps
@@ -429,11 +429,10 @@ class MotionFaultMonitor:
 
     def _count(self, before: str | None, why: str | None, since: int) -> None:
         """Count a failure of the wheels that is new; one that is seen better now takes the place of the one before."""
-        odometer = registry.motion_names().odometer
         if why is not None and (since or why != before):
-            self.flags[f"{odometer}.{why}"] += 1
+            self.flags[f"wheels.{why}"] += 1
         if before is not None and not since and why != before:
-            self.flags -= Counter({f"{odometer}.{before}": 1})
+            self.flags -= Counter({f"wheels.{before}": 1})
 
     def _known_failures(self, step: Step) -> dict[str, str]:
         start = (step.start_ns - (self._first_ns or 0)) * 1e-9
@@ -609,7 +608,7 @@ class MotionJudge:
 
     def _model_notes(self) -> tuple[str, ...]:
         left_out_s = self._faults.left_out_s
-        return (registry.motion_model().left_out(left_out_s),) if left_out_s > 0.0 else ()
+        return (left_out_note(left_out_s),) if left_out_s > 0.0 else ()
 
     def _revise(self, verdict: FaultVerdict) -> tuple[Decision, ...]:
         """Combine the motion of earlier steps anew, back to where the sources began to differ.
@@ -635,8 +634,7 @@ class MotionJudge:
 
 
 def _carried() -> NoiseBudget:
-    names = registry.motion_names()
-    return NoiseBudget({names.odometer: _CARRIED, names.model: _CARRIED})
+    return NoiseBudget({"wheels": _CARRIED, "learned": _CARRIED})
 
 
 def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:

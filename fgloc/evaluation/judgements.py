@@ -10,8 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.calibration.installation import contradicted
-from fgloc.sensors import registry
 from fgloc.stats import SURE_SIGMAS
 from fgloc.types import Decision, IntArray, RunResult, Trajectory
 
@@ -252,11 +252,11 @@ def _episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[tup
 
 def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
     """Rows by what they say, and of what."""
-    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in registry.motion_names()}
+    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in MOTION_SOURCES}
     moved = {d.landmark_id for d in decisions if d.reason in ("quarantined", "landmark_moved")}
     grouped: dict[tuple[Kind, str], list[Decision]] = defaultdict(list)
     for i, d in enumerate(decisions):
-        if d.kind in registry.motion_names() and last[d.step, d.kind] != i:
+        if d.kind in MOTION_SOURCES and last[d.step, d.kind] != i:
             continue  # judged again further down
         if (named := _named(d, moved)) is not None:
             grouped[named].append(d)
@@ -269,7 +269,7 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
     """Kind and subject of a row; None: nothing is wrong, or another row says it."""
     if not d.reason:
         return None
-    if d.kind in registry.motion_names():
+    if d.kind in MOTION_SOURCES:
         return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
     if d.kind == "mode":
         return _OF_MODES[d.reason], "pose"
@@ -346,7 +346,7 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
         return f"{statistic:.1f} s without an accepted sighting{bound}; {count}"
     if not math.isfinite(statistic) or statistic == 0.0:
         return count
-    names = {registry.motion_names().odometer: "GLR"}
+    names = {"wheels": "GLR"}
     names |= {"lift": f"{worst.reason.replace('_', ' ')}: NIS"}
     name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
     bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""

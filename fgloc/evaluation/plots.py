@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d import Axes3D
 
+from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.style import (
     BLUE,
@@ -45,7 +46,6 @@ from fgloc.evaluation.style import (
     shade_modes,
     tidy,
 )
-from fgloc.sensors import registry
 from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, RunResult, Trajectory
 
 # --- Trajectory: the map, the way with its times, and below it how large sigma and error are --------------------------
@@ -315,7 +315,7 @@ def plot_error(result: RunResult, matched: Matched | None) -> Figure:
 
 # --- Timeline: messages received, weights of the sources, fit of the sightings, flags, errors -------------------------
 
-_SOURCES = (*registry.motion_names(), "unknown")
+_SOURCES = (*MOTION_SOURCES, "unknown")
 _NOT_SEEN = (*_SOURCES, "place", "prior", "mode", "clock")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20

@@ -22,7 +22,6 @@ from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations, stacked
-from fgloc.sensors import registry
 from fgloc.types import (
     FloatArray,
     FrameMeasurement,
@@ -181,7 +180,7 @@ def sighting_factors(
 def motion_factor(k: int, m: MotionMeasurement, kernel: str = "none") -> gtsam.NonlinearFactor:
     """Between-factor from keyframe k - 1 to k; a kernel other than "none" is put on the wheels' alone."""
     noise = gaussian(m.cov)
-    if m.source == registry.motion_names().odometer and kernel != "none":
+    if m.source == "wheels" and kernel != "none":
         noise = gtsam.noiseModel.Robust.Create(_KERNELS[kernel], noise)
     return gtsam.BetweenFactorPose2(pose_key(k - 1), pose_key(k), gtsam.Pose2(*m.motion), noise)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from fgloc.sensors.gyro import BIASES, LEVELS, TILTS
 from fgloc import se2
 from fgloc.frames import rotations
 from fgloc.graph.factors import INSTALLATION, ground_key, linear_factor
@@ -20,7 +21,6 @@ from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
 from fgloc.graph.joint import LINEAR_RAD, fuse_installed, joint_cov, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import whitening_of
-from fgloc.sensors import registry
 from fgloc.types import FloatArray, Ground, InertialReading, MotionMeasurement
 
 # --- Motion and gravity on uneven ground ------------------------------------------------------------------------------
@@ -204,8 +204,7 @@ def _turn_of(
         return np.zeros(2), by_bias
     turn = inertial.turn.copy()
     dt = inertial.seconds
-    names = registry.rate_sensor().attitude_names
-    (bias_x, bias_y), (roll, pitch) = names.biases, names.tilts
+    (bias_x, bias_y), (roll, pitch) = BIASES, TILTS
     columns = {bias_x: (0, -dt), bias_y: (1, -dt), roll: (1, -yaw), pitch: (0, yaw)}
     for name, (row, gain) in columns.items():
         if name in installation.index:
@@ -271,8 +270,7 @@ def gravity(
     measured = np.array([math.atan2(y, z), math.atan2(-x, math.hypot(y, z))])
     D = np.zeros((2, installation.constants))
     residual = ground[1:] - measured
-    names = registry.rate_sensor().attitude_names
-    for pair in (names.tilts, names.levels):
+    for pair in (TILTS, LEVELS):
         for row, name in enumerate(pair):
             if name in installation.index:
                 D[row, installation.index[name]] = 1.0

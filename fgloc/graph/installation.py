@@ -224,7 +224,7 @@ def installation_of(
         has_model: whether there is a learned motion.
     """
     camera, rb = config.camera, config.landmarks
-    there = {MotionRole.ODOMETER: True, MotionRole.RATE: has_gyro, MotionRole.MODEL: has_model}
+    there = {"wheels": True, "gyro": has_gyro, "learned": has_model}
     roles = [role for role, is_there in there.items() if is_there]
     parameters = registry.motion_parameters(config, roles)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from fgloc.sensors.learned.network import JointCalibration
 from fgloc.errors import CovarianceError
-from fgloc.sensors import registry
-from fgloc.sensors.equipment import ErrorCorrelation
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
 # --- Noise models of GTSAM, and square roots of information -----------------------------------------------------------
@@ -133,7 +132,7 @@ class FusionRules:
 
     wheels_are_commands: bool = False
     learned_has_gyro: bool = False
-    joint: ErrorCorrelation | None = None
+    joint: JointCalibration | None = None
     stopped_speed: float = 0.0
     stopped_turn: float = 0.0
 
@@ -159,12 +158,11 @@ class NoiseBudget:
         That of the learned motion follows the wheels' up to what it is worth beside wrong wheels; below 1 by the root,
         as it is not known which of the two has too large a covariance.
         """
-        names = registry.motion_names()
-        if names.odometer in self.rejected:
-            return {names.model: COVARIANCE_FACTOR}
+        if "wheels" in self.rejected:
+            return {"learned": COVARIANCE_FACTOR}
         scale = self.scale
         learned = min(scale, COVARIANCE_FACTOR) if scale > 1.0 else math.sqrt(scale)
-        return {names.odometer: scale, names.model: learned}
+        return {"wheels": scale, "learned": learned}
 
     def combine(self, readings: MotionReadings, rules: FusionRules) -> list[MotionMeasurement]:
         """Factors of a step, independent of each other; none where no source that is left measured the distance.
@@ -177,16 +175,16 @@ class NoiseBudget:
             rules: how they depend on each other.
         """
         wheels, learned, gyro = readings.wheels, readings.learned, readings.gyro
-        scales, names = self.scales, registry.motion_names()
-        if readings.at_rest and wheels is not None and names.odometer not in self.rejected:
+        scales = self.scales
+        if readings.at_rest and wheels is not None and "wheels" not in self.rejected:
             cov = np.eye(3) * _REST_PER_SQRT_S**2 * (wheels.stamp_ns - wheels.start_ns) * 1e-9
             return [self.overruled(replace(wheels, cov=cov, inertial=readings.inertial))]
         if wheels is not None:
-            wheels = _scaled(wheels, scales.get(names.odometer, 1.0))
-        learned = None if learned is None or names.model in self.rejected else _scaled(learned, scales[names.model])
-        if gyro is None or names.rate in self.rejected or (learned is not None and rules.learned_has_gyro):
+            wheels = _scaled(wheels, scales.get("wheels", 1.0))
+        learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
+        if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
             gyro = None
-        if wheels is not None and names.odometer in self.rejected:
+        if wheels is not None and "wheels" in self.rejected:
             wheels = None if learned is not None else self._with_slip(wheels, rules)
         elif wheels is not None and learned is not None:
             if rules.wheels_are_commands:

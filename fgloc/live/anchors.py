@@ -7,6 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from fgloc.sensors.gyro import Attitude
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import Config
@@ -14,7 +18,6 @@ from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
-from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, RateSensor
 from fgloc.types import Estimate, FloatArray, Mode, Step
 
 
@@ -24,9 +27,9 @@ class MotionParts:
 
     config: Config
     installation: Installation  # the parameters that motions may depend on
-    joint: ErrorCorrelation | None
+    joint: JointCalibration | None
     model: Any  # of the learned motion
-    attitude: AttitudeSensor | None = None  # on uneven ground
+    attitude: Attitude | None = None  # on uneven ground
     signals_back_ns: int = 0  # how far before a keyframe the learned motion reads measured signals
 
 
@@ -42,8 +45,8 @@ class Anchor:
     mode: Mode
     since_fix_s: float
     budget: NoiseBudget
-    gyro: RateSensor | None
-    learned: MotionPredictor | None  # without its model, and without the events that it has read
+    gyro: Gyro | None
+    learned: LearnedMotion | None  # without its model, and without the events that it has read
 
 
 class Outlet(Protocol):

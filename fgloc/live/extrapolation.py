@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from fgloc.sensors.gyro import Attitude
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.motion import MotionSources, source_difference
@@ -22,8 +25,7 @@ from fgloc.graph.noise import NoiseBudget
 from fgloc.intake.clocks import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
-from fgloc.sensors import registry
-from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionSensors, Odometer
+from fgloc.sensors.equipment import MotionSensors
 from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
@@ -42,10 +44,10 @@ _Events = Mapping[type[MotionEvent], Sequence[MotionEvent]]
 class _Means:
     """What all anchors of one building of the parts are propagated by."""
 
-    joint: ErrorCorrelation | None
+    joint: JointCalibration | None
     model: Any
     factors: LandmarkFactors  # hold what is known of the installation
-    attitude: AttitudeSensor | None
+    attitude: Attitude | None
     signals_back_ns: int
 
 
@@ -55,7 +57,7 @@ class _Held:
 
     anchor: Anchor
     means: _Means
-    wheels: Odometer
+    wheels: WheelMotion
 
     @property
     def stamp_ns(self) -> int:
@@ -117,7 +119,7 @@ class Extrapolator:
             if anchor.segment != self._segment:
                 self._anchors.clear()
                 self._segment = anchor.segment
-            self._anchors.append(_Held(anchor, self._means, registry.odometer().build(self._config)))
+            self._anchors.append(_Held(anchor, self._means, WheelMotion(self._config.wheels)))
             while self._anchors[0].stamp_ns < anchor.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
             for events in self._events.values():
@@ -207,7 +209,7 @@ def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: Motion
     if (
         readings.learned is None
         or not sources.learned_is_independent
-        or registry.motion_names().model in budget.rejected
+        or "learned" in budget.rejected
     ):
         return budget
     difference = source_difference(readings, sources)
@@ -217,7 +219,7 @@ def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: Motion
     cov = difference.cov * max(budget.scale, 1.0) + D @ difference.installation_cov @ D.T
     if float(d @ np.linalg.solve(cov, d)) <= _CONTRADICTION:
         return budget
-    return replace(budget, rejected={**budget.rejected, registry.motion_names().odometer: "slip"})
+    return replace(budget, rejected={**budget.rejected, "wheels": "slip"})
 
 
 def _stamp(event: Event) -> int:

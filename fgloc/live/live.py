@@ -11,6 +11,7 @@ from types import TracebackType
 
 import numpy as np
 
+from fgloc.sensors.learned.sensor import learned_motion
 from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -21,7 +22,6 @@ from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.process import EstimationProcess
 from fgloc.live.reception import Reception
 from fgloc.live.status import LivePose, LiveStatus
-from fgloc.sensors import registry
 from fgloc.sensors.maps import configured_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
 
@@ -72,7 +72,7 @@ class Live(EventMaker):
         """
         if isinstance(landmark_map, Path):
             landmark_map = configured_map(landmark_map, config)
-        registry.motion_model().build(config, None)  # refuses a file now, not when the robot drives
+        learned_motion(config, None)  # refuses a file now, not when the robot drives
         self._recording = config.recording
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
         self._reception = Reception(config)

@@ -10,7 +10,6 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.state import OdometryState, RunState, row3
-from fgloc.sensors import registry
 from fgloc.types import FloatArray, Mode, MotionEvent, Step
 
 _KNOWN = (Mode.OK, Mode.DEAD_RECKONING)  # modes whose pose is worth going on from
@@ -87,7 +86,7 @@ def _by_odometry(state: RunState, step: Step, gap_s: float) -> FloatArray | None
 
 def _odometry_cov(state: RunState, motion: FloatArray, gap_s: float, config: Config) -> FloatArray:
     """Covariance ``(3, 3)`` of that motion: along a path that is as long as the speed before suggests, or the chord."""
-    errors = registry.odometer().errors(config)
+    errors = config.wheels
     noise = errors.noise
     speed, turn = math.hypot(*state.twist[:2]), abs(state.twist[2])
     path = max(math.hypot(*motion[:2]), speed * gap_s)

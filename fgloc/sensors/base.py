@@ -25,8 +25,6 @@ from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, Motion
 
 if TYPE_CHECKING:
     from fgloc.config import Config, GateConfig
-    from fgloc.sensors.equipment import AttitudeSensor, ErrorCorrelation, MotionPredictor, Odometer, RateSensor
-    from fgloc.sensors.markers.detector import SensorDetector
 
 
 # --- signals over time ------------------------------------------------------------------------------------------------
@@ -255,14 +253,6 @@ class Turn:
     noise_density: float = 0.0
 
 
-class MotionRole(StrEnum):
-    """What a motion source is to the others."""
-
-    ODOMETER = "odometer"  # always there, and what others are compared to
-    MODEL = "model"  # predicts the motion from control inputs
-    RATE = "rate"  # measures the turn alone
-
-
 class Rank(IntEnum):
     """Where a parameter of the installation stands in the state."""
 
@@ -314,13 +304,13 @@ class MotionInstallation:
     """The parameters of one motion source.
 
     Attributes:
-        parameters: with their priors, from all settings and the roles that there are.
+        parameters: with their priors, from all settings and the names of the motion sources that there are.
         found: rows of ``metrics.json``, from all settings.
         settings: the lines of ``robot.yaml`` that a run makes of what it found.
         sigmas: the setting that takes the sigma of another one back, by that one.
     """
 
-    parameters: Callable[[Config, Collection[MotionRole]], tuple[Parameter, ...]]
+    parameters: Callable[[Config, Collection[str]], tuple[Parameter, ...]]
     found: Callable[[Config], tuple[FoundRow, ...]]
     settings: Callable[[InstallationState, Config], Iterator[Setting]]
     sigmas: Mapping[str, str]
@@ -334,10 +324,6 @@ class BuiltIn:
         name: of its rows in ``steps.csv``, and in the counts.
         streams: what it reads.
         title: in sentences; "": its name.
-        motion: its role as a motion source; None: it is none.
-        raw_landmarks: its role as what finds landmarks in raw data; None: it does not.
-        channels: what it offers to motion models as inputs.
-        mistakes: what the first messages of a recording show to be wrong with its settings.
         failing_as: by what name failures call it; "": by its own.
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         carried: from a `fgloc.sensors.failures.Carriage` to what it measures while the robot is carried: an event of
@@ -352,12 +338,8 @@ class BuiltIn:
     name: str
     streams: tuple[Stream, ...] = ()
     title: str = ""
-    motion: MotionSource | None = None
-    raw_landmarks: RawLandmarksRole | None = None
-    channels: tuple[Channel, ...] = ()
-    mistakes: Callable[[Sequence[Event], Config], tuple[RawMistake, ...]] | None = None
     failing_as: str = ""
-    failures: Callable[[], tuple[type[Any], ...]] = tuple
+    failures: tuple[type[Any], ...] = ()
     carried: Callable[[Any], Callable[[Event], Event]] | None = None
     joined: Callable[[], Joined] | None = None
     measures: Callable[[Any], Callable[[Any], Iterator[LandmarkSighting]]] | None = None
@@ -464,7 +446,6 @@ class Channel:
         rank: its place among the channels that a network reads. Model files depend on it.
         event: class of the events that it is made of.
         signal: of events in order of stamp, since a time [ns]; None where they do not give it.
-        role: of the motion source whose motion it is: a model that reads it depends on that; None: of none.
         needs_joints: whether it takes the names of the wheels' joints.
         needs_geometry: whether it takes their geometry too.
     """
@@ -474,7 +455,6 @@ class Channel:
     rank: int
     event: type[MotionEvent]
     signal: Callable[[Sequence[Any], int, Mounting], Signal | None]
-    role: MotionRole | None = None
     needs_joints: bool = False
     needs_geometry: bool = False
 
@@ -495,169 +475,6 @@ class EventInput:
     def _when(self, role: str, stamp_ns: int) -> When:
         """Stamp as the configuration corrects it, receive time and topic of a role."""
         raise NotImplementedError
-
-
-# --- roles ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class OdometerErrors:
-    """Error model of the odometer, as it is configured.
-
-    Attributes:
-        noise: white, by distance, rotation and time.
-        scale_sigma: of the distance, as a share.
-        turn_scale_sigma: of the rotation, as a share.
-        yaw_per_m_sigma: rad/m.
-        time_offset_sigma_s: of the clock.
-    """
-
-    noise: NoiseDensity
-    scale_sigma: float
-    turn_scale_sigma: float
-    yaw_per_m_sigma: float
-    time_offset_sigma_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class RateErrors:
-    """Error model of the rate sensor, as it is configured.
-
-    Attributes:
-        yaw_per_sqrt_s: white noise of the integrated rate [rad/√s].
-        scale_sigma: as a share.
-        bias_sigma: rad/s, before anything is known of the bias.
-    """
-
-    yaw_per_sqrt_s: float
-    scale_sigma: float
-    bias_sigma: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SetupMistake:
-    """What an excerpt of a recording shows to be wrong with the odometer's settings.
-
-    Attributes:
-        kind: ``radius``, ``track``, ``odometry_frame``, ``exchanged``, ``reversed`` or ``both_reversed``.
-        factor: of radius and track: true over given.
-        turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
-        source: of its motion, as `Odometer.source` has it.
-    """
-
-    kind: str
-    factor: float
-    turned: FloatArray
-    source: str
-
-
-@dataclass(frozen=True, slots=True)
-class OdometerRole:
-    """Measures every step; what others are compared to.
-
-    Attributes:
-        installation: what it is off by.
-        build: the odometer of one run; `ConfigError` where its settings do not fit together.
-        errors: its error model.
-        freed: settings with wide priors on its gains, to be calibrated; those for it alone, and, in this order where
-            several are to be tried, those for control inputs in its place.
-        distance_gain: the setting that sightings determine wherever the robot moves.
-        correct: the sentence and the values that undo a mistake.
-        by_angles: keys of ``wheels`` with their values, with which the wheels' angles among these events are used;
-            None: the events do not determine them.
-    """
-
-    kind: ClassVar[MotionRole] = MotionRole.ODOMETER
-    installation: MotionInstallation
-    build: Callable[[Config], Odometer]
-    errors: Callable[[Config], OdometerErrors]
-    freed: Callable[[Config], tuple[Config, ...]]
-    distance_gain: str
-    correct: Callable[[SetupMistake, Config], RawMistake]
-    by_angles: Callable[[Sequence[Event]], dict[str, Any] | None]
-
-
-class AttitudeNames(NamedTuple):
-    """Parameters of the installation that roll and pitch depend on, on uneven ground; each about x and y."""
-
-    biases: tuple[str, str]  # of the rates [rad/s], in the axes of the base
-    tilts: tuple[str, str]  # of the mounting, beside the given one [rad]
-    levels: tuple[str, str]  # tilt that the accelerometer's bias makes [rad]
-
-
-@dataclass(frozen=True, slots=True)
-class RateRole:
-    """Measures the turn alone.
-
-    Attributes:
-        installation: what it is off by.
-        build: the sensor of one run, from all settings and the base's z axis ``(3,)`` in its frame.
-        errors: its error model.
-        is_used: whether it is to be used.
-        scale: true over reported rate.
-        attitude: what measures roll and pitch, from all settings and its mounting ``T_base_imu (4, 4)``.
-        attitude_names: of the parameters that those depend on.
-    """
-
-    kind: ClassVar[MotionRole] = MotionRole.RATE
-    installation: MotionInstallation
-    build: Callable[[Config, FloatArray], RateSensor]
-    errors: Callable[[Config], RateErrors]
-    is_used: Callable[[Config], bool]
-    scale: Callable[[Config], float]
-    attitude: Callable[[Config, FloatArray], AttitudeSensor]
-    attitude_names: AttitudeNames
-
-
-@dataclass(frozen=True, slots=True)
-class ModelRole:
-    """Predicts the motion from control inputs.
-
-    Attributes:
-        installation: what it is off by.
-        build: the model of one run, from all settings and what gives the base's z axis ``(3,)`` in the frame of the
-            rate sensor (None: that is mounted level). None: no model is used. `ModelError` where it cannot be used.
-        correlation: how the errors of odometer and model go together; None: they are taken as independent.
-        given: settings with another model; `pydantic.ValidationError` where there is none of this name.
-        without: settings by which none is used.
-        left_out: what to tell the user where sightings contradicted the model for so long [s].
-        shipped_name: ``shipped:NAME`` of a file that comes with the package; None for others.
-    """
-
-    kind: ClassVar[MotionRole] = MotionRole.MODEL
-    installation: MotionInstallation
-    build: Callable[[Config, Callable[[], FloatArray] | None], MotionPredictor | None]
-    correlation: Callable[[Config, MotionPredictor], ErrorCorrelation | None]
-    given: Callable[[Config, Path], Config]
-    without: Callable[[Config], Config]
-    left_out: Callable[[float], str]
-    shipped_name: Callable[[Path], str | None]
-
-
-@dataclass(frozen=True, slots=True)
-class RawLandmarksRole:
-    """Finds landmarks in raw data.
-
-    Attributes:
-        size: of landmarks for which the map gives none [m]; None: not known.
-        dictionary: of the landmarks that are detected; None: the map's.
-        given: settings with another dictionary and size; None: as they are.
-        ids: how many ids a dictionary has; `ConfigError` where there is none of this name.
-        sigma_px: noise of a corner, on each axis.
-        detector: of one run; `ConfigError` where settings and map do not say what is to be detected.
-        fitting_dictionary: the dictionary that fits the raw data of a recording; None if none does.
-    """
-
-    size: Callable[[Config], float | None]
-    dictionary: Callable[[Config], str | None]
-    given: Callable[[Config, str | None, float | None], Config]
-    ids: Callable[[str], int]
-    sigma_px: Callable[[Config], float]
-    detector: Callable[[Config, LandmarkMap | None], SensorDetector]
-    fitting_dictionary: Callable[[Any], str | None]
-
-
-MotionSource = OdometerRole | RateRole | ModelRole
 
 
 def with_values(config: Config, section: str, values: Mapping[str, Any]) -> Config:

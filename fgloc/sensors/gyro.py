@@ -47,7 +47,6 @@ from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setti
 
 if TYPE_CHECKING:
     from fgloc.config import Section
-    from fgloc.sensors.equipment import AttitudeSensor, RateSensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,10 +146,10 @@ TILTS = ("gyro.roll_rad", "gyro.pitch_rad")  # of the IMU, beside its mounting a
 LEVELS = ("gyro.level_x_rad", "gyro.level_y_rad")  # tilt about x and y that the accelerometer's bias makes
 
 
-def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
     """With their priors; on uneven ground also of what tells roll and pitch."""
-    scale = Parameter("gyro.scale", config.gyro.scale_sigma if MotionRole.RATE in roles else 0.0, effects=("turn",))
-    if config.estimator.ground == "flat" or MotionRole.RATE not in roles:
+    scale = Parameter("gyro.scale", config.gyro.scale_sigma if "gyro" in sources else 0.0, effects=("turn",))
+    if config.estimator.ground == "flat" or "gyro" not in sources:
         return (scale,)
     biases = (Parameter(name, config.gyro.bias_sigma) for name in BIASES)
     tilts = (Parameter(name, config.gyro.tilt_sigma_rad) for name in TILTS)
@@ -418,7 +417,7 @@ def _gravity(events: Sequence[InertialEvent], origin_ns: int, mounting: Mounting
 
 
 CHANNELS = (
-    Channel("gyro", 1, 0, InertialEvent, _rate, MotionRole.RATE),
+    Channel("gyro", 1, 0, InertialEvent, _rate),
     Channel("gravity", 2, 3, InertialEvent, _gravity),
 )
 
@@ -508,41 +507,6 @@ def _minimum_jerk(s: float) -> tuple[float, float, float]:
     )
 
 
-def _build(config: Config, up: FloatArray) -> RateSensor:
-
-    return Gyro(config.gyro, up)
-
-
-def _errors(config: Config) -> RateErrors:
-    return RateErrors(config.gyro.yaw_per_sqrt_s, config.gyro.scale_sigma, config.gyro.bias_sigma)
-
-
-def _attitude(config: Config, T_base_imu: FloatArray) -> AttitudeSensor:
-
-    return Attitude(config.gyro, T_base_imu)
-
-
-ROLE = RateRole(
-    installation=INSTALLATION,
-    build=_build,
-    errors=_errors,
-    is_used=lambda config: config.gyro.use,
-    scale=lambda config: config.gyro.scale,
-    attitude=_attitude,
-    attitude_names=AttitudeNames(BIASES, TILTS, LEVELS),
-)
-
-
-def _failures() -> tuple[type[Section], ...]:
-
-    return (ImuBias,)
-
-
-def _carried(carriage: Carriage) -> Callable[[Event], Event]:
-
-    return carried(carriage)
-
-
 GYRO = BuiltIn(
     name="gyro",
     streams=(
@@ -556,8 +520,6 @@ GYRO = BuiltIn(
         ),
     ),
     failing_as="imu",
-    motion=ROLE,
-    channels=CHANNELS,
-    failures=_failures,
-    carried=_carried,
+    failures=(ImuBias,),
+    carried=carried,
 )

@@ -141,11 +141,6 @@ class MarkerPoseMeasurer:
         return self._context.planar(stamp_ns, seen.landmark_id, place, cov, yaw, section.yaw_sigma_rad**2)
 
 
-def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSighting]]:
-
-    return MarkerPoseMeasurer(context)
-
-
 MARKER_POSE = BuiltIn(
     name="marker_pose",
     streams=(
@@ -163,6 +158,6 @@ MARKER_POSE = BuiltIn(
         ),
     ),
     failing_as="camera",
-    measures=_measures,
+    measures=MarkerPoseMeasurer,
     measured=(FrameMeasurement,),
 )

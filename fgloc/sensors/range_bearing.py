@@ -128,11 +128,6 @@ class RangeBearingMeasurer:
         return self._context.polar(stamp_ns, seen.landmark_id, R @ point + t, cov)
 
 
-def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSighting]]:
-
-    return RangeBearingMeasurer(context)
-
-
 RANGE_BEARING = BuiltIn(
     name="range_bearing",
     streams=(
@@ -147,6 +142,6 @@ RANGE_BEARING = BuiltIn(
         ),
     ),
     failing_as="camera",
-    measures=_measures,
+    measures=RangeBearingMeasurer,
     measured=(PointMeasurement,),
 )

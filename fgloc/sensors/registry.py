@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import AfterValidator
 
+from fgloc.sensors import gyro
+from fgloc.sensors.learned import sensor as learned
+from fgloc.sensors.wheels import motion as wheels
 from fgloc.extensions import outside_sensors
 from fgloc.files.settings import Section
 from fgloc.sensors.base import (
@@ -42,7 +45,6 @@ if TYPE_CHECKING:
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
 
-_Role = TypeVar("_Role", OdometerRole, RateRole, ModelRole)
 
 
 class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):
@@ -50,6 +52,7 @@ class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBeari
 
 
 _BUILT_IN = (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
+_MOTION_INSTALLATIONS = (wheels.INSTALLATION, gyro.INSTALLATION, learned.INSTALLATION)
 
 
 def built_in() -> tuple[BuiltIn, ...]:
@@ -134,7 +137,7 @@ def events_of(sensor: str) -> tuple[type[Event], ...]:
 def failures() -> tuple[type[Section], ...]:
     """Failures of all sensors."""
     return tuple(
-        failure for own in (*(s.failures() for s in built_in()), *(s.failures for s in sensors())) for failure in own
+        failure for own in (*(s.failures for s in built_in()), *(s.failures for s in sensors())) for failure in own
     )
 
 
@@ -147,64 +150,20 @@ def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
     return made
 
 
-class MotionNames(NamedTuple):
-    """Names of the motion sources: of their measurements, in ``steps.csv``, of their sections of the installation."""
-
-    odometer: str
-    model: str
-    rate: str
-
-
-@cache
-def motion_names() -> MotionNames:
-    """Which sensor has which role as a motion source."""
-    names = {sensor.motion.kind: sensor.name for sensor in built_in() if sensor.motion is not None}
-    return MotionNames(*(names[role] for role in MotionRole))
-
-
-def raw_mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
-    """What the first messages of a recording show to be wrong with the settings of the sensors."""
-    return tuple(m for sensor in built_in() if sensor.mistakes is not None for m in sensor.mistakes(motion, config))
-
-
 def title_of(name: str) -> str:
     """Of a sensor, in sentences."""
     return next((sensor.title for sensor in built_in() if sensor.name == name and sensor.title), name)
 
 
 def motion_installations() -> tuple[MotionInstallation, ...]:
-    """What the motion sources are off by: odometer, rate sensor, model."""
-    return odometer().installation, rate_sensor().installation, motion_model().installation
+    """What wheels, gyro and learned motion are off by."""
+    return _MOTION_INSTALLATIONS
 
 
-def motion_parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
     """Parameters of the motion sources in the order in which they stand in the state."""
-    made = [p for installation in motion_installations() for p in installation.parameters(config, roles)]
+    made = [p for installation in _MOTION_INSTALLATIONS for p in installation.parameters(config, sources)]
     return tuple(sorted(made, key=lambda p: p.rank))
-
-
-def odometer() -> OdometerRole:
-    """What measures every step."""
-    return _with_role(OdometerRole)
-
-
-def rate_sensor() -> RateRole:
-    """What measures the turn alone."""
-    return _with_role(RateRole)
-
-
-def motion_model() -> ModelRole:
-    """What predicts the motion from control inputs."""
-    return _with_role(ModelRole)
-
-
-def raw_landmarks() -> RawLandmarksRole:
-    """What finds landmarks in raw data."""
-    return next(sensor.raw_landmarks for sensor in built_in() if sensor.raw_landmarks is not None)
-
-
-def _with_role(kind: type[_Role]) -> _Role:
-    return next(sensor.motion for sensor in built_in() if isinstance(sensor.motion, kind))
 
 
 def first_settings() -> tuple[FirstSettings, ...]:

@@ -189,8 +189,8 @@ def test_a_model_is_not_asked_without_its_signals(tmp_path: Path, rng: np.random
 
 
 def test_cards_say_what_a_model_reads() -> None:
-    assert make_card("displacement", inputs=ALL).reads(MotionRole.ODOMETER)
-    assert not make_card("displacement", inputs=("commands", "gyro", "effort")).reads(MotionRole.ODOMETER)
+    assert make_card("displacement", inputs=ALL).reads("wheels")
+    assert not make_card("displacement", inputs=("commands", "gyro", "effort")).reads("wheels")
     for changes, message in (
         ({"inputs": ("commands", "effort"), "joints": None}, "needs the card's joints"),
         ({"inputs": ("commands", "wheels"), "joints": {"left": "l", "right": "r"}}, "needs left_radius"),

@@ -180,9 +180,9 @@ class ModelCard(Section):
         """Inputs that sensors measure during the step, in the network's order."""
         return tuple(name for name in CHANNELS if name in self.inputs)
 
-    def reads(self, role: MotionRole) -> bool:
-        """Whether the model reads the motion by a motion source: its faults then stay unseen by the model."""
-        return any(CHANNELS[name].role == role for name in self.measured)
+    def reads(self, name: str) -> bool:
+        """Whether the model reads this channel."""
+        return name in self.measured
 
     @property
     def n_outputs(self) -> int:
@@ -248,9 +248,6 @@ class Signals:
         """By the name that a card's inputs use."""
         return self.by_name.get(name)
 
-    def of_role(self, role: MotionRole) -> Signal | None:
-        """The motion by a motion source; None if it is not known."""
-        return next((self.by_name[name] for name in self.by_name if CHANNELS[name].role == role), None)
 
 
 class SignalReader:

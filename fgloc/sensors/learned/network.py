@@ -688,7 +688,7 @@ def measured_twists(
 ) -> None:
     """Replace in the twists ``(n, 3)`` of sub-steps what the signals know better: wheels all, a gyro the yaw rate."""
     limits = np.column_stack([starts, starts + dt])
-    wheels, rate = signals.of_role(MotionRole.ODOMETER), signals.of_role(MotionRole.RATE)
+    wheels, rate = signals.named("wheels"), signals.named("gyro")
     if wheels is not None:
         base[:] = wheels.means(limits - wheel_kinematics.delay_s)[:, 0] @ gains(wheel_kinematics)
     if rate is not None:

@@ -48,7 +48,6 @@ from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Setting, Ste
 
 if TYPE_CHECKING:
     from fgloc.config import Config
-    from fgloc.sensors.equipment import ErrorCorrelation, MotionPredictor
 
 
 _CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
@@ -187,12 +186,12 @@ def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
             raise ModelError(f"{path}: {name} holds NaN or infinite weights, expected finite ones; {_REMEDY}")
 
 
-def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
     """With their priors."""
     return (
         Parameter(
             "learned.scale",
-            config.motion.scale_sigma if MotionRole.MODEL in roles else 0.0,
+            config.motion.scale_sigma if "learned" in sources else 0.0,
             Rank.MODEL,
             ("length",),
             lengthens=True,
@@ -323,40 +322,37 @@ class LearnedMotion:
         self._velocity = self._reached = None
 
 
-def _build(config: Config, up: Callable[[], FloatArray] | None) -> MotionPredictor | None:
+def learned_motion(config: Config, up: Callable[[], FloatArray] | None) -> LearnedMotion | None:
+    """The learned motion of one run; None: no model is used.
+
+    Args:
+        config: all settings.
+        up: gives the base's z axis ``(3,)`` in the IMU's frame; None: the IMU is mounted level.
+
+    Raises:
+        ModelError: the model cannot be used.
+    """
     if not config.motion.use or config.motion.model is None:
         return None
-
-    model = load_model(config.motion.model)
-    return LearnedMotion(model, config.motion, (0.0, 0.0, 1.0) if up is None else up())
+    return LearnedMotion(load_model(config.motion.model), config.motion, (0.0, 0.0, 1.0) if up is None else up())
 
 
-def _correlation(config: Config, predictor: MotionPredictor) -> ErrorCorrelation | None:
-    joint: ErrorCorrelation | None = predictor.model.joint
-    return joint if config.motion.correlation == "joint" else None
+def with_model(config: Config, model: Path) -> Config:
+    """Settings with another model.
 
-
-def _given(config: Config, model: Path) -> Config:
+    Raises:
+        pydantic.ValidationError: no model of this name is shipped.
+    """
     motion = MotionConfig(model=model, use=True, correlation=config.motion.correlation)
     return config.model_copy(update={"motion": motion})
 
 
-def _left_out(seconds: float) -> str:
+def left_out_note(seconds: float) -> str:
+    """Sentence for the user where sightings contradicted the model for so long [s]."""
     return (
         f"The motion model was left out for {seconds:.1f} s: sightings contradict it. It may be of another robot or "
         "floor: train one of this robot (fgloc train), or set motion.use: false."
     )
 
 
-ROLE = ModelRole(
-    installation=INSTALLATION,
-    build=_build,
-    correlation=_correlation,
-    given=_given,
-    without=lambda config: with_values(config, "motion", {"use": False}),
-    left_out=_left_out,
-    shipped_name=shipped_name,
-)
-
-
-LEARNED = BuiltIn(name="learned", title="learned motion", motion=ROLE)
+LEARNED = BuiltIn(name="learned", title="learned motion")

@@ -51,49 +51,6 @@ class Detector(Protocol):
         ...
 
 
-class RememberingDetector(Detector, Protocol):
-    """A detector that remembers.
-
-    Attributes:
-        found: what it found anew, by data.
-    """
-
-    found: dict[bytes, Any]
-
-    def save(self) -> None:
-        """Keep what was found for other runs."""
-        ...
-
-
-class SensorDetector(Detector, Protocol):
-    """The detector of a sensor, as `fgloc.sensors.base.RawLandmarksRole` makes it; it does not depend on earlier data.
-
-    Attributes:
-        dictionary: of the landmarks that it finds.
-    """
-
-    dictionary: str
-
-    def following(self) -> Detector:
-        """A detector that follows landmarks through the data, which have to come in their order."""
-        ...
-
-    def remembering(self, detector: Detector, file: Path | None, known: Any, note: bool = True) -> RememberingDetector:
-        """A detector that asks another one only about data that is not known.
-
-        Args:
-            detector: to be asked.
-            file: holds what other runs found; None: there is none.
-            known: what an earlier detector found.
-            note: whether to remember what is found anew.
-        """
-        ...
-
-    def hints(self, recording: Any) -> tuple[tuple[str, ...], str | None]:
-        """Sentences on what may be wrong where nothing is found; and the dictionary, if another one fits."""
-        ...
-
-
 def use_one_thread() -> None:
     """Switch OpenCV's own threads off for the process: beside a detection thread they take the estimator's core."""
     cv2.setNumThreads(1)
@@ -272,7 +229,7 @@ class MarkerDetector:
         """A faster search, for images between those that this one searches."""
         return CoarseSearch(self._dictionary, self._turn)
 
-    def remembering(self, detector: Detector, file: Path | None, known: Any, note: bool = True) -> RememberingDetector:
+    def remembering(self, detector: Detector, file: Path | None, known: Any, note: bool = True) -> RememberedDetections:
         """A detector that asks another one only about images that are not known, from a file or an earlier run."""
         return RememberedDetections(file, detector, known, note)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from fgloc.sensors.markers.detector import fitting_dictionary
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.sensors.base import (
     SENSOR,
@@ -45,7 +46,6 @@ from fgloc.types import (
 if TYPE_CHECKING:
     from fgloc.config import Config, Section
     from fgloc.sensors.landmarks import SightingContext
-    from fgloc.sensors.markers.detector import SensorDetector
 
 
 _OPENCV_ORDER = (1, 0, 3, 2)
@@ -150,7 +150,6 @@ def _first_section(look: FirstLook) -> FirstSection:
     """Dictionary and size, as far as the images show them."""
     if "image" not in look.roles:
         return FirstSection()
-    from fgloc.sensors.markers.detector import fitting_dictionary
 
     lines, missing = ["markers:"], []
     dictionary = fitting_dictionary(look.recording)
@@ -343,51 +342,6 @@ def _area(corners: FloatArray) -> float:
     return 0.5 * abs(float(ax * by - ay * bx))
 
 
-def _detector(config: Config, landmark_map: LandmarkMap | None) -> SensorDetector:
-    from fgloc.sensors.markers.detector import configured_detector  # OpenCV takes a while to load
-
-    return configured_detector(config, landmark_map)
-
-
-def _given(config: Config, dictionary: str | None, size_m: float | None) -> Config:
-    now = config.markers
-    values = {"dictionary": dictionary or now.dictionary, "default_size_m": size_m or now.default_size_m}
-    return with_values(config, "markers", values)
-
-
-def _ids(dictionary: str) -> int:
-    from fgloc.sensors.markers.detector import load_dictionary
-
-    return len(load_dictionary(dictionary).bytesList)
-
-
-def _fitting_dictionary(recording: Any) -> str | None:
-    from fgloc.sensors.markers.detector import fitting_dictionary
-
-    return fitting_dictionary(recording)
-
-
-ROLE = RawLandmarksRole(
-    size=lambda config: config.markers.default_size_m,
-    dictionary=lambda config: config.markers.dictionary,
-    given=_given,
-    ids=_ids,
-    sigma_px=lambda config: config.markers.sigma_px,
-    detector=_detector,
-    fitting_dictionary=_fitting_dictionary,
-)
-
-
-def _failures() -> tuple[type[Section], ...]:
-
-    return (Darkness, FrameRate, MirroredImage)
-
-
-def _measures(context: SightingContext) -> Callable[[Any], Iterator[LandmarkSighting]]:
-
-    return CornerMeasurer(context)
-
-
 MARKERS = BuiltIn(
     name="corners",
     first_settings=FIRST_SETTINGS,
@@ -411,8 +365,7 @@ MARKERS = BuiltIn(
         ),
     ),
     failing_as="camera",
-    raw_landmarks=ROLE,
-    measures=_measures,
+    measures=CornerMeasurer,
     measured=(PixelMeasurement,),
-    failures=_failures,
+    failures=(Darkness, FrameRate, MirroredImage),
 )

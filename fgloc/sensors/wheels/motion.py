@@ -76,7 +76,7 @@ _SLOWEST = 0.1  # share of the reported speed that turning leaves, where it is d
 OF_CLOCK = ("wheels.time_offset_s", "wheels.delay_s")
 
 
-def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Parameter, ...]:
+def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
     """With their priors. Without a gyro theirs is the clock that others are compared to."""
     wheels = config.wheels
     return (
@@ -87,7 +87,7 @@ def _parameters(config: Config, roles: Collection[MotionRole]) -> tuple[Paramete
         Parameter("wheels.delay_s", wheels.delay_sigma_s),
         Parameter(
             "wheels.time_offset_s",
-            wheels.time_offset_sigma_s if MotionRole.RATE in roles else 0.0,
+            wheels.time_offset_sigma_s if "gyro" in sources else 0.0,
             Rank.CLOCK,
             ("heading",),
         ),

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fgloc.sensors.wheels import failures
+from fgloc.sensors.wheels.events import from_odometry, from_joints, odometry_validator, joints_validator
 from fgloc.config import Config
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import (
@@ -25,7 +27,6 @@ from fgloc.sensors.base import (
     OdometerErrors,
     OdometerRole,
     RawMistake,
-    SetupMistake,
     Signal,
     Stream,
     WheelJoints,
@@ -33,8 +34,6 @@ from fgloc.sensors.base import (
     seconds,
     with_values,
 )
-from fgloc.sensors.wheels import events as messages
-from fgloc.sensors.wheels import events as validation
 from fgloc.sensors.wheels.events import JointsEvent, OdometryChecks, OdometryEvent
 from fgloc.sensors.wheels.motion import INSTALLATION
 from fgloc.sensors.wheels.tracks import wheel_names
@@ -42,7 +41,6 @@ from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
     from fgloc.config import Section
-    from fgloc.sensors.equipment import Odometer
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.settings import WheelsConfig
 
@@ -88,7 +86,7 @@ def _pairs(events: Sequence[JointsEvent], joints: WheelJoints, what: str) -> tup
 
 CHANNELS = (
     Channel("effort", 2, 1, JointsEvent, _effort, needs_joints=True),
-    Channel("wheels", 2, 2, JointsEvent, _motion, MotionRole.ODOMETER, needs_joints=True, needs_geometry=True),
+    Channel("wheels", 2, 2, JointsEvent, _motion, needs_joints=True, needs_geometry=True),
 )
 
 
@@ -307,6 +305,23 @@ def _to_fill_in(pair: WheelPair | None) -> tuple[str, ...]:
 FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), _first_section)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SetupMistake:
+    """What an excerpt of a recording shows to be wrong with the odometer's settings.
+
+    Attributes:
+        kind: ``radius``, ``track``, ``odometry_frame``, ``exchanged``, ``reversed`` or ``both_reversed``.
+        factor: of radius and track: true over given.
+        turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
+        source: of its motion, as `Odometer.source` has it.
+    """
+
+    kind: str
+    factor: float
+    turned: FloatArray
+    source: str
+
+
 def correct(mistake: SetupMistake, config: Config) -> RawMistake:
     """What to tell the user of a mistake, and to set."""
     wheels = config.wheels
@@ -429,85 +444,15 @@ def _jumps(angles: FloatArray) -> list[float]:
     return found
 
 
+DISTANCE_GAIN = "wheels.scale_v"  # the setting that sightings determine wherever the robot moves
 _FREED = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # priors before anything was seen
 _FREED_COMMANDS = _FREED | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
 
 
-def _build(config: Config) -> Odometer:
-    from fgloc.sensors.wheels.motion import WheelMotion
-
-    return WheelMotion(config.wheels)
-
-
-def _errors(config: Config) -> OdometerErrors:
-    wheels = config.wheels
-    return OdometerErrors(
-        noise=wheels.noise,
-        scale_sigma=wheels.scale_sigma,
-        turn_scale_sigma=wheels.turn_scale_sigma,
-        yaw_per_m_sigma=wheels.yaw_per_m_sigma,
-        time_offset_sigma_s=wheels.time_offset_sigma_s,
-    )
-
-
-def _freed(config: Config) -> tuple[Config, ...]:
+def freed(config: Config) -> tuple[Config, ...]:
+    """Settings with wide priors on the gains, to be calibrated: of the wheels, and of commands in their place."""
     of_commands = with_values(config, "wheels", _FREED_COMMANDS)
     return (of_commands,) if config.wheels.source == "command" else (with_values(config, "wheels", _FREED), of_commands)
-
-
-def _correct(mistake: SetupMistake, config: Config) -> RawMistake:
-
-    return correct(mistake, config)
-
-
-def _by_angles(events: Sequence[Event]) -> dict[str, Any] | None:
-
-    return settings_of(events)
-
-
-ROLE = OdometerRole(
-    installation=INSTALLATION,
-    build=_build,
-    errors=_errors,
-    freed=_freed,
-    distance_gain="wheels.scale_v",
-    correct=_correct,
-    by_angles=_by_angles,
-)
-
-
-def _failures() -> tuple[type[Section], ...]:
-    from fgloc.sensors.wheels import failures as contents
-    from fgloc.sensors.wheels import failures as speeds
-
-    return (
-        speeds.WheelSlip,
-        speeds.EncoderDead,
-        contents.EncoderFrozen,
-        speeds.EncoderQuantized,
-        contents.EncoderRollover,
-        speeds.WheelScaleDrift,
-        contents.OdometryReset,
-        contents.WheelNan,
-        contents.WrongCovariance,
-    )
-
-
-def _carried(carriage: Carriage) -> Callable[[Event], Event]:
-    from fgloc.sensors.wheels.failures import carried
-
-    return carried(carriage)
-
-
-def _mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
-
-    return mistakes(motion, config)
-
-
-def _joined() -> Joined:
-    from fgloc.sensors.wheels.failures import JoinedWheels
-
-    return JoinedWheels()
 
 
 WHEELS = BuiltIn(
@@ -517,23 +462,30 @@ WHEELS = BuiltIn(
         Stream(
             "odometry",
             OdometryEvent,
-            {"nav_msgs/msg/Odometry": messages.from_odometry},
+            {"nav_msgs/msg/Odometry": from_odometry},
             ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
-            validator=validation.odometry_validator,
+            validator=odometry_validator,
             findings=OdometryChecks,
         ),
         Stream(
             "joints",
             JointsEvent,
-            {"sensor_msgs/msg/JointState": messages.from_joints},
+            {"sensor_msgs/msg/JointState": from_joints},
             ("joint_states",),
-            validator=validation.joints_validator,
+            validator=joints_validator,
         ),
     ),
-    motion=ROLE,
-    channels=CHANNELS,
-    mistakes=_mistakes,
-    failures=_failures,
-    carried=_carried,
-    joined=_joined,
+    failures=(
+        failures.WheelSlip,
+        failures.EncoderDead,
+        failures.EncoderFrozen,
+        failures.EncoderQuantized,
+        failures.EncoderRollover,
+        failures.WheelScaleDrift,
+        failures.OdometryReset,
+        failures.WheelNan,
+        failures.WrongCovariance,
+    ),
+    carried=failures.carried,
+    joined=failures.JoinedWheels,
 )
