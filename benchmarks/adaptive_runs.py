@@ -24,12 +24,12 @@ from benchmarks.adaptive_scores import Figures, lost, score
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
-from fgloc.runner import run
+from fgloc.runner import RunResult, run
 from fgloc.sensors.failures import Failure, Scene
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent
-from fgloc.types import Estimate, Event, LandmarkMap, RunResult, Step, Trajectory
+from fgloc.types import Estimate, Event, LandmarkMap, Step, Trajectory
 
 Changes = Mapping[str, Any]
 Interval = tuple[float, float]

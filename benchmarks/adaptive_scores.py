@@ -14,9 +14,10 @@ from fgloc import se2
 from fgloc.ablation.failures import Kidnap, MovedMarker
 from fgloc.config import Config
 from fgloc.evaluation.metrics import Metrics, compute_metrics
+from fgloc.runner import RunResult
 from fgloc.sensors.failures import Failure
 from fgloc.sensors.markers.images import CornersEvent
-from fgloc.types import Decision, Event, FloatArray, Mode, RunResult
+from fgloc.types import Decision, Event, FloatArray, Mode
 
 _NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
 _NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")

@@ -18,8 +18,8 @@ import typer
 
 from fgloc.config import load_config
 from fgloc.replay import RunMode
-from fgloc.runner import run
-from fgloc.types import FloatArray, RunResult
+from fgloc.runner import RunResult, run
+from fgloc.types import FloatArray
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 EXPECTED = Path(__file__).with_suffix(".json")

@@ -15,8 +15,9 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.evaluation.metrics import match_result, nees
+from fgloc.runner import RunResult
 from fgloc.sensors.markers.images import CornersEvent
-from fgloc.types import Decision, Event, FloatArray, IntArray, LandmarkMap, Mode, RunResult
+from fgloc.types import Decision, Event, FloatArray, IntArray, LandmarkMap, Mode
 
 Found = Mapping[str, tuple[float, float]]
 """Value and sigma by name."""

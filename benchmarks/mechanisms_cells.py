@@ -20,8 +20,8 @@ from fgloc.ablation.failures import Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match_result, nees
+from fgloc.runner import RunResult
 from fgloc.sensors.failures import Failure
-from fgloc.types import RunResult
 
 _KINDS = {"frozen": "frozen", "onewheel": "left_wheel_dead"}  # the fault of the wheels in a case
 FOREIGN = "foreign"  # a case: the motion model is of another robot, one whose landmarks are beacons

@@ -21,11 +21,11 @@ from fgloc.config import Config, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
-from fgloc.runner import run
+from fgloc.runner import RunResult, run
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing import RangeBearingEvent
-from fgloc.types import PointMeasurement, RunResult
+from fgloc.types import PointMeasurement
 from fgloc_datasets import mrclam, pioneer, turtlebot3
 
 _ROOT = Path(__file__).resolve().parent.parent

@@ -28,7 +28,7 @@ from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import RunResult
+from fgloc.runner import RunResult
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "datasets" / "samples" / "patches_run"

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fgloc.config import Config, Section, load_config
     from fgloc.evaluation.results import Results, read_results
     from fgloc.live import Live
-    from fgloc.runner import run
+    from fgloc.runner import RunResult, run
     from fgloc.sensors.base import Context, Sensor, Stream
     from fgloc.sensors.maps import load_map
     from fgloc.types import (
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
         LandmarkMap,
         Mode,
         PoseMeasurement,
-        RunResult,
         SensorEvent,
         Trajectory,
     )
@@ -103,7 +102,7 @@ _IMPORTED_LATE = {
     "LandmarkMap": "fgloc.types",
     "Mode": "fgloc.types",
     "PoseMeasurement": "fgloc.types",
-    "RunResult": "fgloc.types",
+    "RunResult": "fgloc.runner",
     "SensorEvent": "fgloc.types",
     "Trajectory": "fgloc.types",
 }

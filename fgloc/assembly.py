@@ -6,11 +6,6 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgloc.sensors.gyro import Attitude
-from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.learned.sensor import LearnedMotion
-from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.config import Config
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.mistakes import Diagnosis
@@ -22,7 +17,10 @@ from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import SensorSetup, StreamFacts, recorded_setup, sensor_setup
 from fgloc.sensors.base import Sensor
 from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
+from fgloc.sensors.gyro import Attitude, Gyro
+from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, LandmarkMap
 
 

@@ -17,12 +17,14 @@ from fgloc.calibration.installation import contradiction_findings, contradiction
 from fgloc.config import Config, Role
 from fgloc.diagnosis.mistakes import Mistakes, find_mistakes, unused_sightings
 from fgloc.errors import EstimatorError
+from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation import one_blas_thread
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
+from fgloc.results import RunData
 from fgloc.sensors import registry
-from fgloc.types import Estimate, Finding, FloatArray, Ground, RunResult, Severity, Trajectory, note, ordered
+from fgloc.types import Estimate, Finding, FloatArray, Ground, Severity, Trajectory, note, ordered
 
 # --- What a replay found besides poses, and the sentences that say so -------------------------------------------------
 
@@ -105,6 +107,25 @@ def never_found(replay: Replay, rejections: Counter[str]) -> str:
 
 
 # --- Runs -------------------------------------------------------------------------------------------------------------
+
+
+class RunResult(RunData):
+    """A whole run, ready to be evaluated and written."""
+
+    __slots__ = ()
+
+    def write(self, folder: Path) -> None:
+        """Write all files of the run, as ``fgloc smooth`` and ``fgloc online`` do; see ``docs/formats.md``.
+
+        Args:
+            folder: made if missing; an error leaves what was there as it was.
+
+        Raises:
+            OutputError: the folder cannot be written.
+            TrajectoryError: a pose is not finite.
+            CovarianceError: a covariance is not positive definite.
+        """
+        write_results(self, self.config or Config(), folder, "fgloc.RunResult.write")
 
 
 @one_blas_thread

@@ -10,10 +10,6 @@ from typing import Protocol
 
 import numpy as np
 
-from fgloc.sensors.learned.sensor import LearnedMotion
-from fgloc.sensors.learned.sensor import learned_motion
-from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.detector import configured_detector
 from fgloc.config import Config, Role
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
@@ -22,8 +18,9 @@ from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
+from fgloc.sensors.learned.sensor import LearnedMotion, learned_motion
 from fgloc.sensors.maps import configured_map
-from fgloc.sensors.markers.detector import MarkerDetector
+from fgloc.sensors.markers.detector import MarkerDetector, configured_detector
 from fgloc.types import (
     Camera,
     CameraInfoEvent,

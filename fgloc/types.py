@@ -12,18 +12,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.errors import TrajectoryError
-
-if TYPE_CHECKING:
-    from fgloc.config import Config
-
 
 MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
 
@@ -695,53 +690,3 @@ class InstallationFound:
     wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they had no messages
     settings: tuple[Setting, ...] = ()  # all but the map's
     landmarks: LandmarkMap | None = None  # of a known map, where they were found
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunResult:
-    """A whole run, ready to be evaluated and written."""
-
-    trajectory: Trajectory
-    modes: tuple[Mode, ...]  # one per pose
-    decisions: tuple[Decision, ...]
-    counts: Mapping[str, int]  # factors held, by kind
-    rejections: Mapping[str, int]  # items rejected, by reason
-    findings: tuple[Finding, ...]  # what is wrong and worth knowing, the gravest first
-    step_ms: FloatArray  # (n,) wall time of each update
-    wall_s: float
-    truth: Trajectory | None = None
-    landmarks: LandmarkMap | None = None  # the map that was given, or that was estimated
-    spans: Mapping[str, TopicTimes] = field(default_factory=dict)  # by topic
-    source: Path | None = None
-    found: InstallationFound | None = None
-    installation: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # found: value and sigma by name
-    cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
-    first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
-    config: Config | None = None  # as the run used it: with the mistakes undone
-    odometry: Trajectory | None = None  # odometry alone, beside the run; None: nothing measured the motion
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of all findings, the gravest first."""
-        return tuple(finding.text for finding in self.findings)
-
-    @property
-    def mistakes(self) -> tuple[str, ...]:
-        """Sentences of the findings because of which the poses are not to be trusted."""
-        return tuple(finding.text for finding in self.findings if finding.severity is Severity.ERROR)
-
-    def write(self, folder: Path) -> None:
-        """Write all files of the run, as ``fgloc smooth`` and ``fgloc online`` do; see ``docs/formats.md``.
-
-        Args:
-            folder: made if missing; an error leaves what was there as it was.
-
-        Raises:
-            OutputError: the folder cannot be written.
-            TrajectoryError: a pose is not finite.
-            CovarianceError: a covariance is not positive definite.
-        """
-        from fgloc.config import Config
-        from fgloc.evaluation.report import write_results
-
-        write_results(self, self.config or Config(), folder, "fgloc.RunResult.write")

@@ -32,12 +32,12 @@ from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
-from fgloc.runner import run
+from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError
-from fgloc.types import Mode, RawEvent, RunResult, TruthEvent
+from fgloc.types import Mode, RawEvent, TruthEvent
 
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
 
@@ -212,9 +212,7 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
             "seed": cell.seed if cell.chain else None,
             "code": code_hash(),
         }
-        seen = {name: inputs[name] for name in ("bag", "map", "code")} | {
-            "dictionary": cell.config.markers.dictionary
-        }
+        seen = {name: inputs[name] for name in ("bag", "map", "code")} | {"dictionary": cell.config.markers.dictionary}
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}
         folder = None if folders is None else folders[cell.recording]

@@ -209,7 +209,7 @@ def _of_camera(state: _State, config: Config, camera: Camera | None) -> Iterator
 
 def _clocks(state: _State, config: Config, found: InstallationFound) -> Iterator[Setting]:
     clocks = {"camera.time_offset_s": found.seen_by, "sightings.time_offset_s": found.seen_by}
-    clocks[f"wheels.time_offset_s"] = found.wheels
+    clocks["wheels.time_offset_s"] = found.wheels
     for name, role in clocks.items():
         if not role:
             continue

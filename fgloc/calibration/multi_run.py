@@ -8,17 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgloc.sensors.base import with_values
-from fgloc.sensors.wheels.sensor import DISTANCE_GAIN, freed
 from fgloc.calibration.installation import found_text, settings_found, with_settings
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.recording.storage import find_beside
 from fgloc.replay import Progress
-from fgloc.runner import run
+from fgloc.runner import RunResult, run
 from fgloc.sensors import registry
 from fgloc.sensors.base import with_values
-from fgloc.types import InstallationFound, RunResult, Setting
+from fgloc.sensors.wheels.sensor import DISTANCE_GAIN, freed
+from fgloc.types import InstallationFound, Setting
 
 _ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before
 _FAR = 3.0  # of these sigmas that a gain may move at most
@@ -55,7 +54,7 @@ def calibrate(
 
 
 def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:
-    return [s for s in settings if s.name.startswith(f"wheels.")]
+    return [s for s in settings if s.name.startswith("wheels.")]
 
 
 def _key(setting: Setting) -> str:

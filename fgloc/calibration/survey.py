@@ -16,8 +16,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fgloc.sensors.markers.detector import fitting_dictionary
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
@@ -32,7 +30,8 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, smooth_run
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors
-from fgloc.sensors.markers.detector import detect_stream
+from fgloc.sensors.markers.detector import detect_stream, fitting_dictionary
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement, RawEvent, SightingsEvent
 
 # --- Drives, replayed without a map -----------------------------------------------------------------------------------

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from fgloc.ablation.jobs import Record
     from fgloc.config import Config
     from fgloc.evaluation.metrics import Metrics
-    from fgloc.types import RunResult
+    from fgloc.runner import RunResult
 
 
 # --- One run: demo, smooth, online ------------------------------------------------------------------------------------

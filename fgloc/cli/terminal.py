@@ -16,7 +16,7 @@ from fgloc.instrumentation import Advance, end, tell, told_to
 
 if TYPE_CHECKING:
     from fgloc.replay import Progress
-    from fgloc.types import RunResult
+    from fgloc.runner import RunResult
 
 
 EXIT_BAD_INPUT = 1

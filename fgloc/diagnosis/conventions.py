@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgloc.sensors.wheels.sensor import settings_of
 from fgloc import se2
 from fgloc.config import Config, Role, config_of
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
@@ -40,6 +39,7 @@ from fgloc.diagnosis.pairs import (
 )
 from fgloc.diagnosis.signals import Path, Sightings, Signals
 from fgloc.frames import rotation_of, sensor_pose
+from fgloc.sensors.wheels.sensor import settings_of
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp

@@ -19,16 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.gyro import Attitude
-from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.config import Config
 from fgloc.diagnosis.signals import Path, Signals
 from fgloc.estimation.faults import LiftMonitor
 from fgloc.frames import rotation_of
 from fgloc.sensors.cameras import up_in_base
 from fgloc.sensors.equipment import LandmarkSensor
-from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
+from fgloc.sensors.gyro import Attitude, Gyro
+from fgloc.sensors.wheels.motion import WheelMotion, commanded_to_move, is_standing
 from fgloc.types import (
     FloatArray,
     InertialEvent,

@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.markers.detector import RememberedDetections
-from fgloc.sensors.wheels.sensor import mistakes
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
@@ -37,6 +35,7 @@ from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.base import with_values
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberedDetections
+from fgloc.sensors.wheels.sensor import mistakes
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
 # --- Before a run -----------------------------------------------------------------------------------------------------

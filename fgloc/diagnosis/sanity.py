@@ -23,13 +23,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
 from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.gyro import Gyro
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     Estimate,

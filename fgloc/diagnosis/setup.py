@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.wheels.sensor import correct
 from fgloc.config import Config, Role
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
 from fgloc.frames import OPTICAL_TO_BODY, rotation_of, rpy_matrix, sensor_pose
-from fgloc.sensors.wheels.sensor import SetupMistake
 from fgloc.sensors.base import with_values
+from fgloc.sensors.wheels.sensor import SetupMistake, correct
 from fgloc.types import Camera, FloatArray, Landmark, LandmarkMap
 
 _WIDE = 0.5  # prior sigma of what may be grossly off: a share, rad, m or s

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.diagnosis.signals import IMAGES, SignalCollector, Signals, take
@@ -26,6 +25,7 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
 from fgloc.sensors.markers.detector import Detector
 from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     Event,

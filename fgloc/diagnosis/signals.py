@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.frames import quaternion_yaw
@@ -20,6 +19,7 @@ from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Event,
     FloatArray,

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.learned.sensor import left_out_note
 from fgloc import se2
 from fgloc.config import Config, WeightsConfig
 from fgloc.estimation.faults import Contradicted, FaultAttribution, FaultVerdict, GlrResult, GlrTest, LiftMonitor
@@ -26,8 +25,9 @@ from fgloc.graph.ground import planar_turn
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR, FusionRules, NoiseBudget, with_yaw
-from fgloc.sensors.base import MotionRole, Turn
+from fgloc.sensors.base import Turn
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.learned.sensor import left_out_note
 from fgloc.sensors.wheels.motion import commanded_to_move
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
@@ -53,7 +53,7 @@ class MotionSources:
         self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
         self.factors = LandmarkFactors(None) if factors is None else factors
         # m²/s of wheels that stand, with the way of encoders that jitter; of silent ones it is hundreds of times more
-        self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s ** 2
+        self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s**2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
         self._turn: Turn | None = None  # by the gyro, of the step that was read last

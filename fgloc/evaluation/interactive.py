@@ -11,13 +11,14 @@ import numpy as np
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.plots import relocated, stands
 from fgloc.evaluation.style import BLUE, MODE_LOOKS, ErrorScale, TimeAxis, after_gaps, mode_runs, seconds
-from fgloc.types import Decision, FloatArray, IntArray, Landmark, RunResult
+from fgloc.results import RunData
+from fgloc.types import Decision, FloatArray, IntArray, Landmark
 
 _MOST = 4000  # points of a curve
 _DEGREES = math.degrees(1.0)
 
 
-def interactive(result: RunResult, matched: Matched | None) -> dict[str, Any]:
+def interactive(result: RunData, matched: Matched | None) -> dict[str, Any]:
     """Poses, truth, landmarks, errors, sightings and modes; times where `TimeAxis` draws them."""
     axis = TimeAxis.of(result)
     trajectory = result.trajectory
@@ -70,7 +71,7 @@ def _truth(matched: Matched) -> Mapping[str, Any]:
     return {"x": _rounded(x, 4), "y": _rounded(y, 4)}
 
 
-def _errors(result: RunResult, matched: Matched, axis: TimeAxis) -> Mapping[str, Any]:
+def _errors(result: RunData, matched: Matched, axis: TimeAxis) -> Mapping[str, Any]:
     times = axis.place(seconds(result, matched.stamps_ns))
     yaws = _DEGREES * np.abs(matched.errors[:, 2])
     t, position, yaw = _thinned_columns(matched, np.column_stack([times, 1e3 * matched.distances, yaws]))
@@ -88,7 +89,7 @@ def _judged(d: Decision) -> bool:
     return d.landmark_id >= 0 and d.dof > 0 and d.nis > 0.0 and math.isfinite(d.nis)
 
 
-def _sightings(result: RunResult, decisions: Sequence[Decision], axis: TimeAxis) -> Mapping[str, Any]:
+def _sightings(result: RunData, decisions: Sequence[Decision], axis: TimeAxis) -> Mapping[str, Any]:
     chosen = [decisions[k] for k in _thinned(len(decisions))] if decisions else []
     return {
         "t": _rounded(axis.place(seconds(result, [d.stamp_ns for d in chosen])), 3) if chosen else [],
@@ -97,7 +98,7 @@ def _sightings(result: RunResult, decisions: Sequence[Decision], axis: TimeAxis)
     }
 
 
-def _modes(result: RunResult, axis: TimeAxis, times: FloatArray) -> list[Mapping[str, Any]]:
+def _modes(result: RunData, axis: TimeAxis, times: FloatArray) -> list[Mapping[str, Any]]:
     found: list[Mapping[str, Any]] = []
     for mode, (color, _, _) in MODE_LOOKS.items():
         for first, last in mode_runs(result, mode):
@@ -111,7 +112,7 @@ def _ticks(axis: TimeAxis) -> Mapping[str, Any]:
     return {"at": _rounded(axis.place(np.array(ticks)), 3), "told": [f"{t:g}" for t in ticks]}
 
 
-def _landmarks(result: RunResult) -> Mapping[str, Any]:
+def _landmarks(result: RunData) -> Mapping[str, Any]:
     """Places by id, and the edges of markers as seen from above."""
     known = [] if result.landmarks is None else list(result.landmarks.landmarks.values())
     edges = [lm.corners()[:2, :2] for lm in known if stands(lm)]

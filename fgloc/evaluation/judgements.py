@@ -10,10 +10,11 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.calibration.installation import contradicted
+from fgloc.results import RunData
+from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.stats import SURE_SIGMAS
-from fgloc.types import Decision, IntArray, RunResult, Trajectory
+from fgloc.types import Decision, IntArray, Trajectory
 
 # --- What a judgement cost or saved -----------------------------------------------------------------------------------
 
@@ -205,13 +206,13 @@ class Judgement(BaseModel):
         return f"{self.from_s:.1f}–{self.to_s:.1f} s"
 
 
-def judgements(result: RunResult) -> tuple[Judgement, ...]:
+def judgements(result: RunData) -> tuple[Judgement, ...]:
     """Everything that a run judged to be wrong: of the whole run first, then by time."""
     found = (*_of_setup(result), *episodes(result.decisions, result.trajectory))
     return tuple(j.model_copy(update={"number": i}) for i, j in enumerate(found, start=1))
 
 
-def numbered(result: RunResult) -> dict[Decision, int]:
+def numbered(result: RunData) -> dict[Decision, int]:
     """Number of the judgement that a row of ``steps.csv`` belongs to, for those that belong to one."""
     before = sum(1 for _ in _of_setup(result))
     told = _episodes(result.decisions, result.trajectory)
@@ -357,7 +358,7 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
-def _of_setup(result: RunResult) -> Iterator[Judgement]:
+def _of_setup(result: RunData) -> Iterator[Judgement]:
     """What holds for the whole run: gross mistakes, and given values that the run contradicts."""
     for sentence in result.mistakes:
         yield Judgement(

@@ -22,8 +22,9 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Judgement, judgements
+from fgloc.results import RunData
 from fgloc.stats import chi2_bound
-from fgloc.types import Finding, FloatArray, IntArray, RunResult, Severity, Trajectory, ordered
+from fgloc.types import Finding, FloatArray, IntArray, Severity, Trajectory, ordered
 
 # --- Pairs of estimated and true poses at the same times --------------------------------------------------------------
 
@@ -205,7 +206,7 @@ _SETTINGS = {  # of a sensor whose messages are dropped
 
 
 def all_findings(
-    result: RunResult, nees_over_3: float | None, rejections: Mapping[str, int], keyframes: int
+    result: RunData, nees_over_3: float | None, rejections: Mapping[str, int], keyframes: int
 ) -> tuple[Finding, ...]:
     """Findings of a run and the warnings by its figures, the gravest first.
 
@@ -219,7 +220,7 @@ def all_findings(
     return ordered([*result.findings, *warned])
 
 
-def _optimistic(result: RunResult, nees: float | None) -> Iterator[Finding]:
+def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
     if nees is None or nees <= _MOST_NEES:
         return
     yield Finding(
@@ -232,7 +233,7 @@ def _optimistic(result: RunResult, nees: float | None) -> Iterator[Finding]:
     )
 
 
-def _dropped(result: RunResult, rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
+def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
     dropped: Counter[str] = Counter()
     for reason, count in rejections.items():
         dropped[reason.partition(".")[0]] += count
@@ -253,7 +254,7 @@ def _dropped(result: RunResult, rejections: Mapping[str, int], keyframes: int) -
             )
 
 
-def _prior_sigmas(result: RunResult) -> str:
+def _prior_sigmas(result: RunData) -> str:
     """Settings that say how far off this run's installation may be."""
     found = result.found
     sections = [] if found is None else [setting.name.partition(".")[0] for setting in found.settings]
@@ -362,7 +363,7 @@ class Metrics(BaseModel):
     judgements: tuple[Judgement, ...]  # what was judged to be wrong, when, and by which evidence
 
 
-def _installation(result: RunResult) -> dict[str, FoundSetting]:
+def _installation(result: RunData) -> dict[str, FoundSetting]:
     settings = () if result.found is None else result.found.settings
     return {
         s.name: FoundSetting(given=s.given, prior_sigma=s.prior_sigma, found=s.found, sigma=s.sigma) for s in settings
@@ -431,7 +432,7 @@ def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"])
     return RelativeError(_rms(translation), math.degrees(_rms(rotation)), len(errors))
 
 
-def compute_metrics(result: RunResult, config: Config) -> Metrics:
+def compute_metrics(result: RunData, config: Config) -> Metrics:
     """Everything that ``metrics.json`` holds.
 
     Raises:
@@ -488,7 +489,7 @@ def ground_metrics(matched: Matched) -> GroundMetrics | None:
     )
 
 
-def odometry_metrics(result: RunResult, config: Config, ate_m: float) -> OdometryMetrics | None:
+def odometry_metrics(result: RunData, config: Config, ate_m: float) -> OdometryMetrics | None:
     """Figures of odometry alone, beside the run's own error [m]; None: there is none at the truth's times."""
     truth, odometry = result.truth, result.odometry
     if truth is None or odometry is None or len(matchable(odometry, truth, config.truth.max_gap_s)) < FEWEST:
@@ -497,7 +498,7 @@ def odometry_metrics(result: RunResult, config: Config, ate_m: float) -> Odometr
     return OdometryMetrics(ate_rmse_m=alone, ate_over_odometry=ate_m / alone if alone > 0.0 else None)
 
 
-def match_result(result: RunResult, config: Config) -> Matched | None:
+def match_result(result: RunData, config: Config) -> Matched | None:
     """`match` of a run with its truth; None if there is no truth or it has no pose at the run's time."""
     truth = result.truth
     if truth is None or len(truth) == 0 or len(matchable(result.trajectory, truth, config.truth.max_gap_s)) < FEWEST:

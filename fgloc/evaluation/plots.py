@@ -18,7 +18,6 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d import Axes3D
 
-from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.style import (
     BLUE,
@@ -46,7 +45,9 @@ from fgloc.evaluation.style import (
     shade_modes,
     tidy,
 )
-from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, RunResult, Trajectory
+from fgloc.results import RunData
+from fgloc.sensors.settings import MOTION_SOURCES
+from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, Trajectory
 
 # --- Trajectory: the map, the way with its times, and below it how large sigma and error are --------------------------
 
@@ -58,7 +59,7 @@ _TIMES = 8  # written along the way, about
 _JUMPS = ("jump", "overruled by sightings")
 
 
-def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
+def plot_trajectory(result: RunData, matched: Matched | None) -> Figure:
     """The estimate with its times and 3σ ellipses, the truth, the landmarks; below, sigma and true error over time."""
     low, high = _bounds(result, matched)
     extent = float(max(high - low))
@@ -82,7 +83,7 @@ def plot_trajectory(result: RunResult, matched: Matched | None) -> Figure:
     return figure
 
 
-def _bounds(result: RunResult, matched: Matched | None) -> tuple[FloatArray, FloatArray]:
+def _bounds(result: RunData, matched: Matched | None) -> tuple[FloatArray, FloatArray]:
     """Lower left and upper right corner ``(2,)`` [m]: everything, no flatter than half, no taller than square."""
     parts = [result.trajectory.poses[:, :2]]
     if matched is not None:
@@ -97,7 +98,7 @@ def _bounds(result: RunResult, matched: Matched | None) -> tuple[FloatArray, Flo
     return center - half, center + half
 
 
-def _draw_way(axes: Axes, result: RunResult, matched: Matched | None, extent: float) -> list[Artist]:
+def _draw_way(axes: Axes, result: RunData, matched: Matched | None, extent: float) -> list[Artist]:
     """Estimate, truth, ellipses, modes, directions and times; legend entries of them."""
     estimate = result.trajectory
     handles: list[Artist] = [Line2D([], [], color=BLUE, lw=1.8, label="estimate, with times [s]")]
@@ -132,14 +133,14 @@ def travelled(poses: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
-def relocated(result: RunResult) -> IntArray:
+def relocated(result: RunData) -> IntArray:
     """Indices of poses to which no motion leads: the robot was relocated there."""
     stamps = [d.stamp_ns for d in result.decisions if d.kind == "place" and d.reason in _JUMPS and d.weight > 0.0]
     found = np.flatnonzero(np.isin(result.trajectory.stamps_ns, stamps))
     return found[found > 0]
 
 
-def _draw_times(axes: Axes, result: RunResult, extent: float) -> None:
+def _draw_times(axes: Axes, result: RunData, extent: float) -> None:
     """Seconds along the way at even times, and an arrowhead halfway between two of them."""
     poses, times = result.trajectory.poses, seconds(result, result.trajectory.stamps_ns)
     if len(poses) < 3:
@@ -247,7 +248,7 @@ def _label_offset(landmark: Landmark) -> tuple[float, float]:
     return 7.0, 7.0
 
 
-def _draw_distance(axes: Axes, result: RunResult, matched: Matched | None) -> list[Artist]:
+def _draw_distance(axes: Axes, result: RunData, matched: Matched | None) -> list[Artist]:
     """Sigma of the position, and distance from the truth, over time: too small to be seen on the map."""
     stamps, covs = result.trajectory.stamps_ns, result.trajectory.covs
     sigma = None if covs is None else np.sqrt(covs[:, 0, 0] + covs[:, 1, 1])
@@ -275,7 +276,7 @@ def _draw_distance(axes: Axes, result: RunResult, matched: Matched | None) -> li
 # --- Error against its 3σ band ----------------------------------------------------------------------------------------
 
 
-def plot_error(result: RunResult, matched: Matched | None) -> Figure:
+def plot_error(result: RunData, matched: Matched | None) -> Figure:
     """Error in x, y and yaw against its ±3σ band over time; without a truth the band alone."""
     trajectory = result.trajectory
     bands = None if trajectory.covs is None else 3.0 * np.sqrt(np.diagonal(trajectory.covs, axis1=1, axis2=2))
@@ -335,7 +336,7 @@ _LANDMARKS = "sightings of each landmark"
 Panel = tuple[float, Callable[[Axes], None]]  # height in rows, and what draws it
 
 
-def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: IntArray | None = None) -> Figure:
+def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: IntArray | None = None) -> Figure:
     """The timeline of a run; panels of which there is nothing to show are left out.
 
     Args:
@@ -387,12 +388,12 @@ def plot_timeline(result: RunResult, matched: Matched | None = None, slips_ns: I
     return figure
 
 
-def _poses(result: RunResult) -> FloatArray:
+def _poses(result: RunData) -> FloatArray:
     return seconds(result, result.trajectory.stamps_ns)
 
 
 def _handles(
-    result: RunResult, motions: Sequence[Decision], known: Sequence[Decision], truth: bool, slips: bool
+    result: RunData, motions: Sequence[Decision], known: Sequence[Decision], truth: bool, slips: bool
 ) -> list[Any]:
     """Legend entries of what is drawn."""
     handles: list[Any] = []
@@ -415,7 +416,7 @@ def _handles(
     return handles + mode_handles(result)
 
 
-def _flags(result: RunResult, decisions: Sequence[Decision]) -> dict[str, FloatArray]:
+def _flags(result: RunData, decisions: Sequence[Decision]) -> dict[str, FloatArray]:
     """When each reason was given, the most frequent ones, by the order of kinds."""
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
     for d in decisions:
@@ -461,7 +462,7 @@ def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, flo
     return [(float(part[0]), float(np.ptp(part)) + span / 600.0) for part in np.split(times, cuts)]
 
 
-def _weights(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
+def _weights(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None:
     """A row for each motion source: as high as its weight, and what was taken back at full height in red."""
     kinds = [source for source in _SOURCES if any(d.kind == source for d in decisions)]
     for row, kind in enumerate(kinds):
@@ -481,7 +482,7 @@ def _weights(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> No
     _rows(axes, _WEIGHTS, [f"{kind} ({sum(d.kind == kind for d in decisions)})" for kind in kinds])
 
 
-def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
+def _fit(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None:
     """NIS of the sightings over its expected value."""
     for accepted, color, marker in _SIGHTING_LOOKS:
         chosen = [d for d in decisions if (d.weight > 0.0) == accepted]
@@ -494,7 +495,7 @@ def _fit(axes: Axes, result: RunResult, decisions: Sequence[Decision]) -> None:
     tidy(axes)
 
 
-def _landmarks(axes: Axes, result: RunResult, span: float, decisions: Sequence[Decision]) -> None:
+def _landmarks(axes: Axes, result: RunData, span: float, decisions: Sequence[Decision]) -> None:
     """A row for each landmark, and for what else a sensor measured: when it was accepted, and when not."""
     seen = Counter(map(_row_of, decisions))
     shown = sorted(row for row, _ in seen.most_common(_MAX_LANDMARKS))
@@ -511,7 +512,7 @@ def _row_of(decision: Decision) -> tuple[int, str]:
     return decision.landmark_id, "" if decision.landmark_id >= 0 else decision.kind
 
 
-def _error(axes: Axes, result: RunResult, matched: Matched, yaw: bool) -> None:
+def _error(axes: Axes, result: RunData, matched: Matched, yaw: bool) -> None:
     """Distance from the truth, or yaw error, with what the covariance makes of it."""
     covs = result.trajectory.covs
     error = np.abs(matched.errors[:, 2]) if yaw else matched.distances
@@ -534,7 +535,7 @@ def _error(axes: Axes, result: RunResult, matched: Matched, yaw: bool) -> None:
 _TALLER = 4.0  # times: heights of a floor are small beside its extent
 
 
-def plot_space(result: RunResult, matched: Matched | None) -> Figure:
+def plot_space(result: RunData, matched: Matched | None) -> Figure:
     """Path of the base in space, over the truth, with the landmarks."""
     assert result.trajectory.ground is not None
     figure = Figure(figsize=(WIDTH, 0.62 * WIDTH), dpi=DPI, layout="constrained")
@@ -557,7 +558,7 @@ def plot_space(result: RunResult, matched: Matched | None) -> Figure:
     return figure
 
 
-def plot_height(result: RunResult, matched: Matched | None) -> Figure:
+def plot_height(result: RunData, matched: Matched | None) -> Figure:
     """Height, pitch and roll over the distance travelled, with 3σ bands, over the truth."""
     trajectory = result.trajectory
     assert trajectory.ground is not None

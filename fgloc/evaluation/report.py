@@ -31,9 +31,10 @@ from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import write_bytes, write_covariance_csv, write_json, write_steps_csv, write_text, write_tum
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
+from fgloc.results import RunData
 from fgloc.sensors.maps import write_map
 from fgloc.stats import rounded
-from fgloc.types import InstallationFound, IntArray, Mode, RunResult
+from fgloc.types import InstallationFound, IntArray, Mode
 
 # --- Pages by Jinja, which escapes whatever a recording is called -----------------------------------------------------
 
@@ -92,7 +93,7 @@ _INSTALLATION = (
 Row = tuple[str, ...]
 
 
-def content_of(result: RunResult, metrics: Metrics, matched: Matched | None) -> dict[str, Any]:
+def content_of(result: RunData, metrics: Metrics, matched: Matched | None) -> dict[str, Any]:
     """All that the template needs besides the pictures."""
     compared = matched is not None
     lost = Mode.LOST in result.modes
@@ -131,7 +132,7 @@ def _tiles(metrics: Metrics) -> list[Row]:
     return [(label, text) for label, text in shown if text != "–"]
 
 
-def _truth_line(result: RunResult, matched: Matched | None) -> str:
+def _truth_line(result: RunData, matched: Matched | None) -> str:
     if matched is not None:
         return f"The truth was matched at {len(matched.stamps_ns)} of {len(result.trajectory)} keyframes."
     if result.truth is not None:
@@ -146,7 +147,7 @@ def _modes(modes: Sequence[Mode]) -> str:
     return f"Modes: {shares}.{lost}"
 
 
-def _captions(result: RunResult, compared: bool) -> Mapping[str, str]:
+def _captions(result: RunData, compared: bool) -> Mapping[str, str]:
     drawn = "The estimate with its times and 3σ ellipses"
     mapped = ", and the landmarks" if result.landmarks is not None else ""
     return {
@@ -206,7 +207,7 @@ def _ground_figures(metrics: Metrics) -> list[Row]:
     ]
 
 
-def _sensors(result: RunResult) -> list[Row]:
+def _sensors(result: RunData) -> list[Row]:
     rows: list[Row] = []
     for name, topic in result.spans.items():
         steps = np.diff(np.sort(topic.times)) / topic.every
@@ -215,7 +216,7 @@ def _sensors(result: RunResult) -> list[Row]:
     return rows
 
 
-def _installation(result: RunResult) -> list[Row]:
+def _installation(result: RunData) -> list[Row]:
     return [
         (
             s.name + (" (contradicts the given value)" if contradicted(s) else ""),
@@ -228,7 +229,7 @@ def _installation(result: RunResult) -> list[Row]:
     ]
 
 
-def _landmarks(result: RunResult) -> tuple[Row, list[Row]]:
+def _landmarks(result: RunData) -> tuple[Row, list[Row]]:
     """Head and rows; sigmas only of a map that has them."""
     landmarks = {} if result.landmarks is None else result.landmarks.landmarks
     used, refused = Counter[int](), Counter[int]()
@@ -271,7 +272,7 @@ _PACKAGES = ("fgloc", "gtsam", "numpy", "opencv-contrib-python-headless")
 
 
 def write_results(
-    result: RunResult,
+    result: RunData,
     config: Config,
     out: Path,
     command: str,
@@ -317,7 +318,7 @@ def write_results(
     return metrics
 
 
-def _provenance(result: RunResult, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
+def _provenance(result: RunData, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
     """What ``config.json`` holds: how the result came about."""
     source = None if result.source is None else str(result.source)
     return {
@@ -328,7 +329,7 @@ def _provenance(result: RunResult, config: Config, command: str, input_hash: str
     }
 
 
-def _drawn(result: RunResult, matched: Matched | None, config: Config) -> dict[str, Figure]:
+def _drawn(result: RunData, matched: Matched | None, config: Config) -> dict[str, Figure]:
     """The figures of a run by name."""
     drawn = {
         "trajectory": plot_trajectory(result, matched),
@@ -351,7 +352,7 @@ def installation_yaml(found: InstallationFound, config: Config, folder: Path, co
     return "\n".join(head) + "\n" + yaml_of(with_settings(config, found.settings), folder)
 
 
-def _slips(result: RunResult, config: Config) -> IntArray | None:
+def _slips(result: RunData, config: Config) -> IntArray | None:
     """When a wheel truly slipped, if the recording is still there and has it."""
     if result.source is None or not result.source.exists():
         return None
@@ -360,7 +361,7 @@ def _slips(result: RunResult, config: Config) -> IntArray | None:
 
 
 def render(
-    result: RunResult,
+    result: RunData,
     metrics: Metrics,
     matched: Matched | None,
     images: Mapping[str, bytes],

@@ -18,7 +18,8 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from fgloc.evaluation.metrics import Matched
-from fgloc.types import FloatArray, IntArray, Mode, RunResult
+from fgloc.results import RunData
+from fgloc.types import FloatArray, IntArray, Mode
 
 BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#555555"
 MODE_LOOKS = {
@@ -66,7 +67,7 @@ def plain_label(text: str, longest: int = _LONGEST_LABEL) -> str:
     return shown.replace("$", r"\$")
 
 
-def seconds(result: RunResult, stamps_ns: NDArray[np.int64] | Sequence[int]) -> FloatArray:
+def seconds(result: RunData, stamps_ns: NDArray[np.int64] | Sequence[int]) -> FloatArray:
     """Seconds from the first pose."""
     return np.asarray((np.asarray(stamps_ns, dtype=np.int64) - result.trajectory.stamps_ns[0]) * 1e-9)
 
@@ -81,14 +82,14 @@ def broken(stamps_ns: NDArray[np.int64], columns: FloatArray) -> FloatArray:
     return np.insert(columns, after_gaps(stamps_ns), np.nan, axis=0)
 
 
-def mode_runs(result: RunResult, mode: Mode) -> list[tuple[int, int]]:
+def mode_runs(result: RunData, mode: Mode) -> list[tuple[int, int]]:
     """First and last index of each stretch in this mode."""
     inside = np.array([m is mode for m in result.modes], dtype=int)
     edges = np.diff(np.concatenate([[0], inside, [0]]))
     return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
 
 
-def shade_modes(axes: Axes, result: RunResult) -> None:
+def shade_modes(axes: Axes, result: RunData) -> None:
     """Shade the stretches that were not OK."""
     times = seconds(result, result.trajectory.stamps_ns)
     for mode, (color, _, hatch) in MODE_LOOKS.items():
@@ -98,7 +99,7 @@ def shade_modes(axes: Axes, result: RunResult) -> None:
             axes.axvspan(start, float(times[last]), **look)
 
 
-def mode_handles(result: RunResult) -> list[Artist]:
+def mode_handles(result: RunData) -> list[Artist]:
     """Legend entries of the modes that occur."""
     return [
         Patch(facecolor=color, edgecolor=color, alpha=0.3, hatch=hatch, label=label)
@@ -142,7 +143,7 @@ class TimeAxis:
     places: FloatArray
 
     @classmethod
-    def of(cls, result: RunResult) -> TimeAxis:
+    def of(cls, result: RunData) -> TimeAxis:
         """From the first message or pose to the last pose."""
         poses = seconds(result, result.trajectory.stamps_ns)
         first = min([float(poses[0]), *(float(t.times.min()) for t in result.spans.values() if len(t.times))])
@@ -242,7 +243,7 @@ class ErrorScale:
 
     @classmethod
     def of(
-        cls, result: RunResult, band: FloatArray | None, error: tuple[IntArray, FloatArray] | None, angle: bool = False
+        cls, result: RunData, band: FloatArray | None, error: tuple[IntArray, FloatArray] | None, angle: bool = False
     ) -> ErrorScale:
         """The scale for a band and an error.
 
@@ -266,7 +267,7 @@ class ErrorScale:
         return cls(usual, largest, 1e3, "mm") if usual < _SMALL_M else cls(usual, largest, 1.0, "m")
 
     @classmethod
-    def of_distance(cls, result: RunResult, matched: Matched | None) -> ErrorScale:
+    def of_distance(cls, result: RunData, matched: Matched | None) -> ErrorScale:
         """The scale for 3σ of the position and the distance from the truth."""
         covs = result.trajectory.covs
         band = None if covs is None else 3.0 * np.sqrt(covs[:, 0, 0] + covs[:, 1, 1])
@@ -303,7 +304,7 @@ class ErrorScale:
         axes.text(0.005, 0.96, told, transform=axes.transAxes, ha="left", va="top", zorder=7, bbox=box, **TEXT)
 
 
-def _calm(result: RunResult) -> NDArray[np.bool_]:
+def _calm(result: RunData) -> NDArray[np.bool_]:
     """Which poses set the scale: those that are OK; all that are not LOST, or all, if there are no others."""
     for kept in ((Mode.OK,), (Mode.OK, Mode.UNCONFIRMED, Mode.DEAD_RECKONING), tuple(Mode)):
         chosen = np.array([mode in kept for mode in result.modes])

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from fgloc.sensors.gyro import BIASES, LEVELS, TILTS
 from fgloc import se2
 from fgloc.frames import rotations
 from fgloc.graph.factors import INSTALLATION, ground_key, linear_factor
@@ -21,6 +20,7 @@ from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
 from fgloc.graph.joint import LINEAR_RAD, fuse_installed, joint_cov, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import whitening_of
+from fgloc.sensors.gyro import BIASES, LEVELS, TILTS
 from fgloc.types import FloatArray, Ground, InertialReading, MotionMeasurement
 
 # --- Motion and gravity on uneven ground ------------------------------------------------------------------------------

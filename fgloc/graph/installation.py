@@ -16,7 +16,6 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.sensors import registry
-from fgloc.sensors.base import MotionRole
 from fgloc.stats import PRIOR_GATE, SURE_SIGMAS
 from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from fgloc.sensors.learned.network import JointCalibration
 from fgloc.errors import CovarianceError
+from fgloc.sensors.learned.network import JointCalibration
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
 
 # --- Noise models of GTSAM, and square roots of information -----------------------------------------------------------

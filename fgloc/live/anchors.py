@@ -7,10 +7,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fgloc.sensors.gyro import Attitude
-from fgloc.sensors.gyro import Gyro
-from fgloc.sensors.learned.network import JointCalibration
-from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import Config
@@ -18,6 +14,9 @@ from fgloc.errors import FglocError
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
+from fgloc.sensors.gyro import Attitude, Gyro
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.types import Estimate, FloatArray, Mode, Step
 
 

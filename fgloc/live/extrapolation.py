@@ -12,9 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.sensors.gyro import Attitude
-from fgloc.sensors.learned.network import JointCalibration
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.motion import MotionSources, source_difference
@@ -26,6 +23,9 @@ from fgloc.intake.clocks import ClockGuard, ClockVerdict
 from fgloc.live.anchors import Anchor, MotionParts
 from fgloc.live.status import LivePose
 from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro import Attitude
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Event, InertialEvent, Mode, MotionEvent, MotionReadings, Step
 
@@ -206,11 +206,7 @@ def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: Motion
 
     The test that flags slips (`MotionFaults`) sees whole steps only.
     """
-    if (
-        readings.learned is None
-        or not sources.learned_is_independent
-        or "learned" in budget.rejected
-    ):
+    if readings.learned is None or not sources.learned_is_independent or "learned" in budget.rejected:
         return budget
     difference = source_difference(readings, sources)
     if difference is None:

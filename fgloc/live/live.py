@@ -11,7 +11,6 @@ from types import TracebackType
 
 import numpy as np
 
-from fgloc.sensors.learned.sensor import learned_motion
 from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -22,6 +21,7 @@ from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.process import EstimationProcess
 from fgloc.live.reception import Reception
 from fgloc.live.status import LivePose, LiveStatus
+from fgloc.sensors.learned.sensor import learned_motion
 from fgloc.sensors.maps import configured_map
 from fgloc.types import Camera, Estimate, Event, LandmarkMap
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
+from enum import IntEnum
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -20,7 +19,6 @@ from pydantic import Field, FiniteFloat
 
 from fgloc.files.settings import Section
 from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
-from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, MotionEvent, PoseMeasurement, Setting
 
 if TYPE_CHECKING:

@@ -5,34 +5,29 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from fgloc.sensors.gyro import Attitude, Gyro
-from fgloc.sensors.learned.network import JointCalibration
-from fgloc.sensors.learned.sensor import LearnedMotion
-from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.sensors import registry
-from fgloc.sensors.base import Sensor, Turn
+from fgloc.sensors.base import Sensor
+from fgloc.sensors.gyro import Attitude, Gyro
 from fgloc.sensors.landmarks import SightingContext
+from fgloc.sensors.learned.network import JointCalibration
+from fgloc.sensors.learned.sensor import LearnedMotion
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     FloatArray,
     FrameMeasurement,
-    InertialEvent,
-    InertialReading,
     LandmarkMap,
     LandmarkMeasurement,
     LandmarkSighting,
-    MotionEvent,
-    MotionMeasurement,
     PixelMeasurement,
     PoseMeasurement,
     SightingsEvent,

@@ -18,18 +18,14 @@ from fgloc.config import Config
 from fgloc.frames import rotation_of, rpy_matrix
 from fgloc.sensors.base import (
     BASE,
-    AttitudeNames,
     BuiltIn,
     Channel,
     EventInput,
     FoundRow,
     InstallationState,
     MotionInstallation,
-    MotionRole,
     Mounting,
     Parameter,
-    RateErrors,
-    RateRole,
     Signal,
     Stream,
     Turn,
@@ -46,7 +42,7 @@ from fgloc.stats import GATE, chi2_bound
 from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setting, Step
 
 if TYPE_CHECKING:
-    from fgloc.config import Section
+    pass
 
 
 @dataclass(frozen=True, slots=True, eq=False)

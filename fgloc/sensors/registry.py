@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator
 
-from fgloc.sensors import gyro
-from fgloc.sensors.learned import sensor as learned
-from fgloc.sensors.wheels import motion as wheels
 from fgloc.extensions import outside_sensors
 from fgloc.files.settings import Section
+from fgloc.sensors import gyro
 from fgloc.sensors.base import (
     BuiltIn,
     Context,
     Converter,
     FirstSettings,
     Joined,
-    ModelRole,
     MotionInstallation,
-    MotionRole,
-    OdometerRole,
     Parameter,
-    RateRole,
-    RawLandmarksRole,
-    RawMistake,
     Sensor,
     Stream,
 )
 from fgloc.sensors.commands import COMMANDS, CommandInput
 from fgloc.sensors.gyro import GYRO, GyroInput
+from fgloc.sensors.learned import sensor as learned
 from fgloc.sensors.learned.sensor import LEARNED
 from fgloc.sensors.marker_pose import MARKER_POSE
 from fgloc.sensors.markers.sensor import MARKERS, MarkersInput
 from fgloc.sensors.range_bearing import RANGE_BEARING, RangeBearingInput
+from fgloc.sensors.wheels import motion as wheels
 from fgloc.sensors.wheels.events import WheelsInput
 from fgloc.sensors.wheels.sensor import WHEELS
 from fgloc.types import Event, LandmarkSighting, RawEvent
@@ -44,7 +38,6 @@ if TYPE_CHECKING:
     from fgloc.config import Config
     from fgloc.sensors.failures import Carriage
     from fgloc.sensors.landmarks import SightingContext
-
 
 
 class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):

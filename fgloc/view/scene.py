@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import OutputError
-from fgloc.types import Decision, Estimate, FloatArray, Landmark, LandmarkMap, RunResult
+from fgloc.results import RunData
+from fgloc.types import Decision, Estimate, FloatArray, Landmark, LandmarkMap
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -229,7 +230,7 @@ def _blueprint() -> Any:
 # --- Files ------------------------------------------------------------------------------------------------------------
 
 
-def write_rrd(result: RunResult, path: Path) -> None:
+def write_rrd(result: RunData, path: Path) -> None:
     """Write a run as an ``.rrd``; the file appears whole or not at all. A truth in another frame is left out.
 
     Raises:
@@ -252,7 +253,7 @@ def write_rrd(result: RunResult, path: Path) -> None:
             unfinished.unlink()
 
 
-def draw(result: RunResult, stream: RecordingStream) -> None:
+def draw(result: RunData, stream: RecordingStream) -> None:
     """Send a run to a rerun recording stream, from its beginning to its end."""
     settings = (result.config or Config()).truth
     scene = Scene(stream, settings.max_gap_s)

@@ -16,8 +16,9 @@ from benchmarks.adaptive_recordings import Recorded, moved_interval, scenario, s
 from benchmarks.adaptive_runs import CASES, changed, distrusting, failure, moved_id
 from benchmarks.adaptive_scores import Figures, Slips, flags, found_again, lost, slips
 from fgloc.config import Config
+from fgloc.runner import RunResult
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Decision, Landmark, LandmarkMap, Mode, RunResult, Trajectory
+from fgloc.types import Decision, Landmark, LandmarkMap, Mode, Trajectory
 
 START_NS = 10**18
 MAP = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), 0.2) for i in range(4)})

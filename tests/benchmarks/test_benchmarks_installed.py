@@ -28,11 +28,12 @@ from benchmarks.installed_scores import (
 )
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.config import Config
+from fgloc.runner import RunResult
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import Camera, Decision, Landmark, LandmarkMap, Mode, RunResult, Step, Trajectory, by_class
+from fgloc.types import Camera, Decision, Landmark, LandmarkMap, Mode, Step, Trajectory, by_class
 
 SECOND = 1_000_000_000
 INSTALLED = {

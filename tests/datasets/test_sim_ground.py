@@ -13,7 +13,8 @@ from sim_ramp import estimated, record_ramp
 from fgloc.cli.terminal import exit_code
 from fgloc.evaluation.metrics import ground_metrics, match_result
 from fgloc.frames import quaternion_matrix
-from fgloc.types import RunResult, Severity
+from fgloc.runner import RunResult
+from fgloc.types import Severity
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from fgloc.config import Config, config_of
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
-from fgloc.types import RunResult
+from fgloc.runner import RunResult
 from fgloc_datasets.bag import BagWriter
 
 SECOND = 1_000_000_000

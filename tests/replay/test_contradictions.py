@@ -11,9 +11,9 @@ from real_data import real_data
 from robot_world import config
 
 from fgloc.config import Config
-from fgloc.runner import run
+from fgloc.runner import RunResult, run
 from fgloc.stats import PRIOR_GATE
-from fgloc.types import Finding, RunResult, Severity
+from fgloc.types import Finding, Severity
 
 SECONDS = 40.0
 CODE = "installation.contradiction"

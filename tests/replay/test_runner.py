@@ -14,8 +14,8 @@ from fgloc import se2
 from fgloc.errors import EstimatorError
 from fgloc.files.outputs import write_tum
 from fgloc.recording.storage import find_beside
-from fgloc.runner import run
-from fgloc.types import Mode, RunResult, TruthEvent
+from fgloc.runner import RunResult, run
+from fgloc.types import Mode, TruthEvent
 
 
 def errors(result: RunResult) -> np.ndarray:

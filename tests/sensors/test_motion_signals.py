@@ -11,7 +11,7 @@ from motion_models import make_card, make_tensors
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
-from fgloc.sensors.base import MotionRole, Signal
+from fgloc.sensors.base import Signal
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.learned.card import SignalReader, Signals
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgloc.runner import RunResult
 from fgloc.se2 import rotate_cov, wrap_array
-from fgloc.types import Decision, Finding, Landmark, LandmarkMap, Mode, RunResult, TopicTimes, Trajectory
+from fgloc.types import Decision, Finding, Landmark, LandmarkMap, Mode, TopicTimes, Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 

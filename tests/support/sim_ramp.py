@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fgloc import run
 from fgloc.config import Config, load_config
-from fgloc.types import RunResult
+from fgloc.runner import RunResult
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.sim.physics import make_scene, simulate
 from fgloc_datasets.sim.record import write_beside

@@ -15,7 +15,6 @@ from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
 from fgloc.errors import ConfigError, ModelError
-from fgloc.sensors.base import MotionRole
 from fgloc.sensors.learned.card import Input, Kind, Split
 from fgloc.sensors.learned.sensor import load_model, read_model, save_model
 from fgloc_training import evaluate as evaluation

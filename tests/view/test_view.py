@@ -16,8 +16,9 @@ import fgloc
 from fgloc.cli import app
 from fgloc.config import Config, load_config
 from fgloc.errors import OutputError
+from fgloc.runner import RunResult
 from fgloc.sensors.maps import load_map
-from fgloc.types import Decision, Estimate, Finding, Mode, RunResult, Trajectory
+from fgloc.types import Decision, Estimate, Finding, Mode, Trajectory
 from fgloc.view import scene as scenes
 from fgloc.view.page import Page, PrivatePage
 from fgloc.view.scene import write_rrd

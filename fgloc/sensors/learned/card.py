@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from fgloc.config import Section
-from fgloc.sensors.base import MotionRole, Mounting, Signal, WheelJoints
+from fgloc.sensors.base import Mounting, Signal, WheelJoints
 from fgloc.sensors.gyro import CHANNELS as _GYRO_CHANNELS
 from fgloc.sensors.settings import NoiseDensity
 from fgloc.sensors.wheels.sensor import CHANNELS as _WHEEL_CHANNELS
@@ -247,7 +247,6 @@ class Signals:
     def named(self, name: str) -> Signal | None:
         """By the name that a card's inputs use."""
         return self.by_name.get(name)
-
 
 
 class SignalReader:

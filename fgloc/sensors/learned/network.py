@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fgloc import se2
 from fgloc.errors import CovarianceError, ModelError
-from fgloc.sensors.base import MotionRole, Signal
+from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Signals
 from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray, MotionMeasurement

@@ -25,12 +25,9 @@ from fgloc.sensors.base import (
     BuiltIn,
     FoundRow,
     InstallationState,
-    ModelRole,
     MotionInstallation,
-    MotionRole,
     Parameter,
     Rank,
-    with_values,
 )
 from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard, SignalReader
 from fgloc.sensors.learned.network import (
@@ -43,7 +40,7 @@ from fgloc.sensors.learned.network import (
     RecurrentNetwork,
     VelocityModel,
 )
-from fgloc.sensors.settings import MotionConfig, shipped_name
+from fgloc.sensors.settings import MotionConfig
 from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Setting, Step
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from fgloc.sensors.markers.detector import fitting_dictionary
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.sensors.base import (
     SENSOR,
@@ -20,23 +19,21 @@ from fgloc.sensors.base import (
     FirstLook,
     FirstSection,
     FirstSettings,
-    RawLandmarksRole,
     Stream,
     When,
     byte_array,
-    with_values,
 )
 from fgloc.sensors.cameras import marker_pose_candidates, marker_pose_cov, pinhole, undistort_points
 from fgloc.sensors.checks import FieldChecks, RawChecks, SightingsChecks
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.landmarks import planar_yaw
+from fgloc.sensors.markers.detector import fitting_dictionary
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners, decode
 from fgloc.types import (
     Camera,
     Event,
     FloatArray,
     Landmark,
-    LandmarkMap,
     LandmarkSighting,
     PixelMeasurement,
     RawEvent,
@@ -44,7 +41,6 @@ from fgloc.types import (
 )
 
 if TYPE_CHECKING:
-    from fgloc.config import Config, Section
     from fgloc.sensors.landmarks import SightingContext
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fgloc.sensors.wheels import failures
-from fgloc.sensors.wheels.events import from_odometry, from_joints, odometry_validator, joints_validator
 from fgloc.config import Config
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import (
@@ -21,11 +19,7 @@ from fgloc.sensors.base import (
     FirstLook,
     FirstSection,
     FirstSettings,
-    Joined,
-    MotionRole,
     Mounting,
-    OdometerErrors,
-    OdometerRole,
     RawMistake,
     Signal,
     Stream,
@@ -34,14 +28,20 @@ from fgloc.sensors.base import (
     seconds,
     with_values,
 )
-from fgloc.sensors.wheels.events import JointsEvent, OdometryChecks, OdometryEvent
-from fgloc.sensors.wheels.motion import INSTALLATION
+from fgloc.sensors.wheels import failures
+from fgloc.sensors.wheels.events import (
+    JointsEvent,
+    OdometryChecks,
+    OdometryEvent,
+    from_joints,
+    from_odometry,
+    joints_validator,
+    odometry_validator,
+)
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
-    from fgloc.config import Section
-    from fgloc.sensors.failures import Carriage
     from fgloc.sensors.settings import WheelsConfig
 
 
