@@ -59,7 +59,7 @@ class Assembly:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the user should know of the parts so far."""
+        """Sentences for the user about the parts so far."""
         parts = (self.gate, self.detections, self.stepper, self.wheels)
         return (
             *self.notes,

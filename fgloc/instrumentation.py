@@ -44,7 +44,7 @@ _listener: ContextVar[Listener | None] = ContextVar("fgloc_progress", default=No
 
 @contextmanager
 def told_to(listener: Listener | None) -> Iterator[None]:
-    """Within the block, work of this thread is told to the listener."""
+    """Report progress of this thread's work to the listener inside the block."""
     token = _listener.set(listener)
     try:
         yield
@@ -53,19 +53,19 @@ def told_to(listener: Listener | None) -> Iterator[None]:
 
 
 def tell(label: str, done: float, total: float | None, unit: str = "", detail: str = "") -> None:
-    """Tell how far it is; cheap where nobody listens."""
+    """Report progress; cheap where nobody listens."""
     if (listener := _listener.get()) is not None:
         listener(Advance(label, done, total, unit, detail))
 
 
 def end(label: str) -> None:
-    """Tell that it is done or given up."""
+    """Report that the work is done or given up."""
     if (listener := _listener.get()) is not None:
         listener(Advance(label, 0, None, ended=True))
 
 
 def counted(items: Iterable[T], label: str, total: float | None = None, unit: str = "") -> Iterator[T]:
-    """The items, each of which is told when it is done."""
+    """Iterate over the items and report each one that is done."""
     try:
         for done, item in enumerate(items, 1):
             yield item

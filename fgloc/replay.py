@@ -47,7 +47,7 @@ EventFilter = Callable[[Iterator[Event]], Iterator[Event]]
 
 
 class RunOptions(TypedDict, total=False):
-    """What `run` takes besides, by keyword.
+    """Further options of `run`, by keyword.
 
     Attributes:
         pace: replay at this multiple of real time; None: as fast as possible.
@@ -161,7 +161,7 @@ class Replay:
         options: RunOptions,
         causal: bool = False,
     ) -> None:
-        """Take the parts of a run; ``causal``: what is given is what was known then, and is checked on the way."""
+        """Use the parts of a run; ``causal``: estimates are those known at the time, checked on the way."""
         self._parts = parts
         self._detector = detector
         self._causal = causal
@@ -316,7 +316,7 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
 
 
 def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:
-    """Of each keyframe; None: the floor is flat."""
+    """Ground of each keyframe; None: the floor is flat."""
     if result.ground is None or result.ground_covs is None:
         yield from (None for _ in solver.frames)
         return

@@ -1,4 +1,4 @@
-"""All that came out of a run: what evaluation, displays and exports are made of."""
+"""Data of a whole run: evaluation, displays and exports are computed from it."""
 
 from __future__ import annotations
 

@@ -26,14 +26,14 @@ from fgloc.results import RunData
 from fgloc.sensors import registry
 from fgloc.types import Estimate, Finding, FloatArray, Ground, Severity, Trajectory, note, ordered
 
-# --- What a replay found besides poses, and the sentences that say so -------------------------------------------------
+# --- Results besides poses, and their sentences -------------------------------------------------
 
 _GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the replay found besides poses: read while the recording is open.
+    """Results of the replay besides poses, collected while the recording is open.
 
     Attributes:
         roles: topics by role.
@@ -47,7 +47,7 @@ class Outcome:
 
     @classmethod
     def of(cls, recording: Recording, parts: Assembly, replay: Replay, wrong: Mistakes) -> Outcome:
-        """Collect it from the parts of a run."""
+        """Collect the outcome from the parts of a run."""
         hints = _hints(recording, parts, replay)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
@@ -77,7 +77,7 @@ class Outcome:
 
 
 def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
-    """Why nothing was received, or no marker was found."""
+    """Reasons why nothing was received, or no marker was found."""
     hints = [*replay.activity.missing()]
     if parts.detector is not None and not any(parts.localizer.counts[kind] for kind in registry.detected_kinds()):
         hints = [*parts.detector.hints(recording)[0], *hints]
@@ -190,7 +190,7 @@ def _findings(
     of_constants: Sequence[Finding],
     sane: Sequence[Finding],
 ) -> tuple[Finding, ...]:
-    """What is wrong and what the user should know, the gravest first."""
+    """Findings of the whole run, the gravest first."""
     return ordered(
         [
             *outcome.findings,

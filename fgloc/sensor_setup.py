@@ -48,7 +48,7 @@ class HasFrames(Protocol):
 
 
 class StreamFacts(HasFrames, Protocol):
-    """What is known of a stream before it is run."""
+    """Facts of a stream that are known before it is run."""
 
     @property
     def name(self) -> str:
@@ -87,7 +87,7 @@ class RecordingFacts:
     camera: Camera | None = None
 
     def __init__(self, recording: Recording) -> None:
-        """Take an opened recording."""
+        """Use an opened recording."""
         self._recording = recording
         self.name = str(recording.path)
         self.roles: Mapping[Role, str] = recording.roles
@@ -109,7 +109,7 @@ class RecordingFacts:
 
     @cached_property
     def image_size(self) -> tuple[int, int] | None:
-        """Of the first image near the beginning that can be decoded."""
+        """Width and height of the first image near the beginning that can be decoded."""
         some = (event for _, event in zip(range(_SCAN_EVENTS), self._recording.events(), strict=False))
         return first_size(some)
 

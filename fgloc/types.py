@@ -41,11 +41,11 @@ class Event:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionEvent(Event):
-    """Of a source of motion: it holds over time and is integrated over steps, at its own stamps."""
+    """Event of a motion source: it holds over time and is integrated over steps, at its own stamps."""
 
     @property
     def publisher(self) -> tuple[str, ...]:
-        """What tells apart those who share the topic, each with a clock of its own."""
+        """Identity among the publishers that share the topic, each with a clock of its own."""
         return ()
 
     @property
@@ -184,7 +184,7 @@ M = TypeVar("M", bound=MotionEvent)
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)  # sensors remember what they made of it
 class Step:
-    """All that was received between two keyframes, gated and in order of stamp.
+    """Events received between two keyframes, validated and in order of stamp.
 
     Each tuple of ``motion`` holds what is needed to integrate over ``[start_ns, stamp_ns]``: the events inside, the
     last one at or before the start, and the first one at or after the end where known. Control inputs reach back
@@ -219,7 +219,7 @@ class Step:
 
     @property
     def inertial(self) -> tuple[InertialEvent, ...]:
-        """Of the inertial unit."""
+        """Events of the inertial unit."""
         return self.of(InertialEvent)
 
 
@@ -305,7 +305,7 @@ _LEVEL = np.zeros(2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialReading:
-    """What an inertial unit measures of one step on uneven ground, in the axes of the base."""
+    """Measurement of an inertial unit over one step on uneven ground, in the axes of the base."""
 
     turn: FloatArray  # (2,) rad: about x and y over the step, with the bias in it
     turn_variance: float  # rad², of each
@@ -330,7 +330,7 @@ class MotionMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionReadings:
-    """What each motion source measured of one step, as if it were alone; None where it has no data."""
+    """Motion over one step by each source, as if it were alone; None where it has no data."""
 
     wheels: MotionMeasurement | None = None
     learned: MotionMeasurement | None = None
@@ -379,7 +379,7 @@ class PointMeasurement:
 
     @property
     def point(self) -> FloatArray:
-        """Where it is in the base frame ``(2,)`` [m]."""
+        """Position in the base frame ``(2,)`` [m]."""
         return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
 
     @property
@@ -408,7 +408,7 @@ class FrameMeasurement:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseMeasurement(ABC):
-    """What a registered sensor measured, as a function of the robot's pose; each kind of it is a subclass.
+    """Measurement of a registered sensor, as a function of the robot's pose; each kind is a subclass.
 
     A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
     the first pose are made of that.
@@ -432,11 +432,11 @@ class PoseMeasurement(ABC):
         """
 
     def places(self) -> Iterable[FloatArray]:
-        """Where in the map ``(2,)`` the robot may be, roughly: where the search for its first pose begins."""
+        """Rough positions ``(2,)`` [m] of the robot in the map, from which the search for its first pose begins."""
         return ()
 
     def alternatives(self, predicted: FloatArray) -> Sequence[PoseMeasurement]:
-        """What else the reading may mean, most probable first: tried in turn where the chi-square gate refuses it.
+        """Other interpretations of the reading, most probable first, tried where the chi-square gate refuses it.
 
         Args:
             predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.
@@ -454,7 +454,7 @@ class PoseMeasurement(ABC):
         return -2 - self.target
 
     def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `residual_at`, by the pose at the keyframe."""
+        """Residual and Jacobian of `residual_at`, by the pose at the keyframe."""
         residual, J = self.residual_at(se2.compose(pose, self.T_keyframe_then))
         return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
 
@@ -528,7 +528,7 @@ def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 class Mode(StrEnum):
-    """How the estimate came about."""
+    """State of the tracker when the estimate was made."""
 
     OK = "OK"
     UNCONFIRMED = "UNCONFIRMED"  # by sightings that nothing checks yet: before the first pose is certain
@@ -538,7 +538,7 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What became of one measurement, or of the pose: a row of ``steps.csv``."""
+    """Decision on one measurement, or on the pose: a row of ``steps.csv``."""
 
     step: int
     stamp_ns: int
@@ -557,7 +557,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """What makes a planar pose one in space, where the ground is uneven.
+    """Height, roll and pitch that complete a planar pose where the ground is uneven.
 
     The base's rotation is ``Rz(yaw) Ry(pitch) Rx(roll)``.
     """
@@ -605,7 +605,7 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def ground_at(self, i: int) -> Ground | None:
-        """What pose ``i`` has beside the planar one; None: the floor is flat."""
+        """Height, roll and pitch of pose ``i``; None: the floor is flat."""
         if self.ground is None or self.ground_covs is None:
             return None
         z, roll, pitch = self.ground[i].tolist()
@@ -662,7 +662,7 @@ class Setting:
 
     @property
     def off(self) -> float:
-        """How far what was given and what the measurements alone give are apart, in sigmas of both.
+        """Difference of the given value and that of the measurements alone, in sigmas of both.
 
         What was found lies between the two, by their sigmas; its expected square distance from the given value is the
         difference of the variances.

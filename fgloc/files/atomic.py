@@ -226,7 +226,7 @@ def _exchanged(stage: Path, out: Path, own: Sequence[str]) -> bool:
 
 
 def _link(source: Path, target: Path) -> None:
-    """The same file, or a folder of the same files, under another name."""
+    """Link a file, or a folder of the same files, under another name."""
     if source.is_symlink() or not source.is_dir():
         os.link(source, target, follow_symlinks=False)
         return
@@ -261,7 +261,7 @@ def _move(source: Path, target: Path, names: Sequence[str]) -> None:
 
 
 def _names(folder: Path) -> list[str]:
-    """What a folder holds, without temporary folders; nothing if there is none."""
+    """Names in a folder, without temporary folders; none if there is no folder."""
     try:
         return sorted(n for n in os.listdir(folder) if n not in (_OLD, _MOVED) and not n.startswith(_PARTIAL))
     except (FileNotFoundError, NotADirectoryError):

@@ -46,17 +46,17 @@ class Item:
 
     @property
     def node(self) -> yaml.Node:
-        """What the parser made of it."""
+        """YAML node of the value."""
         return self._node
 
     @property
     def is_mapping(self) -> bool:
-        """Whether it is keys and values."""
+        """Whether the YAML node is a mapping."""
         return isinstance(self._node, yaml.MappingNode)
 
     @property
     def is_sequence(self) -> bool:
-        """Whether it is a list."""
+        """Whether the YAML node is a sequence."""
         return isinstance(self._node, yaml.SequenceNode)
 
     def fail(self, message: str) -> FglocError:

@@ -108,7 +108,7 @@ class Settings:
 
 
 def sentences(error: ValidationError, model: type[BaseModel]) -> list[str]:
-    """What is wrong with each value, the first ones of many: its key, why, what it is, what may have been meant."""
+    """One sentence for each wrong value (the first ones of many): key, reason, value, likely correction."""
     schema: dict[str, Any] | None = None
     found = []
     for e in _own(error)[:_MOST_SHOWN]:
@@ -139,7 +139,7 @@ def _meant(word: str, known: Sequence[str]) -> str:
 
 
 def _complaint(e: ErrorDetails) -> str:
-    """What is wrong with a value, in the words of this program where it is not the model's own."""
+    """Reason why a value is refused, in words that do not depend on pydantic."""
     kind, value, context = e["type"], e["input"], e.get("ctx", {})
     if kind == "missing":
         return "is missing"

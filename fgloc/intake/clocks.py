@@ -22,7 +22,7 @@ _MAX_UNCONFIRMED = 1024
 
 
 class ClockVerdict(Enum):
-    """What an event is."""
+    """Verdict on the stamp of an event."""
 
     FITS = "belongs to the running clock"
     STARTS = "the first of a new segment: the clock has jumped"
@@ -139,7 +139,7 @@ class ClockNotes:
 
     @property
     def sentences(self) -> Iterator[str]:
-        """What the user should know so far."""
+        """Notes for the user so far, one sentence each."""
         yield from self._jumps
         if self._jump_count > _NAMED_JUMPS:
             yield f"the clock jumped {self._jump_count} times in all"
@@ -174,7 +174,7 @@ def source_of(event: Event) -> Source:
 
 @dataclass(slots=True)
 class _Clock:
-    """What is known of one source's stamps."""
+    """Delay and offset of one source's stamps."""
 
     delay_ns: float  # usual receive time less stamp
     received_ns: int  # of the newest message
@@ -182,16 +182,16 @@ class _Clock:
     held: list[Event] = field(default_factory=list)  # with another delay than usual
 
     def change_ns(self, event: Event) -> int:
-        """How much later than usual a message seems."""
+        """Delay of a message beyond the usual one [ns]."""
         return _delay(event) - self.offset_ns - round(self.delay_ns)
 
     def begin_anew(self, event: Event) -> None:
-        """Take its delay for the usual one."""
+        """Make the delay of this event the usual one."""
         self.delay_ns, self.offset_ns = _delay(event), 0
 
 
 class TopicClocks:
-    """Tells the reset of one topic's clock from a jump of the clock that all share.
+    """Distinguishes the reset of one topic's clock from a jump of the clock that all share.
 
     A message whose delay (receive time less stamp) is far from its topic's usual one is held back until the next
     messages tell: the topic is alone with it (its stamps are corrected from then on), other topics have jumped too
@@ -200,14 +200,14 @@ class TopicClocks:
     """
 
     def __init__(self) -> None:
-        """Nothing has come in."""
+        """Start without any source."""
         self._clocks: dict[Source, _Clock] = {}
         self._jump_ns: int | None = None  # how much later than before the last common jump made messages seem
         self._resets: dict[str, tuple[int, int]] = {}  # by topic: how often, offset of the last [ns]
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
+        """Notes for the user so far, one sentence each."""
         return tuple(
             f"{topic}: its clock alone was reset {count} time(s), as when its publisher is restarted; its stamps are "
             f"corrected by {offset_ns * 1e-9:+.3f} s, to its usual delay"
@@ -240,7 +240,7 @@ class TopicClocks:
         yield from self.flush()
 
     def flush(self) -> list[Event]:
-        """What is still held back: nothing more will come."""
+        """Events that are still held back, at the end of the stream."""
         held = [e for clock in self._clocks.values() for e in clock.held]
         return sorted(held, key=lambda e: e.received_ns)
 

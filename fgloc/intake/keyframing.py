@@ -84,7 +84,7 @@ class Peak:
     since_ns: int = 0
 
     def add(self, value_ns: int, now_ns: int) -> None:
-        """Take in a value at a time [ns]."""
+        """Add a value at a time [ns]."""
         if now_ns - self.since_ns > _REMEMBERED_NS:
             twice = now_ns - self.since_ns > 2 * _REMEMBERED_NS
             self.before_ns, self.value_ns, self.since_ns = 0 if twice else self.value_ns, 0, now_ns
@@ -92,7 +92,7 @@ class Peak:
 
     @property
     def ns(self) -> int:
-        """That value [ns]."""
+        """Largest value remembered [ns]."""
         return max(self.value_ns, self.before_ns)
 
 
@@ -110,7 +110,7 @@ class Punctuality:
 
     @property
     def patience_ns(self) -> int:
-        """How long, by the newest stamp of all, its word is waited for."""
+        """Time for which the topic is waited for, by the newest stamp of all [ns]."""
         return max(self.least_ns, min(5 * self.late_ns.ns // 4, MAX_PATIENCE_NS))
 
     @property
@@ -147,7 +147,7 @@ class KeyframeBuilder:
     """
 
     def __init__(self, config: KeyframesConfig, gate: GateConfig, lag_s: float, streams: Iterable[Stream] = ()) -> None:
-        """Set up.
+        """Start without events.
 
         Args:
             config: when keyframes are made.
@@ -193,7 +193,7 @@ class KeyframeBuilder:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
+        """Notes for the user so far, one sentence each."""
         notes = [*self._clock_notes.sentences]
         for topic, source in self._sources.items():
             if source.patience_ns > self._reorder_ns:
@@ -204,7 +204,7 @@ class KeyframeBuilder:
         return tuple(notes)
 
     def push(self, event: Event) -> list[Step]:
-        """Take the next event, in order of receipt, and return the steps that it completes (mostly none)."""
+        """Add the next event, in order of receipt, and return the steps that it completes (mostly none)."""
         if not isinstance(event, MotionEvent | SightingsEvent) and type(event) not in self._streams:
             return []
         return self._take(self._clock.judge(event))
@@ -279,7 +279,7 @@ class KeyframeBuilder:
                 insort(self._pending, event, key=lambda e: e.stamp_ns)
 
     def _name(self, event: Event) -> str:
-        """Of an event's role, for the rejections."""
+        """Name of an event's role, for the rejections."""
         return self._roles[type(event)]
 
     def _stray(self, event: Event) -> None:
@@ -349,7 +349,7 @@ class KeyframeBuilder:
         )
 
     def _waited(self, stamp_ns: int) -> int:
-        """How long ago, by receive times, this stamp was reached: after a stall, topics come one after another."""
+        """Time since this stamp was reached [ns], by receive times: after a stall, topics come one after another."""
         while len(self._reached) > 1 and self._reached[0][0] < stamp_ns:
             self._reached.popleft()
         return self._received_ns - self._reached[0][1] if self._reached else 0
@@ -384,7 +384,7 @@ class KeyframeBuilder:
         return step
 
     def _back_ns(self, kind: type[MotionEvent]) -> int:
-        """How far events are kept from before a step."""
+        """Span before a step for which events are kept [ns]."""
         return self._history_ns if issubclass(kind, ControlEvent) else 0
 
     def _finish(self) -> list[Step]:

@@ -22,7 +22,7 @@ _LEAST_SCALE = 1e-3  # of a rate: no unit of angle is smaller
 
 @dataclass(slots=True)
 class _Topic:
-    """What is remembered of one topic."""
+    """State of one topic: stamps and gaps."""
 
     newest_ns: int
     recent: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
@@ -69,7 +69,7 @@ class EventValidator:
     def __init__(
         self, config: GateConfig, known_ids: Collection[int] | None = None, streams: Iterable[Stream] = ()
     ) -> None:
-        """Set up.
+        """Start without events.
 
         Args:
             config: bounds.
@@ -88,7 +88,7 @@ class EventValidator:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each; nothing is said twice."""
+        """Notes for the user so far, one sentence each, without repetitions."""
         notes = [*self._notes, *self._parts.notes]
         for reason in sorted(r for r in self.rejections if r.endswith("yaw_rate_bound")):
             bad, seen = self.rejections[reason], self._seen[reason.split(".")[0]]

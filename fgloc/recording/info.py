@@ -38,7 +38,7 @@ _DRIFT_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class TopicReport:
-    """Timing of one topic. Times are from the recording's start; None where there is nothing to tell."""
+    """Timing of one topic. Times are from the recording's start; None: not known."""
 
     name: str
     message_type: str
@@ -134,7 +134,7 @@ def _stamped(
 
 
 def _clocks(report: TopicReport, role: Role, delays: FloatArray, jumps: bool) -> list[str]:
-    """What is wrong with the header stamps as a whole."""
+    """Faults of a topic's header stamps as a whole, one sentence each."""
     topic, found = report.name, []
     remedy = f"recording.received_stamps: [{role}] takes the receive times instead"
     if report.zero_stamps:
@@ -171,7 +171,7 @@ def plural(n: int, noun: str) -> str:
 
 
 def int64(values: array[int]) -> NDArray[np.int64]:
-    """As an array."""
+    """Convert to an int64 array."""
     return np.array(values, dtype=np.int64)
 
 
@@ -185,12 +185,12 @@ class TruthChecks:
         self._rows = Table(7)
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, TruthEvent)
         self._rows.add(*event.position, *event.orientation)
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         rows = self._rows.array()
         found = []
         finite = finite_rows(rows)
@@ -220,7 +220,7 @@ class CameraInfoChecks:
         self._calibrations: set[bytes] = set()
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, CameraInfoEvent)
         self._count += 1
         self.size = event.width, event.height
@@ -231,7 +231,7 @@ class CameraInfoChecks:
             self._calibrations.add(event.K.tobytes() + event.D.tobytes())
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         found = []
         if self._zero:
             found.append(
@@ -272,7 +272,7 @@ _NO_PLACE = frozenset(BUILT_IN_ROLES) - {"image", "sightings"}  # roles that do 
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """All that `inspect` found."""
+    """Result of `inspect`."""
 
     path: Path
     kind: str
@@ -293,7 +293,7 @@ class RecordingInfo:
 
     @property
     def exit_code(self) -> int:
-        """Of ``fgloc info``, as a run would end: 1 if none is possible, 3 if its poses would be wrong, else 0."""
+        """Exit code of ``fgloc info``: 1 if no run is possible, 3 if its poses would be wrong, else 0."""
         return 1 if self.problems else 3 if any(f.severity is Severity.ERROR for f in self.found) else 0
 
 
@@ -310,7 +310,7 @@ def inspect(path: Path, config: Config) -> RecordingInfo:
 def inspect_recording(
     recording: Recording, config: Config, watch: Callable[[Event], object] | None = None
 ) -> RecordingInfo:
-    """As `inspect`, of an opened recording; `watch` is called with each event that is decoded, tf's excepted."""
+    """Inspect an opened recording; `watch` is called with each event that is decoded, tf's excepted."""
     times, checks, child_frame = _read_through(recording, watch)
     start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
     undecodable = dict(recording.undecodable)
@@ -372,7 +372,7 @@ def _read_through(
 
 
 def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector], child_frame: str) -> list[str]:
-    """What is missing for a run."""
+    """Roles that a run needs and the recording lacks, one sentence each."""
     roles, found = recording.roles, []
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
@@ -401,7 +401,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
 
 
 def _unused(recording: Recording) -> list[str]:
-    """Sentences on topics that tell where the robot is, and that nothing here reads."""
+    """Sentences on topics that hold the robot's position, and that nothing here reads."""
     return [
         f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}."
         for t in recording.topics

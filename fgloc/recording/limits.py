@@ -57,7 +57,7 @@ _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
 
 
 def allowed_bytes(path: Path) -> int:
-    """How many bytes a pass over a file, or over a folder's files, may deliver."""
+    """Number of bytes that a pass over a file, or over a folder's files, may deliver."""
     files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
     return _FREE_BYTES + _RATIO * sum(file.stat().st_size for file in files)
 
@@ -174,7 +174,7 @@ def opening(budget: Budget) -> Iterator[None]:
 
 
 def _chunk(kind: str, data: bytes, size: int) -> bytes:
-    """What rosbags calls for a chunk that says it holds ``size`` bytes."""
+    """Decompress a chunk that claims to hold ``size`` bytes, in place of rosbags' own function."""
     if (budget := _opening.get()) is not None:
         budget.check(size)
         budget.spend(size)
@@ -223,7 +223,7 @@ def check_sqlite(path: Path) -> None:
 
 
 def check_tables(database: sqlite3.Connection, path: Path) -> None:
-    """As `check_sqlite`, of an opened database."""
+    """Check an opened database like `check_sqlite`."""
     database.text_factory = lambda raw: raw.decode(errors="replace")
     try:
         rows = database.execute("SELECT type, name, sql FROM sqlite_master LIMIT 1000").fetchall()

@@ -36,7 +36,7 @@ _Timed = tuple[int, str, dict[str, Any]]  # stamp [ns], topic, message
 
 
 class Run(Protocol):
-    """What is exported of a run: `fgloc.RunResult` has it, and what `fgloc.read_results` reads."""
+    """Parts of a run that are exported: `fgloc.RunResult` has them, and so has the result of `fgloc.read_results`."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -101,7 +101,7 @@ def _all(run: Run, base_frame: str) -> Iterator[_Timed]:
 
 
 def _estimates(run: Run, base_frame: str) -> Iterator[_Timed]:
-    """What each keyframe says, and once a second or when the mode changes the state."""
+    """Pose of each keyframe; tracker state at 1 Hz and on mode changes."""
     stamps, poses, covs = run.trajectory.stamps_ns.tolist(), run.trajectory.poses, run.trajectory.covs
     assert covs is not None
     last_mode, told_ns = None, 0

@@ -76,7 +76,7 @@ class DefinitionError(Exception):
 
 
 def plain_idl(text: str) -> str:
-    """IDL without comments, includes and annotations, which tell nothing of the serialization.
+    """IDL without comments, includes and annotations, which do not affect the serialization.
 
     Raises:
         DefinitionError: what is left has parentheses, or sequences nested deeply.
@@ -369,7 +369,7 @@ class Messages:
 
 
 def ros2_type(message_type: str) -> str:
-    """What ROS 2 calls a recorded message type."""
+    """ROS 2's name of a recorded message type."""
     return _RENAMED.get(message_type, message_type)
 
 

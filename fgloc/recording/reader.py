@@ -196,7 +196,7 @@ def _given_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> tuple[dic
 
 
 def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
-    """That topics would fit by type but not by name; empty if there is none, or the role is not told by names."""
+    """Note on topics that fit by type but not by name; empty if there are none, or names do not count for the role."""
     if role not in ("image", "truth"):
         return ""
     fitting = converters_of(role).keys() - converters_of("odometry").keys()
@@ -222,7 +222,7 @@ def _one_of_images_and_sightings(roles: dict[Role, str], config: TopicsConfig) -
 
 
 def _empty(role: Role, topics: Iterable[TopicInfo]) -> str:
-    """What a topic without messages, for a role that no other plays, is the trace of; empty if there is none."""
+    """Note on topics without messages that could play an unfilled role; empty if there are none."""
     names = [topic.name for topic in topics if topic.count == 0 and role != "truth" and _fits(role, topic)]
     if not names:
         return ""
@@ -276,7 +276,7 @@ def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str |
 
 
 def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
-    """What is wrong with a configured topic; empty if nothing."""
+    """Reason why a configured topic does not fit; empty if it fits."""
     types = converters_of(role)
     found = next((topic for topic in topics if topic.name == given), None)
     fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
@@ -383,7 +383,7 @@ class Recording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each. Damage is noted when reading meets it."""
+        """Notes for the user, one sentence each. Damage is noted when reading meets it."""
         return (*self._storage.notes, *self._notes)
 
     @property

@@ -37,7 +37,7 @@ _MAX_BYTES = 16 * 1024 * 1024
 
 @dataclass(frozen=True, slots=True)
 class BagMetadata:
-    """What of ``metadata.yaml`` is needed to find and to judge the storage files."""
+    """Content of ``metadata.yaml`` that finds and judges the storage files."""
 
     files: tuple[Path, ...]
     compressed: str  # by rosbag2 itself: "file", "message", or "" (also where the storage format compresses)

@@ -64,7 +64,7 @@ class TruthTrack:
         self._poses = array("d")
 
     def add(self, event: TruthEvent) -> None:
-        """Take in one pose."""
+        """Add one pose."""
         stamp = event.stamp_ns
         if stamp >= self._newest_ns - self._back_ns:
             self._newest_ns, self._set_back_ns = max(self._newest_ns, stamp), 0
