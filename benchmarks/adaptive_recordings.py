@@ -33,9 +33,8 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners
 from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
-from fgloc_datasets.sim.record import describe, is_recorded, robot_settings
+from fgloc_datasets.sim.record import BUNDLED, Job, describe, is_recorded, load_suite, record_suite, robot_settings
 from fgloc_datasets.sim.scenario import Scenario
-from fgloc_datasets.sim.suite import BUNDLED, Job, load_suite, record_suite
 
 Split = Literal["train", "validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]

@@ -8,7 +8,7 @@ deviations; a value ``a_over_b`` is the mean of a over the mean of b, its spread
 pose that guided the robot, and how long it drove, without the learned motion: an uncertain robot slows down and waits.
 ``reached``: share of the waypoints that the robot has come within 10 cm of.
 
-With ``--corners`` the camera sends corners with a detector's noise (`fgloc_datasets.sim.corners`); nothing is rendered.
+With ``--corners`` the camera sends corners with a detector's noise (`fgloc_datasets.sim.camera`); nothing is rendered.
 Cases (`fgloc_datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 16 to 36 s, on ice; onewheel, the left encoder counts nothing in that
 time; moved, a marker is 0.5 m from where the map has it. Rows ``slope``, ``rough`` and ``flat.uneven_over_flat`` are

@@ -34,7 +34,7 @@ from fgloc.sensors.learned.network import MotionModel
 from fgloc.sensors.learned.sensor import load_model, model_of, read_model, save_model
 from fgloc.types import ControlEvent, FloatArray
 from fgloc_datasets import mrclam
-from fgloc_training.adapt import adapted
+from fgloc_training.calibrate import adapted
 from fgloc_training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from fgloc_training.data import Run, cut, make_run
 from fgloc_training.evaluate import STEP_S, Figures, evaluate

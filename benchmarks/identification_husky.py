@@ -25,10 +25,9 @@ from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import Event, TruthEvent
 from fgloc_datasets import drive
 from fgloc_training.config import CalibrationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc_training.data import Run, make_run
+from fgloc_training.data import Run, SensorRecord, make_run
 from fgloc_training.evaluate import evaluate
 from fgloc_training.rollouts import Rollout, roll_model, roll_wheels
-from fgloc_training.sensor_record import SensorRecord
 from fgloc_training.train import train
 
 _STEPS = {"train": range(120), "validation": range(120, 150), "test": range(150, 201)}  # of the calibration

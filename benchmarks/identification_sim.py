@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.common import Row
 from fgloc.sensors.learned.card import Input, Split
 from fgloc.sensors.learned.sensor import load_model
-from fgloc_datasets.sim.suite import BUNDLED, Job, jobs, load_suite, record_suite
+from fgloc_datasets.sim.record import BUNDLED, Job, jobs, load_suite, record_suite
 from fgloc_training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
 from fgloc_training.data import Run, load_run
 from fgloc_training.evaluate import STEP_S, evaluate

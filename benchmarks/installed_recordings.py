@@ -2,7 +2,7 @@
 
 They are kept as those of `benchmarks.adaptive_recordings` are, whose floors and control functions they take, with seeds
 of their own that no setting was chosen on. In an ``installed`` recording every error of a careful installation is drawn
-by the seed (`fgloc_datasets.sim.installation`), and the floor's own error of the wheels is left out; ``map5mm`` errs in
+by the seed (`fgloc_datasets.sim.scenario`), and the floor's own error of the wheels is left out; ``map5mm`` errs in
 the places of the markers only; ``perfect`` in nothing. The last two keep the wheels of `benchmarks.adaptive`.
 """
 
@@ -14,8 +14,7 @@ from typing import Literal
 
 from benchmarks import adaptive_recordings
 from benchmarks.adaptive_recordings import Change, Floor, Recorded, Split
-from fgloc_datasets.sim.installation import Installation
-from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.scenario import Installation, Scenario
 
 Variant = Literal["installed", "map5mm", "perfect", "found"]
 SEEDS: dict[Split, tuple[int, ...]] = {

@@ -141,7 +141,7 @@ def _simulation(place: Path) -> Writer:
 
 
 def _training(place: Path) -> Writer:
-    from fgloc_training.session import Reporter, train_models
+    from fgloc_training.train import Reporter, train_models
     from tests.support.synthetic_robot import write_bag
 
     out = place / "train" / "out"

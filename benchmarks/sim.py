@@ -22,8 +22,6 @@ from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.sim.camera import RenderError, frames, pose_at
-from fgloc_datasets.sim.floor import Floor
-from fgloc_datasets.sim.mjcf import camera_rotation, intrinsics
 from fgloc_datasets.sim.physics import (
     Log,
     Scene,
@@ -34,10 +32,10 @@ from fgloc_datasets.sim.physics import (
     slipping,
     wheel_twist,
 )
-from fgloc_datasets.sim.record import record
-from fgloc_datasets.sim.scenario import Camera, Control, Robot, Scenario, World
+from fgloc_datasets.sim.record import BUNDLED, jobs, load_suite, record, record_suite
+from fgloc_datasets.sim.scenario import Camera, Control, Floor, Robot, Scenario, World
+from fgloc_datasets.sim.scene import camera_rotation, intrinsics
 from fgloc_datasets.sim.sensors import streams
-from fgloc_datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
 
 _HALL = World(size_m=(30.0, 30.0))
 _NEAR_M = 3.0

@@ -1,14 +1,258 @@
-"""Writing standard rosbag2 recordings: one method per kind of message, used by the converters and the simulator."""
+"""Writer of standard rosbag2 recordings: one method per kind of message, for the converters and the simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from fgloc_datasets.landmark_messages import LandmarkMessages
-from fgloc_datasets.message_writer import flat_cov, xyz_fields
+from fgloc.recording.messages import default_typestore
+
+# --- Messages ---------------------------------------------------------------------------------------------------------
+
+Tap = Callable[[str, str, Any, int], None]
+
+
+class MessageWriter:
+    """Writes any message of the typestore. Stamps are integer nanoseconds; ``received_ns`` defaults to the stamp."""
+
+    def __init__(
+        self, path: Path, storage: str = "mcap", overwrite: bool = False, compress: bool = False, tap: Tap | None = None
+    ) -> None:
+        """Open a new bag folder.
+
+        Args:
+            path: folder to be made.
+            storage: "mcap" or "sqlite3".
+            overwrite: replace an existing bag folder (one that holds a metadata.yaml).
+            compress: zstd chunks, which readers of MCAP undo by themselves; MCAP only.
+            tap: given every message as it is read from the bag, with its topic, type and receive time [ns].
+
+        Raises:
+            FileExistsError: the folder exists and is not to be replaced.
+        """
+        if path.exists():
+            if not (overwrite and (path / "metadata.yaml").is_file()):
+                raise FileExistsError(f"{path} exists; give another folder or remove it")
+            for file in path.iterdir():
+                file.unlink()
+            path.rmdir()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._store = default_typestore()
+        plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
+        self._writer = Writer(path, version=9, storage_plugin=plugin)
+        if compress:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._connections: dict[str, Connection] = {}
+        self._tap = tap
+
+    def __enter__(self) -> Self:
+        self._writer.open()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._writer.close()
+
+    def copy(self, topic: str, message_type: str, raw: bytes | memoryview, received_ns: int) -> None:
+        """Write a message that is already serialized (CDR); its type must be in the typestore."""
+        self._writer.write(self._connection(topic, message_type), received_ns, raw)
+
+    def knows(self, message_type: str) -> bool:
+        """Whether the typestore defines a type, so that a message of it can be written."""
+        return message_type in self._store.types
+
+    def write(self, topic: str, message_type: str, message: Any, received_ns: int) -> None:
+        """Write any message of the typestore."""
+        raw = self._store.serialize_cdr(message, message_type)
+        self._writer.write(self._connection(topic, message_type), received_ns, raw)
+        if self._tap is not None:
+            self._tap(topic, message_type, self._store.deserialize_cdr(raw, message_type), received_ns)
+
+    def make(self, message_type: str, **fields: Any) -> Any:
+        """A message of the typestore, for `write`."""
+        return self._make(message_type, **fields)
+
+    # --- parts of messages ---
+
+    def _connection(self, topic: str, message_type: str) -> Connection:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, message_type, typestore=self._store)
+        return self._connections[topic]
+
+    def _make(self, message_type: str, **fields: Any) -> Any:
+        return self._store.types[message_type](**fields)
+
+    def _write(
+        self, topic: str, kind: str, stamp_ns: int, received_ns: int | None, frame_id: str, content: dict[str, Any]
+    ) -> None:
+        message = self._make(kind, header=self._header(stamp_ns, frame_id), **content)
+        self.write(topic, kind, message, stamp_ns if received_ns is None else received_ns)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        time = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+    def _vector(self, xyz: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", **xyz_fields(xyz))
+
+    def _quaternion(self, xyzw: Sequence[float]) -> Any:
+        x, y, z, w = (float(value) for value in xyzw)
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def _twist(self, linear: Sequence[float], angular: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector(angular))
+
+    def _planar_pose(self, pose: Sequence[float]) -> Any:
+        x, y, yaw = pose
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", **xyz_fields((x, y, 0.0))),
+            orientation=self._quaternion((0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))),
+        )
+
+
+def xyz_fields(values: Sequence[float]) -> dict[str, float]:
+    """Fields of a vector or point."""
+    x, y, z = (float(value) for value in values)
+    return {"x": x, "y": y, "z": z}
+
+
+def flat_cov(cov: ArrayLike | None) -> Any:
+    """A covariance ``(6, 6)`` as messages have it; zeros for None."""
+    return np.zeros(36) if cov is None else np.asarray(cov, dtype=float).reshape(36)
+
+
+# --- Landmarks --------------------------------------------------------------------------------------------------------
+
+
+class LandmarkMessages(MessageWriter):
+    """Ranges, positions, corners and poses, one method per kind of message."""
+
+    def range_reading(
+        self, topic: str, stamp_ns: int, range_m: float, frame_id: str, received_ns: int | None = None
+    ) -> None:
+        """``sensor_msgs/Range`` of a radio, of 0.1 to 100 m."""
+        content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m)
+        self._write(topic, "sensor_msgs/msg/Range", stamp_ns, received_ns, frame_id, content)
+
+    def satellite_fix(
+        self,
+        topic: str,
+        stamp_ns: int,
+        place: Sequence[float],
+        variances: Sequence[float],
+        received_ns: int | None = None,
+        frame_id: str = "gnss_link",
+    ) -> None:
+        """``sensor_msgs/NavSatFix``: latitude, longitude [degrees], altitude [m]; variances east, north, up [m²]."""
+        latitude, longitude, altitude = place
+        content = dict(
+            status=self._make("sensor_msgs/msg/NavSatStatus", status=2, service=1),
+            latitude=float(latitude),
+            longitude=float(longitude),
+            altitude=float(altitude),
+            position_covariance=np.diag(np.asarray(variances, dtype=float)).ravel(),
+            position_covariance_type=2,
+        )
+        self._write(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, received_ns, frame_id, content)
+
+    def range_bearing(
+        self,
+        topic: str,
+        stamp_ns: int,
+        sightings: Iterable[tuple[int, float, float]],
+        received_ns: int | None = None,
+        frame_id: str = "base_link",
+    ) -> None:
+        """``landmark_msgs/LandmarkArray`` of (id, range [m], bearing [rad])."""
+        landmarks = [
+            self._make(
+                "landmark_msgs/msg/Landmark",
+                id=i,
+                hamming=0,
+                goodness=1.0,
+                decision_margin=1.0,
+                range=r,
+                bearing=b,
+            )
+            for i, r, b in sightings
+        ]
+        content = dict(landmarks=landmarks)
+        self._write(topic, "landmark_msgs/msg/LandmarkArray", stamp_ns, received_ns, frame_id, content)
+
+    def marker_poses(
+        self,
+        topic: str,
+        stamp_ns: int,
+        sightings: Iterable[tuple[int, Sequence[float], Sequence[float], ArrayLike | None]],
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``aruco_msgs/MarkerArray`` of (id, position, quaternion x, y, z, w, covariance (6, 6) or None)."""
+        markers = [
+            self._make(
+                "aruco_msgs/msg/Marker",
+                header=self._header(stamp_ns, frame_id),
+                id=number,
+                pose=self._make(
+                    "geometry_msgs/msg/PoseWithCovariance",
+                    pose=self._make(
+                        "geometry_msgs/msg/Pose",
+                        position=self._make("geometry_msgs/msg/Point", **xyz_fields(position)),
+                        orientation=self._quaternion(quaternion),
+                    ),
+                    covariance=flat_cov(cov),
+                ),
+                confidence=1.0,
+            )
+            for number, position, quaternion, cov in sightings
+        ]
+        self._write(topic, "aruco_msgs/msg/MarkerArray", stamp_ns, received_ns, frame_id, dict(markers=markers))
+
+    def corners(
+        self,
+        topic: str,
+        stamp_ns: int,
+        markers: Mapping[int, ArrayLike],
+        received_ns: int | None = None,
+        frame_id: str = "camera_optical",
+    ) -> None:
+        """``apriltag_msgs/AprilTagDetectionArray`` of corners (4, 2) [px] by id, clockwise from the top left.
+
+        The message counts from the first pixel's corner and holds the tag upside down (`fgloc.recording.reader`).
+        """
+        detections = []
+        for number, given in markers.items():
+            corners = np.asarray(given, dtype=float)[[1, 0, 3, 2]] + 0.5
+            points = [self._make("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in corners]
+            x, y = corners.mean(axis=0).tolist()
+            centre = self._make("apriltag_msgs/msg/Point", x=x, y=y)
+            detections.append(
+                self._make(
+                    "apriltag_msgs/msg/AprilTagDetection",
+                    family="",
+                    id=number,
+                    hamming=0,
+                    goodness=0.0,
+                    decision_margin=100.0,
+                    centre=centre,
+                    corners=points,
+                    homography=np.zeros(9),
+                )
+            )
+        kind = "apriltag_msgs/msg/AprilTagDetectionArray"
+        self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(detections=detections))
+
+
+# --- Bags -------------------------------------------------------------------------------------------------------------
 
 
 class BagWriter(LandmarkMessages):

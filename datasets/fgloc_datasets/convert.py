@@ -1,15 +1,23 @@
-"""What the converters share: a bag that appears whole, robot.yaml, reading of tables."""
+"""Parts that all converters share: download, a bag that appears whole, robot.yaml, reading of tables."""
 
 from __future__ import annotations
 
+import hashlib
 import heapq
+import os
+import shutil
 import tempfile
+import urllib.error
+import urllib.request
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from operator import itemgetter
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
+from urllib.parse import urlsplit
 
 import numpy as np
 import yaml
@@ -21,6 +29,120 @@ from fgloc.files.outputs import write_text
 from fgloc.instrumentation import counted
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
+
+# --- Download ---------------------------------------------------------------------------------------------------------
+
+_TIMEOUT_S = 60.0
+_BLOCK = 1 << 20
+_LIMIT = 4 << 30  # no set here is near 4 GiB: more is a mistake or an attack
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+@dataclass(frozen=True, slots=True)
+class Remote:
+    """A file at its owner's. ``size`` [bytes] and ``sha256`` (hex) are checked where they are known."""
+
+    url: str
+    size: int | None = None
+    sha256: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Last part of the address, the file's name."""
+        return PurePosixPath(urlsplit(self.url).path).name
+
+
+def fetch(remote: Remote, folder: Path) -> Path:
+    """Download a file into a folder, unless a file of the right name and size is there already.
+
+    The file appears under its name only when it is complete and checked.
+
+    Raises:
+        RecordingError: the address is not https (or ftp, or http on this machine), the server does not answer, or what
+            came is not of the size or checksum that was expected.
+    """
+    _check_address(remote)
+    target = folder / remote.name
+    if target.is_file() and remote.size is not None and target.stat().st_size == remote.size:
+        return target
+    folder.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=folder, prefix=f".{remote.name}.", suffix=".part")
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            _receive(remote, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except (urllib.error.URLError, OSError, EOFError) as error:
+        reason = getattr(error, "reason", error)
+        raise RecordingError(f"{remote.url}: {reason}; download it by hand into {folder} or try again") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return target
+
+
+def unpack(archive: Path, folder: Path) -> Path:
+    """Unpack a zip file into a folder, which appears whole.
+
+    Raises:
+        RecordingError: the archive is damaged, or a name in it leads out of the folder.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.exists():
+        return folder
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".unpacking-") as scratch:
+        made = Path(scratch) / "files"
+        try:
+            with zipfile.ZipFile(archive) as file:
+                if sum(item.file_size for item in file.infolist()) > _LIMIT:
+                    raise RecordingError(f"{archive}: unpacks to more than {_LIMIT} bytes; refused")
+                for item in file.infolist():
+                    _check_member(archive, item)
+                file.extractall(made)
+        except (zipfile.BadZipFile, EOFError) as error:
+            raise RecordingError(f"{archive}: not a whole zip file ({error}); delete it and download again") from error
+        made.mkdir(exist_ok=True)
+        shutil.move(made, folder)
+    return folder
+
+
+def _check_address(remote: Remote) -> None:
+    parts = urlsplit(remote.url)
+    local = parts.scheme == "http" and parts.hostname in _LOOPBACK
+    if not (parts.scheme in ("https", "ftp") or local) or not remote.name:
+        raise RecordingError(f"{remote.url!r}: expected an https address (or ftp) that ends in a file name")
+
+
+def _receive(remote: Remote, file: BinaryIO) -> None:
+    digest = hashlib.sha256()
+    received = 0
+    with urllib.request.urlopen(remote.url, timeout=_TIMEOUT_S) as answer:
+        length = answer.headers.get("Content-Length")
+        promised = int(length) if length is not None and length.isdigit() else remote.size
+        for block in counted(
+            iter(lambda: answer.read(_BLOCK), b""), remote.name, promised and promised / _BLOCK, "MiB"
+        ):
+            received += len(block)
+            if received > (remote.size or _LIMIT):
+                raise RecordingError(f"{remote.url}: more than the expected {remote.size or _LIMIT} bytes; refused")
+            digest.update(block)
+            file.write(block)
+    expected = remote.size if remote.size is not None else promised
+    if expected is not None and received != expected:
+        raise RecordingError(f"{remote.url}: {received} bytes came, expected {expected}; try again, or give --url")
+    if remote.sha256 is not None and digest.hexdigest() != remote.sha256:
+        raise RecordingError(f"{remote.url}: sha256 {digest.hexdigest()}, expected {remote.sha256}; not used")
+
+
+def _check_member(archive: Path, item: zipfile.ZipInfo) -> None:
+    path = PurePosixPath(item.filename.replace("\\", "/"))
+    link = (item.external_attr >> 16) & 0o170000 == 0o120000
+    if path.is_absolute() or ".." in path.parts or ":" in item.filename or link:
+        raise RecordingError(f"{archive}: member {item.filename!r} leads out of the folder; refused")
+
+
+# --- Conversion -------------------------------------------------------------------------------------------------------
 
 Message = tuple[int, Callable[[], None]]  # when it was received [ns], and what writes it
 

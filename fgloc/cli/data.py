@@ -37,7 +37,7 @@ def mrclam(
 ) -> None:
     """UTIAS MRCLAM: iRobot Creates and landmarks. Five robots that see each other; truth by Vicon."""
     from fgloc_datasets import mrclam as data
-    from fgloc_datasets.mrclam_run import Calibration
+    from fgloc_datasets.mrclam import Calibration
 
     check_out(out)
     if download is not None:
@@ -45,7 +45,7 @@ def mrclam(
     if source is None:
         raise typer.BadParameter("give the folder of the unpacked set, or --download FOLDER", param_hint="SRC")
     if fit:
-        from fgloc_datasets.mrclam_fit import left_out
+        from fgloc_datasets.mrclam import left_out
 
         fitted = left_out({k: data.read(source, k) for k in data.ROBOTS})
         for name in Calibration.__dataclass_fields__:
@@ -72,7 +72,7 @@ def pioneer(
     name: Annotated[str, typer.Option(help="which one to download: duarte or pinto1")] = "duarte",
 ) -> None:
     """A Pioneer with ArUco markers. Truth by motion capture."""
-    from fgloc_datasets.download import fetch
+    from fgloc_datasets.convert import fetch
     from fgloc_datasets.pioneer import REMOTES
     from fgloc_datasets.pioneer import convert as converted
 
@@ -101,7 +101,7 @@ def turtlebot3(
     url: Url = None,
 ) -> None:
     """A TurtleBot3 Burger with AprilTags."""
-    from fgloc_datasets.download import unpack
+    from fgloc_datasets.convert import unpack
     from fgloc_datasets.turtlebot3 import convert_and_tell
 
     check_out(out)
@@ -142,7 +142,7 @@ def drive(
 
 def _given_or_fetched(source: Path | None, name: str, download: Path | None, url: str | None, unknown: str) -> Path:
     """The recording that was given as the argument ``name``, or downloaded; ``unknown``: why it needs an address."""
-    from fgloc_datasets.download import Remote, fetch
+    from fgloc_datasets.convert import Remote, fetch
 
     if download is not None:
         if url is None:
@@ -201,8 +201,8 @@ def record(
     longest: Annotated[float | None, typer.Option(metavar="S", min=0.5, help="cut runs to this length [s]")] = None,
 ) -> None:
     """Record a scenario, or a suite of them. Of a suite only what is missing is recorded."""
+    from fgloc_datasets.sim.record import BUNDLED, find_scenario, jobs, load_suite, record_suite
     from fgloc_datasets.sim.record import record as record_run
-    from fgloc_datasets.sim.suite import BUNDLED, find_scenario, jobs, load_suite, record_suite
 
     check_out(out)
     from_file = Path(what).suffix in (".yaml", ".yml")
@@ -247,12 +247,10 @@ def follow_path(
     corners: Corners = False,
 ) -> None:
     """Let the robot drive itself along waypoints. Its guide is a pose that is estimated while it drives."""
-    from fgloc_datasets.sim.following.failing import read_failures
-    from fgloc_datasets.sim.following.figures import draw_drives, table
-    from fgloc_datasets.sim.following.loop import Drive, follow, seen_by
-    from fgloc_datasets.sim.following.path import load_path
-    from fgloc_datasets.sim.following.poses import POSES
-    from fgloc_datasets.sim.suite import find_scenario
+    from fgloc_datasets.sim.following.cases import draw_drives, table
+    from fgloc_datasets.sim.following.loop import POSES, Drive, follow, read_failures, seen_by
+    from fgloc_datasets.sim.following.pursuit import load_path
+    from fgloc_datasets.sim.record import find_scenario
 
     check_out(out)
     known = {name: name for name in POSES}
@@ -274,7 +272,7 @@ def follow_demo(
     corners: Corners = False,
 ) -> None:
     """Six drives, with a picture and a table. Flat, on ice, with sensors that fail."""
-    from fgloc_datasets.sim.following.demo import PICTURE, demonstrate
+    from fgloc_datasets.sim.following.cases import PICTURE, demonstrate
     from fgloc_datasets.sim.following.loop import seen_by
 
     check_out(out)
@@ -337,7 +335,7 @@ def train(
             "for one of these recordings: fgloc train --init BAG... --out train.yaml"
         )
     check_out(out)
-    from fgloc_training.session import CHECKPOINTS, Reporter, train_models
+    from fgloc_training.train import CHECKPOINTS, Reporter, train_models
 
     (config,) = inputs
     kept = f"what was trained so far is kept in {out / CHECKPOINTS}; the same command goes on from there"
@@ -378,7 +376,7 @@ def evaluate_model(
 def _write_config(bags: list[Path], out: Path) -> None:
     """``--init``."""
     from fgloc.files.outputs import write_text
-    from fgloc_training.initial import look, missing, training_yaml
+    from fgloc_training.recordings import look, missing, training_yaml
 
     check_out(out, folder=False)
     found = [look(bag, configured(bag, None, None)) for bag in bags]

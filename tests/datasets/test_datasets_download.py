@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fgloc.errors import RecordingError
-from fgloc_datasets.download import Remote, fetch, unpack
+from fgloc_datasets.convert import Remote, fetch, unpack
 
 _CONTENT = bytes(range(256)) * 300
 

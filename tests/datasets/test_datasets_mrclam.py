@@ -19,8 +19,7 @@ from fgloc.errors import RecordingError
 from fgloc.sensors.maps import load_map
 from fgloc_datasets import mrclam
 from fgloc_datasets.bag import BagWriter
-from fgloc_datasets.mrclam import Run, calibration, convert, frames, read
-from fgloc_datasets.mrclam_fit import fit_sensor, left_out, sighting_errors
+from fgloc_datasets.mrclam import Run, calibration, convert, fit_sensor, frames, left_out, read, sighting_errors
 
 _START = 1_248_444_175.103
 _LANDMARKS = {i: (round(2.0 * math.cos(i) + 1.0, 6), round(3.0 * math.sin(i), 6)) for i in range(6, 21)}

@@ -19,8 +19,7 @@ from fgloc.recording.reader import open_recording
 from fgloc.sensors.marker_pose import MarkerPosesEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Trajectory, TruthEvent
-from fgloc_datasets.mounting import sensor_mounting
-from fgloc_datasets.pioneer import convert, date_bursts
+from fgloc_datasets.pioneer import convert, date_bursts, sensor_mounting
 
 _START_NS = 1_575_641_303_000_000_000
 _WRONG_CLOCK_NS = 1_202_150_932_000_000_000

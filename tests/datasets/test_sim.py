@@ -10,11 +10,10 @@ from rosbags.highlevel import AnyReader
 
 from fgloc.config import load_config
 from fgloc.sensors.maps import load_map
-from fgloc_datasets.sim.floor import Floor, Patch
 from fgloc_datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from fgloc_datasets.sim.readings import odometry
 from fgloc_datasets.sim.record import is_recorded, record
-from fgloc_datasets.sim.scenario import Camera, Control, Robot, Scenario, World
+from fgloc_datasets.sim.scenario import Camera, Control, Floor, Patch, Robot, Scenario, World
+from fgloc_datasets.sim.sensors import odometry
 
 HALL = World(size_m=(20.0, 20.0))
 

@@ -11,9 +11,9 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
-from fgloc_datasets.sim.mjcf import camera_rotation, intrinsics
 from fgloc_datasets.sim.physics import Log, Scene, make_scene, simulate
 from fgloc_datasets.sim.scenario import Camera, Control, Scenario
+from fgloc_datasets.sim.scene import camera_rotation, intrinsics
 
 pytestmark = pytest.mark.render
 

@@ -22,13 +22,26 @@ from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.sim.control import Command, Driver
-from fgloc_datasets.sim.following.cases import CASES, drive_of
-from fgloc_datasets.sim.following.failing import FailingSensors, read_failures
-from fgloc_datasets.sim.following.figures import draw_drives, table
-from fgloc_datasets.sim.following.loop import PROCESSING_S, Arrivals, Drive, Written, follow
-from fgloc_datasets.sim.following.path import BUNDLED, Curve, WaypointPath, load_path
-from fgloc_datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
-from fgloc_datasets.sim.following.results import Followed
+from fgloc_datasets.sim.following.cases import CASES, draw_drives, drive_of, table
+from fgloc_datasets.sim.following.loop import (
+    PROCESSING_S,
+    Arrivals,
+    Drive,
+    FailingSensors,
+    Followed,
+    Written,
+    follow,
+    read_failures,
+)
+from fgloc_datasets.sim.following.pursuit import (
+    BUNDLED,
+    Curve,
+    Pursuit,
+    PursuitSettings,
+    State,
+    WaypointPath,
+    load_path,
+)
 from fgloc_datasets.sim.physics import Simulation, make_scene, simulate
 from fgloc_datasets.sim.scenario import Camera, Gnss, Scenario, Uwb, World
 from fgloc_datasets.sim.sensors import EPOCH_NS, stamp_ns, streams

@@ -16,15 +16,12 @@ from fgloc.frames import rpy_matrix
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
-from fgloc_datasets.sim.installation import Installation
 from fgloc_datasets.sim.installed import Installed, install, load_installed, survey, write_installed
-from fgloc_datasets.sim.mjcf import intrinsics
 from fgloc_datasets.sim.physics import base_twist, make_scene, simulate, slipping, wheel_twist
-from fgloc_datasets.sim.readings import odometry
-from fgloc_datasets.sim.record import is_recorded, record
-from fgloc_datasets.sim.room import make_map
-from fgloc_datasets.sim.scenario import Camera, Control, Robot, Scenario, World
-from fgloc_datasets.sim.suite import BUNDLED, load_suite
+from fgloc_datasets.sim.record import BUNDLED, is_recorded, load_suite, record
+from fgloc_datasets.sim.scenario import Camera, Control, Installation, Robot, Scenario, World
+from fgloc_datasets.sim.scene import intrinsics, make_map
+from fgloc_datasets.sim.sensors import odometry
 
 FULL = Installation.as_installed()
 SCENARIO = Scenario(name="test", duration_s=1.0, installation=FULL)

@@ -14,11 +14,10 @@ from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, Landmark
 from fgloc_datasets.sim.camera import Renderer, RenderError, frames, pose_at
-from fgloc_datasets.sim.installation import Installation
 from fgloc_datasets.sim.installed import MountedCamera, load_installed
 from fgloc_datasets.sim.physics import Log, make_scene, simulate
 from fgloc_datasets.sim.record import record
-from fgloc_datasets.sim.scenario import Camera, Control, Scenario
+from fgloc_datasets.sim.scenario import Camera, Control, Installation, Scenario
 
 pytestmark = pytest.mark.render
 

@@ -10,9 +10,9 @@ import yaml
 from fgloc.config import load_config
 from fgloc.sensors.maps import load_map
 from fgloc_datasets.sim.installed import install, load_installed
-from fgloc_datasets.sim.room import make_map
+from fgloc_datasets.sim.record import BUNDLED, load_suite
 from fgloc_datasets.sim.scenario import Scenario
-from fgloc_datasets.sim.suite import BUNDLED, load_suite
+from fgloc_datasets.sim.scene import make_map
 
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 SEEDS = {"first_run": 1, "patches_run": 1, "light_drop_run": 1, "installed_run": 3}

@@ -14,23 +14,26 @@ from fgloc.types import FloatArray
 from fgloc_datasets.sim.camera import light_level
 from fgloc_datasets.sim.control import Driver, make_function
 from fgloc_datasets.sim.figures import draw
-from fgloc_datasets.sim.floor import Floor, Humps, Patch, Ramp, Rough, Tilt
-from fgloc_datasets.sim.ground import make_ground
 from fgloc_datasets.sim.physics import Log, base_twist, make_scene, simulate, slipping, wheel_twist
-from fgloc_datasets.sim.record import record
-from fgloc_datasets.sim.room import make_map
+from fgloc_datasets.sim.record import BUNDLED, jobs, load_suite, record, record_suite
 from fgloc_datasets.sim.scenario import (
     Control,
     ControlKind,
+    Floor,
+    Humps,
     LightStep,
     Markers,
+    Patch,
     PlacedMarker,
+    Ramp,
     Robot,
+    Rough,
     Scenario,
+    Tilt,
     World,
+    channel_rng,
 )
-from fgloc_datasets.sim.section import channel_rng
-from fgloc_datasets.sim.suite import BUNDLED, jobs, load_suite, record_suite
+from fgloc_datasets.sim.scene import make_ground, make_map
 
 SUITE = load_suite(BUNDLED)
 KINDS: tuple[ControlKind, ...] = (

@@ -28,9 +28,9 @@ from fgloc.sensors.equipment import compensated
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
-from fgloc_datasets.sim.positioning import geodetic
 from fgloc_datasets.sim.record import record
 from fgloc_datasets.sim.scenario import Gnss, Scenario, Uwb
+from fgloc_datasets.sim.sensors import geodetic
 
 SECONDS = 14.0
 ANCHORS = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.2), 3: (6.0, 5.0, 1.8)}

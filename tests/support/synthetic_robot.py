@@ -14,8 +14,7 @@ from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, Event, FloatArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import DataConfig
-from fgloc_training.data import Run, make_run
-from fgloc_training.sensor_record import SensorRecord
+from fgloc_training.data import Run, SensorRecord, make_run
 
 SECOND = 1_000_000_000
 T0 = 1_700_000_000 * SECOND

@@ -11,7 +11,7 @@ from fgloc.graph.ground import GRAVITY, driven
 from fgloc.sensors.base import Mounting
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.learned.card import CHANNELS
-from fgloc_training.slopes import in_robots_plane
+from fgloc_training.data import in_robots_plane
 
 
 def test_the_truth_on_a_slope_is_unrolled_to_the_robots_plane() -> None:

@@ -20,7 +20,6 @@ from fgloc.sensors.learned.sensor import load_model, read_model, save_model
 from fgloc_training import evaluate as evaluation
 from fgloc_training import optimize
 from fgloc_training import train as training
-from fgloc_training.checkpoint import Checkpoint, Checkpoints
 from fgloc_training.config import (
     AdaptationConfig,
     CalibrationConfig,
@@ -30,12 +29,12 @@ from fgloc_training.config import (
     TrainConfig,
     load_train_config,
 )
-from fgloc_training.controls import controls, draw_controls
 from fgloc_training.data import Run
-from fgloc_training.export import card_of, tensors_of
-from fgloc_training.members import new_net
 from fgloc_training.models import DisplacementNet
+from fgloc_training.optimize import Checkpoint, Checkpoints
+from fgloc_training.recordings import controls, draw_controls
 from fgloc_training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.train import card_of, new_net, tensors_of
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from fgloc_training.checkpoint import Curve
-from fgloc_training.curves import warnings_of
+from fgloc_training.optimize import Curve
+from fgloc_training.train import warnings_of
 
 
 def curve(*scores):

@@ -21,8 +21,8 @@ from fgloc_datasets.bag import BagWriter
 from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from fgloc_training.config import CalibrationConfig, DataConfig, OptimizationConfig
 from fgloc_training.data import Run, cut, load_run, make_run
-from fgloc_training.losses import composed_nll, end_errors, rollout_loss
-from fgloc_training.planar import integrate, relative
+from fgloc_training.models import integrate, relative
+from fgloc_training.optimize import composed_nll, end_errors, rollout_loss
 from fgloc_training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
 
 

@@ -19,9 +19,8 @@ from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Event
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import DataConfig
-from fgloc_training.data import load_runs
+from fgloc_training.data import SensorRecord, load_runs
 from fgloc_training.rollouts import roll_wheels
-from fgloc_training.sensor_record import SensorRecord
 
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
 

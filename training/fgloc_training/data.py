@@ -1,32 +1,205 @@
-"""Recordings to samples at a fixed time step: smoothed truth, body velocities, commands as a function of time.
+"""Recordings as training sees them: recorded inputs, smoothed truth, body velocities, at a fixed time step.
 
 Source: paper eq. 1, 2.
 """
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.signal import savgol_filter
 
 from fgloc.config import Config, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.files.outputs import read_tum
+from fgloc.frames import rotations
+from fgloc.intake.keyframing import EventBuffer
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up
+from fgloc.sensors.base import Mounting, WheelJoints
+from fgloc.sensors.gyro import Gyro, ImuEvent
+from fgloc.sensors.learned.card import Signals, signals_of
 from fgloc.sensors.learned.network import CommandHistory
-from fgloc.types import ControlEvent, Event, FloatArray, TruthEvent
+from fgloc.sensors.settings import GyroConfig, WheelsConfig
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, MotionEvent, Step, TruthEvent
 from fgloc_training.config import DataConfig
-from fgloc_training.sensor_record import SensorRecord
-from fgloc_training.slopes import in_robots_plane
+
+# --- Inputs of a motion model, as recorded ----------------------------------------------------------------------------
+
+_STEP_NS = 200_000_000  # of the gyro's filter
+_NO_FIX_NS = 10_000_000_000  # without a fix: no window that is judged may have taught the bias it is judged with
+_FIRST_NS = 2_000_000_000
+_FIX_SIGMA = 0.002  # rad
+_MAX_TRUTH_GAP_NS = 200_000_000
+
+
+class SensorRecord:
+    """Commands, IMU, joints and odometry of one recording.
+
+    Attributes:
+        commands: in order of stamp.
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+        wheels: how the robot's wheels are read.
+    """
+
+    def __init__(
+        self,
+        events: Iterable[Event],
+        config: Config | None = None,
+        imu_up: ArrayLike = (0.0, 0.0, 1.0),
+        truth: tuple[NDArray[np.int64], FloatArray] | None = None,
+    ) -> None:
+        """Keep what a motion model may read.
+
+        Args:
+            events: of any kind, in any order.
+            config: the robot's.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+            truth: stamps ``(n,)`` and poses ``(n, 3)``: the fixes from which the gyro's bias is learned, as the
+                localizer learns it from sightings. None: from rests alone.
+        """
+        config = Config() if config is None else config
+        self.wheels: WheelsConfig = config.wheels
+        self.imu_up = imu_up
+        kinds = (ControlEvent, ImuEvent, JointsEvent, OdometryEvent)
+        self._buffers: dict[type[MotionEvent], EventBuffer[Any]] = {kind: EventBuffer() for kind in kinds}
+        for event in events:
+            if isinstance(event, kinds):
+                self._buffers[type(event)].insert(event)
+        self.commands: tuple[ControlEvent, ...] = self._all(ControlEvent)
+        self._biases = self._gyro_biases(config.gyro, truth)
+
+    @property
+    def has_wheels(self) -> bool:
+        """Whether wheel odometry comes from wheels, not from commands."""
+        if self.wheels.source in ("command", "none"):
+            return False
+        by_joints = bool(self._stamps(JointsEvent)) and self.wheels.left_radius is not None
+        return by_joints or bool(self._stamps(OdometryEvent))
+
+    @property
+    def joints(self) -> WheelJoints | None:
+        """The wheels by name and size; None if there are no joints."""
+        if not self._stamps(JointsEvent):
+            return None
+        w = self.wheels
+        return WheelJoints(
+            left=w.left_joint,
+            right=w.right_joint,
+            left_radius=w.left_radius,
+            right_radius=w.right_radius,
+            track=w.track,
+        )
+
+    def step(self, start_ns: int, end_ns: int, history_s: float = 0.0) -> Step:
+        """All messages around a time, as the localizer would get them."""
+        return Step(
+            index=0,
+            segment=0,
+            start_ns=start_ns,
+            stamp_ns=end_ns,
+            motion={
+                kind: buffer.window(start_ns - round(history_s * 1e9), end_ns, beyond=False)
+                if kind is ControlEvent
+                else buffer.window(start_ns, end_ns)
+                for kind, buffer in self._buffers.items()
+            },
+        )
+
+    def gyro_bias(self, stamp_ns: int) -> float:
+        """What was known of the gyro's bias [rad/s] 10 s before a time, as after 10 s of dead reckoning."""
+        if not len(self._biases):
+            return 0.0
+        return float(self._biases[max(0, int(np.searchsorted(self._stamps(ImuEvent), stamp_ns, "right")) - 1)])
+
+    def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
+        """The wanted signals over the whole recording."""
+        events = {InertialEvent: self._all(ImuEvent), JointsEvent: self._all(JointsEvent)}
+        return signals_of(wanted, events.__getitem__, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
+
+    def _stamps(self, kind: type[MotionEvent]) -> list[int]:
+        return self._buffers[kind].stamps
+
+    def _all(self, kind: type[MotionEvent]) -> tuple[Any, ...]:
+        stamps = self._stamps(kind)
+        return self._buffers[kind].window(stamps[0], stamps[-1]) if stamps else ()
+
+    def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
+        """What the localizer's own filter knew of the bias some time before each IMU message."""
+        stamps = self._stamps(ImuEvent)
+        if not stamps:
+            return np.zeros(0)
+        gyro, wheels = Gyro(config, self.imu_up), WheelMotion(self.wheels) if self.has_wheels else None
+        at, biases = [stamps[0]], [0.0]
+        for start in range(stamps[0], stamps[-1], _STEP_NS):
+            step = self.step(start, start + _STEP_NS)
+            measured = None if wheels is None else wheels.measure(step)
+            turn = gyro.measure(step, None if measured is None else measured.motion)
+            if turn is None:
+                gyro.forget_fix()
+            else:
+                gyro.turned(turn.yaw, step.dt)
+            at.append(step.stamp_ns)
+            if truth is not None and (yaw := _yaw_at(*truth, step.stamp_ns)) is not None:
+                gyro.fix(yaw, _FIX_SIGMA**2)
+            biases.append(gyro.bias)
+        known = np.searchsorted(at, np.array(stamps) - _NO_FIX_NS, "right") - 1
+        first = np.searchsorted(at, stamps[0] + _FIRST_NS)  # a robot rests before it sets out
+        return np.array(biases)[np.maximum(known, np.minimum(np.searchsorted(at, stamps, "right") - 1, first))]
+
+
+def _yaw_at(stamps_ns: NDArray[np.int64], poses: FloatArray, at_ns: int) -> float | None:
+    """Yaw [rad] between the poses around a time; None if there is no truth there."""
+    k = int(np.searchsorted(stamps_ns, at_ns, "right")) - 1
+    if k < 0 or k + 1 >= len(stamps_ns) or stamps_ns[k + 1] - stamps_ns[k] > _MAX_TRUTH_GAP_NS:
+        return None
+    share = (at_ns - stamps_ns[k]) / (stamps_ns[k + 1] - stamps_ns[k])
+    return float(poses[k, 2] + share * math.remainder(poses[k + 1, 2] - poses[k, 2], math.tau))
+
+
+# --- Motion on slopes -------------------------------------------------------------------------------------------------
+
+_LEVEL_RAD = 0.01  # a positioning system measures roll and pitch no better; below, the floor is flat
+
+
+def in_robots_plane(poses: FloatArray, ground: FloatArray) -> FloatArray:
+    """The path that would be driven on a flat floor by the same motions in the robot's plane.
+
+    Args:
+        poses: ``(m, 3)`` in the map, in order of time.
+        ground: ``(m, 3)`` height, roll and pitch there.
+
+    Returns:
+        ``(m, 3)``, beginning at the first pose; of a flat floor the poses as they are.
+    """
+    if np.ptp(ground[:, 1:], axis=0).max() < _LEVEL_RAD:
+        return poses
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    Rz = np.zeros((len(poses), 3, 3))
+    Rz[:, 0, 0], Rz[:, 0, 1], Rz[:, 1, 0], Rz[:, 1, 1], Rz[:, 2, 2] = c, -s, s, c, 1.0
+    R = Rz @ rotations(ground[:, 1:])
+    moved = np.diff(np.column_stack([poses[:, :2], ground[:, 0]]), axis=0)
+    way = np.einsum("mji,mj->mi", R[:-1], moved)  # in the axes of the robot
+    turn = np.einsum("mji,mjk->mik", R[:-1], R[1:])
+    yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(0.5 * (turn[:, 1, 0] - turn[:, 0, 1]))])
+    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    steps = np.column_stack([c * way[:, 0] - s * way[:, 1], s * way[:, 0] + c * way[:, 1]])
+    return np.column_stack([poses[0, :2] + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), yaw])
+
+
+# --- Runs -------------------------------------------------------------------------------------------------------------
 
 _FINE_S = 0.02  # the truth is resampled to this before it is smoothed
 

@@ -1,4 +1,7 @@
-"""The networks in torch. Each rolls out trajectories that a loss can compare; export hands the weights to fgloc."""
+"""Networks of motion in torch: displacements or velocities, their variance, and a recurrent trunk.
+
+Each rolls out trajectories that a loss can compare; export hands the weights to fgloc.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,115 @@ from fgloc.sensors.learned.network import calibrated, measured_twists, signal_fe
 from fgloc.types import FloatArray
 from fgloc_training.config import NetworkConfig
 from fgloc_training.data import Run
-from fgloc_training.planar import integrate
-from fgloc_training.recurrent import Trunk
-from fgloc_training.variance import start, variance_net
+
+# --- Planar motion ----------------------------------------------------------------------------------------------------
+
+
+def integrate(twists: Tensor) -> Tensor:
+    """Compose exponentials of twists ``(b, n, 3)`` into poses ``(b, n, 3)``; the yaw is not wrapped."""
+    yaw = torch.cumsum(twists[..., 2], dim=-1)
+    middle = yaw - 0.5 * twists[..., 2]
+    chord = torch.sinc(twists[..., 2] / (2 * torch.pi))  # sin(θ/2) / (θ/2): arc to chord
+    c, s = torch.cos(middle) * chord, torch.sin(middle) * chord
+    x = torch.cumsum(c * twists[..., 0] - s * twists[..., 1], dim=-1)
+    y = torch.cumsum(s * twists[..., 0] + c * twists[..., 1], dim=-1)
+    return torch.stack([x, y, yaw], dim=-1)
+
+
+def relative(a: Tensor, b: Tensor) -> Tensor:
+    """``T_a⁻¹ ∘ T_b`` of poses ``(..., 3)``; the yaw is not wrapped."""
+    c, s = torch.cos(a[..., 2]), torch.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return torch.stack([c * dx + s * dy, c * dy - s * dx, b[..., 2] - a[..., 2]], dim=-1)
+
+
+# --- Memory -----------------------------------------------------------------------------------------------------------
+
+
+class Trunk(nn.Module):
+    """A GRU over the commands of the age bins, oldest first; layers on its last state and the other inputs.
+
+    Attributes:
+        cell: the GRU.
+        layers: linear ones with ReLU after each; perhaps none.
+        width: of the output.
+    """
+
+    def __init__(self, n_bins: int, n_inputs: int, hidden: tuple[int, ...]) -> None:
+        """Set up.
+
+        Args:
+            n_bins: age bins, of two commands each, with which the inputs begin, youngest first.
+            n_inputs: all of them.
+            hidden: units of the cell, then of the layers.
+        """
+        super().__init__()
+        self._n_bins = n_bins
+        self.cell = nn.GRU(2, hidden[0], batch_first=True)
+        widths = [hidden[0] + n_inputs - 2 * n_bins, *hidden[1:]]
+        parts: list[nn.Module] = []
+        for n_in, n_out in pairwise(widths):
+            parts += [nn.Linear(n_in, n_out), nn.ReLU()]
+        self.layers = nn.Sequential(*parts)
+        self.width = widths[-1]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Hidden values ``(..., width)`` of normalized inputs ``(..., in)``."""
+        commands = x[..., : 2 * self._n_bins].reshape(-1, self._n_bins, 2).flip(1)
+        _, last = self.cell(commands)
+        state = last[0].reshape(*x.shape[:-1], -1)
+        return self.layers(torch.cat([state, x[..., 2 * self._n_bins :]], dim=-1))
+
+    def weights(self) -> dict[str, Tensor]:
+        """Of the cell, by the names of the model file."""
+        names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        return {f"gru.{name}": getattr(self.cell, f"{name}_l0") for name in names}
+
+
+# --- Variance ---------------------------------------------------------------------------------------------------------
+
+_START_SIGMAS = (1e-2, 1e-2, 3e-2)  # m, m, rad per √s
+
+
+def variance_net(net: nn.Sequential, mean: Tensor, std: Tensor, neighbors: list[tuple[int, int]]) -> nn.Sequential:
+    """The network, its first units started as the sizes of changes from age to age, then of the inputs themselves.
+
+    Robots pick up changed commands at instants that nobody knows; steady ones they follow.
+
+    Args:
+        net: linear layers with ReLU between them, inputs to three log-variances per second.
+        mean: ``(n,)`` with which the inputs are normalized.
+        std: ``(n,)`` likewise.
+        neighbors: columns of the same input at neighboring ages, the younger first.
+    """
+    first = net[0]
+    rows: list[Tensor] = []
+    offsets: list[float] = []
+    for younger, older in [*neighbors, *((i, None) for i in range(len(mean)))]:
+        row, offset = torch.zeros(len(mean)), float(mean[younger] / std[younger])
+        row[younger] = 1.0
+        if older is not None:
+            row[older] = -float(std[older] / std[younger])
+            offset -= float(mean[older] / std[younger])
+        rows += [row, -row]
+        offsets += [offset, -offset]
+    n = min(first.out_features, len(rows))
+    with torch.no_grad():
+        first.weight[:n] = torch.stack(rows[:n])
+        first.bias[:n] = torch.tensor(offsets[:n])
+    at_start_variance(net[-1])
+    return net
+
+
+def at_start_variance(head: nn.Linear) -> nn.Linear:
+    """The last layer, started from the same variance everywhere."""
+    with torch.no_grad():
+        head.weight.zero_()
+        head.bias.copy_(torch.log(torch.tensor(_START_SIGMAS) ** 2))
+    return head
+
+
+# --- Networks ---------------------------------------------------------------------------------------------------------
 
 _RATE_S = 0.2  # a robot's velocities change within about this time
 
@@ -79,7 +188,7 @@ class DisplacementNet(nn.Module):
             self.trunk, self.mean_head = net[:-1], net[-1]
         self.variance: nn.Sequential | nn.Linear
         if config.kind == "gru":
-            self.variance = start(nn.Linear(self.mean_head.in_features, 3))
+            self.variance = at_start_variance(nn.Linear(self.mean_head.in_features, 3))
         else:
             own = mlp([len(mean), *[config.variance_units] * len(config.hidden), 3])
             self.variance = variance_net(own, self.mean, self.std, self._neighbors())
@@ -193,6 +302,10 @@ def _linear(net: nn.Sequential) -> list[nn.Linear]:
 
 class NaiveNet(nn.Module):
     """v = u: nothing to learn."""
+
+    mean: Tensor
+    std: Tensor
+    scale: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         """Take the configuration."""

@@ -1,19 +1,272 @@
-"""The two descents of a training: the mean on rolled-out trajectories, then the variance on their likelihood."""
+"""Gradient descent of a training, continued from checkpoints: first the mean, then the variance."""
 
 from __future__ import annotations
 
+import copy
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from fgloc.errors import FglocError
-from fgloc_training.checkpoint import Checkpoint, Curve
-from fgloc_training.config import OptimizationConfig
+from fgloc.errors import FglocError, ModelError
+from fgloc.files.atomic import atomic_file
+from fgloc.instrumentation import end, tell
+from fgloc.sensors.learned.card import Split
+from fgloc_training.config import OptimizationConfig, TrainConfig
 from fgloc_training.data import Run
-from fgloc_training.descent import Plan, descend
-from fgloc_training.losses import composed_nll, end_errors, rollout_loss
-from fgloc_training.models import DisplacementNet, MotionNet, Samples
-from fgloc_training.planar import relative
+from fgloc_training.models import DisplacementNet, MotionNet, Samples, relative
+
+# --- Checkpoints ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """How one stage of training went: losses of the batches, and scores on what validates."""
+
+    losses: list[float] = field(default_factory=list)
+    scores: list[tuple[int, float]] = field(default_factory=list)  # after this many iterations
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """The file of one stage of one network; without a path nothing is kept."""
+
+    path: Path | None = None
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Replace what is kept, atomically."""
+        if self.path is None:
+            return
+        with atomic_file(self.path, binary=True) as file:
+            torch.save(state, file)
+
+    def load(self) -> dict[str, Any] | None:
+        """What was kept last; None if there is nothing.
+
+        Raises:
+            ModelError: the file is damaged.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        try:
+            state: dict[str, Any] = torch.load(self.path, weights_only=True)
+        except Exception as error:
+            raise ModelError(f"{self.path}: not a sound checkpoint ({error}); delete it to begin anew") from error
+        return state
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoints:
+    """All stages of one model. Another configuration, split or recording has other files, so none is mistaken."""
+
+    folder: Path | None = None
+
+    def of(self, config: TrainConfig, split: Split, runs: dict[str, Run], member: int, stage: str) -> Checkpoint:
+        """The stage's place."""
+        if self.folder is None:
+            return Checkpoint()
+        digest = hashlib.sha256((config.model_dump_json() + split.model_dump_json()).encode())
+        for name in (*split.train, *split.validation):
+            digest.update(name.encode())
+            digest.update(runs[name].poses.tobytes())
+            digest.update(runs[name].valid.tobytes())
+        return Checkpoint(self.folder / f"{digest.hexdigest()[:16]}.{member}.{stage}.pt")
+
+
+# --- Losses -----------------------------------------------------------------------------------------------------------
+
+
+def rollout_loss(predicted: Tensor, truth: Tensor, dt_s: float, config: OptimizationConfig) -> Tensor:
+    """Distance of trajectories in units of the configured sigmas, averaged; later poses weigh less, as 1/√t.
+
+    The root makes it robust: a window that nothing explains pulls with constant force.
+
+    Args:
+        predicted: ``(b, n, 3)`` seen from the start.
+        truth: ``(b, n + 1, 3)`` float64 in the map frame, from the start on.
+        dt_s: time step.
+        config: sigmas.
+
+    Source: paper section 3, the trajectory "repeats the real trajectory as closely as possible"; eq. 11 and 12.
+    """
+    error = predicted - relative(truth[:, :1], truth[:, 1:]).float()
+    position = error[..., :2].square().sum(dim=-1) / config.position_sigma_m**2
+    yaw = error[..., 2].square() / config.yaw_sigma_rad**2
+    times = torch.arange(1, predicted.shape[1] + 1) * dt_s
+    return (torch.sqrt(position + yaw + 1e-4) / torch.sqrt(times)).mean()
+
+
+def composed_nll(error: Tensor, adjoints: Tensor, log_density: Tensor, dt_s: float, beta: float = 0.0) -> Tensor:
+    """Negative log-likelihood of the errors at the ends of windows, their covariance composed from each step's.
+
+    Args:
+        error: ``(b, 3)`` right perturbation of the predicted end pose.
+        adjoints: ``(b, n, 3, 3)`` that carry each step's perturbation to the end.
+        log_density: ``(b, n, 3)`` log-variances per second.
+        dt_s: time step.
+        beta: each window weighs as its variance to this power: 0 is the likelihood, towards 1 windows that are known
+            well count no more than the others.
+
+    Source: Seitzer et al., "On the pitfalls of heteroscedastic uncertainty estimation with probabilistic neural
+    networks", ICLR 2022, eq. 5 (β-NLL).
+    """
+    variances = torch.exp(log_density) * dt_s
+    cov = torch.einsum("bnij,bnj,bnkj->bik", adjoints, variances, adjoints)
+    root = torch.linalg.cholesky(cov)
+    white = torch.linalg.solve_triangular(root, error[..., None], upper=False)[..., 0]
+    log_root = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(dim=-1)
+    losses = 0.5 * white.square().sum(dim=-1) + log_root
+    if beta == 0.0:
+        return losses.mean()
+    weights = torch.softmax(beta * 2.0 / error.shape[-1] * log_root.detach(), dim=0)
+    return (weights * losses).sum()
+
+
+def end_errors(poses: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors at the ends and the adjoints that carry earlier perturbations there, for `composed_nll`.
+
+    Args:
+        poses: ``(b, n, 3)`` predicted, seen from the start.
+        truth: ``(b, n + 1, 3)`` float64.
+    """
+    end = poses[:, -1:]
+    difference = relative(end[:, 0], relative(truth[:, 0], truth[:, -1]).float())
+    half = 0.5 * difference[..., 2]
+    a = torch.where(half.abs() < 1e-4, 1.0 - half.square() / 3.0, half / torch.tan(half))
+    x, y = difference[..., 0], difference[..., 1]
+    error = torch.stack([a * x + half * y, a * y - half * x, difference[..., 2]], dim=-1)
+    back = relative(end, poses)  # each pose seen from the end: (T_pose⁻¹ T_end)⁻¹
+    c, s = torch.cos(back[..., 2]), torch.sin(back[..., 2])
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    rows = [c, -s, back[..., 1], s, c, -back[..., 0], zero, zero, one]
+    return error, torch.stack(rows, dim=-1).reshape(*c.shape, 3, 3)
+
+
+# --- Descent ----------------------------------------------------------------------------------------------------------
+
+_MOST_GRADIENT = 5.0  # norm above which the gradient is clipped
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How long a descent goes on and how often it is judged."""
+
+    name: str
+    iterations: int
+    learning_rate: float
+    validate_every: int
+    patience: int | None  # validations without improvement after which to stop
+    anneal: bool  # lower the rate to nothing, as a cosine
+
+
+def descend(
+    plan: Plan,
+    module: nn.Module,
+    loss_of_batch: Callable[[torch.Generator], Tensor],
+    score: Callable[[], float] | None,
+    seed: int,
+    checkpoint: Checkpoint,
+) -> Curve:
+    """Adam on a module's parameters. Keeps the state with the least score, or the last if nothing is scored.
+
+    Interrupted and begun again with the same arguments it gives the same weights, bit for bit.
+    """
+    descent = _Descent(plan, module, seed)
+    first = descent.resume(checkpoint.load())
+    detail = ""
+    for i in range(first, plan.iterations + 1):
+        descent.step(loss_of_batch)
+        tell(plan.name, i, plan.iterations, "iterations", detail)
+        if i % plan.validate_every and i < plan.iterations:
+            continue
+        if score is not None:
+            descent.judge(i, score())
+            detail = f"validation {descent.curve.scores[-1][1]:.4g}"
+        checkpoint.save(descent.state(plan.iterations if descent.is_tired else i))
+        if descent.is_tired:
+            break
+    end(plan.name)
+    if score is not None:
+        module.load_state_dict(descent.best_state)
+    return descent.curve
+
+
+class _Descent:
+    """Everything that changes while it goes on.
+
+    Attributes:
+        curve: losses and scores so far.
+        best_state: the module's at the least score.
+    """
+
+    def __init__(self, plan: Plan, module: nn.Module, seed: int) -> None:
+        self._plan, self._module = plan, module
+        self._rng = torch.Generator().manual_seed(seed)
+        self._optimizer = torch.optim.Adam(module.parameters(), lr=plan.learning_rate)
+        cosine = torch.optim.lr_scheduler.CosineAnnealingLR
+        self._schedule = cosine(self._optimizer, plan.iterations) if plan.anneal else None
+        self._best, self._waited = float(np.inf), 0
+        self.best_state = copy.deepcopy(module.state_dict())
+        self.curve = Curve()
+
+    def resume(self, kept: dict[str, Any] | None) -> int:
+        """Go on where an earlier descent was stopped; the next iteration."""
+        if kept is None:
+            return 1
+        self._module.load_state_dict(kept["module"])
+        self._optimizer.load_state_dict(kept["optimizer"])
+        if self._schedule is not None:
+            self._schedule.load_state_dict(kept["schedule"])
+        self._rng.set_state(kept["rng"])
+        self._best, self.best_state, self._waited = kept["best"], kept["best_state"], kept["waited"]
+        self.curve = Curve(kept["losses"], [(int(i), float(s)) for i, s in kept["scores"]])
+        return int(kept["iteration"]) + 1
+
+    def step(self, loss_of_batch: Callable[[torch.Generator], Tensor]) -> None:
+        """One iteration."""
+        loss = loss_of_batch(self._rng)
+        self._optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._module.parameters(), _MOST_GRADIENT)
+        self._optimizer.step()
+        if self._schedule is not None:
+            self._schedule.step()
+        self.curve.losses.append(float(loss.detach()))
+
+    def judge(self, iteration: int, score: float) -> None:
+        """Note a score; the least one so far marks the best state."""
+        self.curve.scores.append((iteration, score))
+        self._waited += 1
+        if score < self._best:
+            self._best, self.best_state, self._waited = score, copy.deepcopy(self._module.state_dict()), 0
+
+    @property
+    def is_tired(self) -> bool:
+        """Whether the scores have not improved for long."""
+        return self._plan.patience is not None and self._waited >= self._plan.patience
+
+    def state(self, iteration: int) -> dict[str, Any]:
+        """What `resume` goes on from."""
+        return {
+            "iteration": iteration,
+            "module": self._module.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "schedule": {} if self._schedule is None else self._schedule.state_dict(),
+            "rng": self._rng.get_state(),
+            "best": self._best,
+            "best_state": self.best_state,
+            "waited": self._waited,
+            "losses": self.curve.losses,
+            "scores": self.curve.scores,
+        }
+
+
+# --- Mean and variance ------------------------------------------------------------------------------------------------
 
 _VARIANCE_EVERY = 25  # iterations between validations of the variance
 

@@ -1,32 +1,207 @@
-"""Identify a robot from its recordings: ``fgloc train CONFIG --data DIR --out DIR``.
+"""Identification of a robot from its recordings: ``fgloc train CONFIG --data DIR --out DIR``.
 
-Read from top to bottom: fit the known kinematics, train the mean on rolled-out trajectories with early stopping on
-validation recordings, train the variance with the mean frozen, calibrate it on the validation recordings, export.
-A run that was killed goes on from its last checkpoint when the same command is given again, and ends at the same files.
+Steps in their order: fit the known kinematics, train the mean on rolled-out trajectories with early stopping on
+validation recordings, train the variance with the mean frozen, calibrate it on the validation recordings, export. A
+run that was killed goes on from its last checkpoint when the same command is given again, and ends at the same
+files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from matplotlib.figure import Figure
 
-from fgloc.errors import ConfigError
-from fgloc.sensors.learned.card import ModelCard, Split
+from fgloc.errors import ConfigError, RecordingError
+from fgloc.files.atomic import atomic_folder, check_out
+from fgloc.instrumentation import counted
+from fgloc.sensors.base import Signal
+from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
 from fgloc.sensors.learned.sensor import Tensors, load_model, model_of, read_model, save_model
-from fgloc_training.adapt import adapted
-from fgloc_training.calibrate import fit_joint, fit_noise, fit_variance, noise_covs
-from fgloc_training.checkpoint import Checkpoints, Curve
-from fgloc_training.config import CalibrationConfig, TrainConfig
-from fgloc_training.curves import warnings_of
-from fgloc_training.data import Run
-from fgloc_training.evaluate import STEP_S, card_figures
-from fgloc_training.export import card_of, tensors_of
-from fgloc_training.members import train_member
-from fgloc_training.plots import draw_losses
+from fgloc_training.calibrate import adapted, fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
+from fgloc_training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
+from fgloc_training.data import Run, load_runs
+from fgloc_training.evaluate import STEP_S, card_figures, save
+from fgloc_training.models import DisplacementNet, MotionNet, NaiveNet, Trunk, VelocityNet
+from fgloc_training.optimize import Checkpoints, Curve, train_mean, train_variance
+from fgloc_training.recordings import controls, draw_controls
 from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
+
+# --- Networks of an ensemble ------------------------------------------------------------------------------------------
+
+_SEEDS_APART = 1_000  # between the members of an ensemble
+
+
+def train_member(
+    config: TrainConfig, split: Split, runs: dict[str, Run], member: int, checkpoints: Checkpoints
+) -> tuple[MotionNet, dict[str, Curve]]:
+    """One network and how its stages went; the members of an ensemble differ by their seed."""
+    optimization = config.optimization.model_copy(update={"seed": config.optimization.seed + _SEEDS_APART * member})
+    training, validation = ([runs[name] for name in names] for names in (split.train, split.validation))
+    kept = {stage: checkpoints.of(config, split, runs, member, stage) for stage in ("mean", "variance")}
+    torch.manual_seed(optimization.seed)
+    net = new_net(config.network, training)
+    curves = {}
+    if not isinstance(net, NaiveNet) and any(True for _ in net.parameters()):
+        curves["mean"] = train_mean(net, training, validation, optimization, kept["mean"])
+    if isinstance(net, DisplacementNet):
+        curves["variance"] = train_variance(net, training, validation, optimization, kept["variance"])
+    return net, curves
+
+
+def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
+    """An untrained network on top of what is known of these recordings' robot."""
+    if config.kind == "naive":
+        return NaiveNet(config)
+    kinematics = fit_kinematics(training)
+    if config.kind in ("displacement", "gru"):
+        wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
+        return DisplacementNet(config, kinematics, wheel_kinematics, training)
+    lag = None if config.kind == "rate" else fit_lag(training, kinematics)
+    return VelocityNet(config, kinematics, lag, training)
+
+
+def _wheels_of(run: Run) -> Signal:
+    wheels = run.sensors.signals(("wheels",), run.origin_ns).named("wheels")
+    if wheels is None:
+        raise RecordingError(
+            f"{run.name}: the model is to read the wheels, but no joints with known geometry are there"
+        )
+    return wheels
+
+
+# --- Curves of a training ---------------------------------------------------------------------------------------------
+
+_SMOOTH = 25  # batches in the running mean of a loss
+_WORSE_DRIFT = 1.2  # last validated drift over the best one; less is the scatter between validations
+_WORSE_NLL = 3.0  # nats of the mean negative log-likelihood of a window: its errors are e³ times less likely
+
+
+def warnings_of(curves: Mapping[str, Curve]) -> list[str]:
+    """Sentences on stages whose validation went wrong; none if all is well.
+
+    Args:
+        curves: by stage: ``mean`` scores are drifts [%], ``variance`` scores negative log-likelihoods.
+    """
+    return [text for stage, curve in curves.items() if (text := _warning(stage, curve)) is not None]
+
+
+def _warning(stage: str, curve: Curve) -> str | None:
+    if not curve.scores:
+        return None
+    kind = "drift of the validation recordings [%]" if stage.startswith("mean") else "negative log-likelihood"
+    finite = [(i, s) for i, s in curve.scores if math.isfinite(s)]
+    if not finite:
+        return f"{stage}: the {kind} is not finite; the recordings hold errors that no variance explains"
+    (first_at, first), (last_at, last) = finite[0], finite[-1]
+    best_at, best = min(finite, key=lambda pair: pair[1])
+    worse = last > _WORSE_DRIFT * best if stage.startswith("mean") else last > best + _WORSE_NLL
+    if not worse:
+        return None
+    kept = f"the state of iteration {best_at} is kept"
+    if best_at == first_at and len(finite) > 1:
+        return (
+            f"{stage}: the {kind} got worse from the first validation on, from {first:.3g} to {last:.3g} at iteration "
+            f"{last_at} ({kept}): the validation recordings differ from those that train, or these are too few; record "
+            "more like them, or give a smaller network (network.hidden)"
+        )
+    return (
+        f"{stage}: the {kind} got worse after iteration {best_at}, from {best:.3g} to {last:.3g} at iteration "
+        f"{last_at} ({kept}): the network learns the training recordings by heart; record more, or give a smaller "
+        "network (network.hidden)"
+    )
+
+
+def draw_losses(path: Path, curves: dict[str, Curve]) -> None:
+    """Losses of the batches and scores on the validation recordings, a panel for each stage."""
+    figure = Figure(figsize=(5.5 * len(curves), 3.6), layout="constrained")
+    for axes, (name, curve) in zip(np.atleast_1d(figure.subplots(1, len(curves))), curves.items(), strict=True):
+        losses = np.array(curve.losses)
+        axes.plot(np.arange(1, len(losses) + 1), losses, color="0.8", linewidth=0.6, label="batch")
+        if len(losses) > _SMOOTH:
+            mean = np.convolve(losses, np.full(_SMOOTH, 1.0 / _SMOOTH), "valid")
+            axes.plot(np.arange(_SMOOTH, len(losses) + 1), mean, color="C0", label=f"mean of {_SMOOTH} batches")
+        axes.set_title(name, pad=20)
+        axes.set(xlabel="iteration", ylabel="training loss")
+        low, high = np.percentile(losses, [0.5, 99.5]) if len(losses) else (0.0, 1.0)
+        axes.set_ylim(low - 0.05 * (high - low) - 1e-9, high + 0.05 * (high - low) + 1e-9)
+        lines = list(axes.get_lines())
+        if curve.scores:
+            other = axes.twinx()
+            at, scores = np.array(curve.scores).T
+            lines += other.plot(at, scores, "o-", color="C1", markersize=3, label="validation")
+            best = int(np.argmin(scores))
+            lines += other.plot(at[best], scores[best], "o", color="C3", label="kept")
+            other.set_ylabel("drift [%]" if name.startswith("mean") else "negative log-likelihood")
+        axes.legend(
+            handles=lines, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(lines), frameon=False
+        )
+    save(figure, path)
+
+
+# --- Model files ------------------------------------------------------------------------------------------------------
+
+_WARM_UP_S = 2.0  # a velocity model that is given no velocity starts from rest this long ago
+
+
+def tensors_of(nets: list[MotionNet]) -> Tensors:
+    """Weights by the names that `fgloc.sensors.learned.load_model` expects; those of several networks stacked."""
+    out: Tensors = {}
+    for i, members in enumerate(zip(*(net.layers() for net in nets), strict=True)):
+        for name, tensors in zip(("weight", "bias"), zip(*members, strict=True), strict=True):
+            arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors]
+            out[f"layer{i}.{name}"] = np.stack(arrays) if len(arrays) > 1 else arrays[0]
+    if isinstance(nets[0], DisplacementNet) and isinstance(nets[0].trunk, Trunk):
+        out |= {name: tensor.detach().numpy() for name, tensor in nets[0].trunk.weights().items()}
+    return out
+
+
+def _widths(net: MotionNet) -> tuple[int, ...]:
+    """Of the hidden layers as `tensors_of` stacks them."""
+    kind, hidden = net.config.kind, net.config.hidden
+    if kind in ("naive", "lag", "arx"):
+        return ()
+    return tuple(h + net.config.variance_units for h in hidden) if kind == "displacement" else hidden
+
+
+def card_of(net: MotionNet, config: TrainConfig, split: Split, made_by: str) -> ModelCard:
+    """The card of a network that is trained and not yet calibrated."""
+    network = config.network
+    displacement = isinstance(net, DisplacementNet)
+    velocity = isinstance(net, VelocityNet)
+    return ModelCard.model_validate(
+        dict(
+            kind=network.kind,
+            robot=config.robot,
+            inputs=network.inputs if displacement else ("commands", "velocity") if velocity else ("commands",),
+            dt_s=network.dt_s,
+            hidden=_widths(net),
+            members=network.members,
+            hold_s=network.hold_s,
+            history_s=max(network.edges_s[-1], net.kinematics.delay_s) if displacement else _WARM_UP_S,
+            kinematics=net.kinematics,
+            lag=None if displacement else net.lag,
+            edges_s=network.edges_s if displacement else (),
+            joints=net.joints if displacement and {"effort", "wheels"} & set(network.inputs) else None,
+            signal_edges_s=network.signal_edges_s,
+            wheel_kinematics=net.wheel_kinematics if displacement else {},
+            velocity_decay_s=network.velocity_decay_s,
+            input_mean=net.mean.tolist(),
+            input_std=net.std.tolist(),
+            output_scale=net.scale.tolist(),
+            noise=None if displacement else {},
+            split=split,
+            made_by=made_by,
+        )
+    )
+
+
+# --- One model --------------------------------------------------------------------------------------------------------
 
 _NOTHING_KEPT = Checkpoints()
 
@@ -193,3 +368,93 @@ def train_on_all(
 
 def _mean(dumps: list[dict[str, object]]) -> dict[str, object]:
     return {key: np.mean([d[key] for d in dumps], axis=0).tolist() for key in dumps[0]}  # type: ignore[arg-type]
+
+
+# --- All models of a configuration ------------------------------------------------------------------------------------
+
+CHECKPOINTS = ".checkpoints"
+
+
+@dataclass(frozen=True, slots=True)
+class Reporter:
+    """Where messages go: `say` those on each finished model, `warn` those on what looks wrong."""
+
+    say: Callable[[str], None]
+    warn: Callable[[str], None]
+
+
+def train_models(config_file: Path, data: Path, out: Path, start: Path | None, reporter: Reporter) -> list[Path]:
+    """Train what a configuration asks for. Interrupted and run again it goes on, and ends at the same files.
+
+    Args:
+        config_file: see `fgloc_training.config.TrainConfig`.
+        data: folder that the recordings' paths are relative to.
+        out: folder of the models; it appears whole.
+        start: a model to adapt, instead of training one.
+        reporter: where messages go.
+
+    Returns:
+        The models' files.
+
+    Raises:
+        ConfigError: the configuration is wrong.
+        RecordingError: a recording cannot be used.
+        OutputError: `out` cannot be written.
+    """
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    config = load_train_config(config_file)
+    check_out(out)
+    made_by = f"fgloc train {config_file.as_posix()}; {config.model_dump_json()}"
+    smoothed = {name: data / folder for name, folder in config.truth.items()}
+    parts = {
+        name: load_runs(data / bag, name, config.network.dt_s, config.data, smoothed.get(name))
+        for name, bag in counted(config.recordings.items(), "reading", len(config.recordings), "recordings")
+    }
+    runs = {name: run for part in parts.values() for name, run in part.items()}
+    if config.split is not None:
+        config = config.model_copy(update={"split": _in_parts(config.split, parts)})
+    with atomic_folder(out, own=("*.safetensors", "*.png", CHECKPOINTS)) as stage:
+        if start is not None:
+            path = stage / "model.safetensors"
+            reporter.say(_figures(path.stem, adapt(start, config, runs, path, f"{made_by}; from {start.name}")))
+        else:
+            _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), reporter)
+        names = sorted(path.name for path in stage.glob("*.safetensors"))
+    return [out / name for name in names]
+
+
+def _train_all(
+    config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, reporter: Reporter
+) -> None:
+    """The model of the configuration's split, or one for each recording left out, and one of all."""
+    trained = list(runs) if config.split is None else config.split.train
+    found = controls([runs[name] for name in trained], config.limits)
+    draw_controls(out / "controls.png", found)
+    for missing in found.missing():
+        reporter.warn(f"the recordings hold too little of {missing}")
+    if config.split is not None:
+        path = out / "model.safetensors"
+        card = train(config, config.split, runs, path, made_by, checkpoints, reporter.warn)
+        reporter.say(_figures(path.stem, card))
+        return
+    folds = []
+    for split in leave_one_out(list(runs)):
+        path = out / f"without_{split.test[0]}.safetensors"
+        folds.append(train(config, split, runs, path, made_by, checkpoints, reporter.warn))
+        reporter.say(_figures(path.stem, folds[-1]))
+    reporter.say(_figures("all", train_on_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints)))
+
+
+def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
+    """The split of recordings as one of the runs that they are made of."""
+
+    def names(recordings: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(name for recording in recordings for name in parts[recording])
+
+    return Split(train=names(split.train), validation=names(split.validation), test=names(split.test))
+
+
+def _figures(name: str, card: ModelCard) -> str:
+    figures = ", ".join(f"{k} {v:g}" for k, v in card.figures.items() if k.startswith(("drift", "nis")))
+    return f"{name}: {figures}"

@@ -10,8 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fgloc_datasets.sim.scenario import Control, ControlKind, Robot, Scenario
-from fgloc_datasets.sim.section import channel_rng
+from fgloc_datasets.sim.scenario import Control, ControlKind, Robot, Scenario, channel_rng
 
 Command = tuple[float, float]  # v [m/s], ω [rad/s]
 Function = Callable[[float], Command]  # of the time within the segment [s]

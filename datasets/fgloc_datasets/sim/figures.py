@@ -24,11 +24,17 @@ from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, LandmarkMap
-from fgloc_datasets.sim.ground import make_ground, outline
 from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.scene import make_ground, outline
 from fgloc_datasets.sim.sensors import EPOCH_NS
 
-STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.spines.top": False, "axes.spines.right": False}
+STYLE: Any = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
 _SHEET = (4, 3)  # columns and rows
 _EPOCH_S = EPOCH_NS // 1_000_000_000
 

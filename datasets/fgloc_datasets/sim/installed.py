@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from fgloc.files.settings import Settings
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, Landmark, LandmarkMap
-from fgloc_datasets.sim.installation import Installation
-from fgloc_datasets.sim.mjcf import intrinsics, optical_rotation
-from fgloc_datasets.sim.scenario import Camera, Robot, Scenario
-from fgloc_datasets.sim.section import Section, Vector2, Vector3, channel_rng
+from fgloc_datasets.sim.scenario import Camera, Installation, Robot, Scenario, Section, Vector2, Vector3, channel_rng
+from fgloc_datasets.sim.scene import intrinsics, optical_rotation
 
 INSTALLED = "installed.yaml"
 
@@ -233,8 +232,6 @@ def _true_wheels(robot: Robot, seed: int, errors: Installation) -> TrueWheels:
 
 
 def _marker(landmark: Landmark) -> Marker:
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = (float(v) for v in Rotation.from_matrix(landmark.rotation).as_quat())
     return Marker(
         id=landmark.landmark_id, position=_triple(landmark.position), quaternion=(x, y, z, w), size=landmark.size_m

@@ -18,11 +18,9 @@ from fgloc.errors import FglocError
 from fgloc.frames import yaw_quaternion
 from fgloc.types import FloatArray, LandmarkMap
 from fgloc_datasets.sim.control import Command, Driver
-from fgloc_datasets.sim.ground import Ground, make_ground
 from fgloc_datasets.sim.installed import Installed, install, survey, true_robot
-from fgloc_datasets.sim.mjcf import build_model, wheel_names
-from fgloc_datasets.sim.room import make_map
 from fgloc_datasets.sim.scenario import Robot, Scenario
+from fgloc_datasets.sim.scene import Ground, build_model, make_ground, make_map, wheel_names
 
 TICK_S = 0.005
 _SETTLE_S = 0.5

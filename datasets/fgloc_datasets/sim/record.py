@@ -1,27 +1,37 @@
-"""Recording: a scenario and a seed in; a bag, a map, a robot file, the truth and the resolved scenario out."""
+"""Recording of simulated runs: a scenario and a seed as bag, map, robot file and truth; suites in processes."""
 
 from __future__ import annotations
 
 import heapq
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from importlib.metadata import version
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import yaml
+from pydantic import Field
 
+from fgloc.errors import ConfigError, FglocError
 from fgloc.files.atomic import atomic_folder
+from fgloc.files.settings import Settings
 from fgloc.instrumentation import counted
 from fgloc.sensors.maps import write_map
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import write_robot
 from fgloc_datasets.sim.installed import INSTALLED, write_installed
-from fgloc_datasets.sim.mjcf import wheel_names
-from fgloc_datasets.sim.physics import Scene, make_scene, simulate
-from fgloc_datasets.sim.positioning import gnss_settings, uwb_settings
-from fgloc_datasets.sim.scenario import Scenario
-from fgloc_datasets.sim.sensors import streams
+from fgloc_datasets.sim.physics import Scene, SimulationError, make_scene, simulate
+from fgloc_datasets.sim.scenario import Control, Scenario, Section
+from fgloc_datasets.sim.scene import wheel_names
+from fgloc_datasets.sim.sensors import gnss_settings, streams, uwb_settings
+
+# --- One run ----------------------------------------------------------------------------------------------------------
 
 DONE = "scenario.yaml"  # a folder that holds it is complete
 RUN_FILES = ("bag", "map.yaml", "robot.yaml", INSTALLED, DONE)
@@ -131,3 +141,142 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
         wheels |= {"scale_sigma": 0.01, "turn_scale_sigma": 0.01, "yaw_per_m_sigma": 0.05}
         settings["motion"] = {"model": "shipped:sim/diff_drive"}
     return settings
+
+
+# --- A suite ----------------------------------------------------------------------------------------------------------
+
+BUNDLED = Path(__file__).parent / "suite.yaml"
+
+
+class Run(Section):
+    """One recording of a scenario: a seed, and what differs from the scenario."""
+
+    split: Literal["train", "validation", "test"]
+    seed: int = Field(ge=0)
+    duration_s: float | None = Field(None, gt=0)
+    control: Control | None = None
+
+
+class Entry(Section):
+    """A scenario and its runs."""
+
+    scenario: Scenario
+    runs: tuple[Run, ...] = ()
+
+
+class Suite(Section):
+    """Several scenarios."""
+
+    entries: tuple[Entry, ...]
+
+    def find(self, name: str) -> Scenario:
+        """The scenario of this name.
+
+        Raises:
+            ConfigError: there is none; those that there are are listed.
+        """
+        for entry in self.entries:
+            if entry.scenario.name == name:
+                return entry.scenario
+        names = ", ".join(e.scenario.name for e in self.entries)
+        raise ConfigError(f"scenario '{name}' is not in the suite; it has {names}; or give a YAML file")
+
+    def perfect(self) -> Suite:
+        """The same scenarios where all is exactly as written."""
+        entries = (
+            entry.model_copy(update={"scenario": entry.scenario.model_copy(update={"installation": None})})
+            for entry in self.entries
+        )
+        return Suite(entries=tuple(entries))
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run to be recorded."""
+
+    scenario: Scenario
+    seed: int
+    folder: str  # below the suite's
+    split: str
+
+
+def jobs(suite: Suite, longest_s: float | None = None) -> list[Job]:
+    """All runs of a suite, longest first, each cut to ``longest_s``."""
+    out = []
+    for entry in suite.entries:
+        for run in entry.runs:
+            seconds = run.duration_s or entry.scenario.duration_s
+            changes = {
+                "duration_s": seconds if longest_s is None else min(seconds, longest_s),
+                "control": run.control or entry.scenario.control,
+            }
+            scenario = entry.scenario.model_copy(update=changes)
+            out.append(Job(scenario, run.seed, f"{scenario.name}/{run.split}_{run.seed}", run.split))
+    return sorted(out, key=lambda job: -job.scenario.duration_s)
+
+
+def record_suite(
+    todo: list[Job], out: Path, camera: bool, workers: int, said: Callable[[str], None] = lambda _: None
+) -> int:
+    """Record runs in ``workers`` processes. Runs that ``out`` already holds are skipped, so a killed suite resumes.
+
+    Args:
+        todo: what to record.
+        out: a folder for the suite; each run gets its own below it.
+        camera: render images.
+        workers: processes.
+        said: told of each run that was recorded.
+
+    Returns:
+        How many runs were recorded now.
+
+    Raises:
+        SimulationError: runs failed; the others are recorded all the same.
+    """
+    left = [job for job in todo if not is_recorded(job.scenario, job.seed, out / job.folder, camera)]
+    failed: list[str] = []
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's: one core for each worker
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
+        futures = {pool.submit(record, j.scenario, j.seed, out / j.folder, camera): j for j in left}
+        for future in counted(as_completed(futures), "recording", len(left), "runs"):
+            folder = futures[future].folder
+            try:
+                future.result()
+                said(folder)
+            except FglocError as error:
+                failed.append(f"  {folder}: {error}")
+    if failed:
+        raise SimulationError(f"{len(failed)} of {len(left)} runs failed:\n" + "\n".join(failed))
+    return len(left)
+
+
+def _end_with_parent() -> None:
+    """Let a worker end when its parent is killed, so that none writes into a suite that is being resumed."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def load_suite(path: Path) -> Suite:
+    """Read a suite, or a single scenario as a suite of one. A key ``parts`` holds what is only referred to.
+
+    Raises:
+        ConfigError: no such file, no YAML, an unknown key or a value out of range; all are named.
+    """
+    settings = Settings(path, "give 'entries' (a suite) or the keys of a scenario")
+    settings.content.pop("parts", None)
+    if "entries" in settings.content:
+        return settings.validated(Suite)
+    return Suite(entries=(Entry(scenario=settings.validated(Scenario)),))
+
+
+def find_scenario(what: str) -> Scenario:
+    """A scenario of the bundled suite by name, or of a YAML file."""
+    if Path(what).suffix in (".yaml", ".yml"):
+        return load_suite(Path(what)).entries[0].scenario
+    return load_suite(BUNDLED).find(what)

@@ -1,19 +1,196 @@
-"""Every parameter of a simulated run: robot, world, sensors, control. Strict: unknown keys are errors.
+"""Every parameter of a simulated run: robot, floor, world, sensors, control, installation. Unknown keys are errors.
 
 The contact and motor figures were measured: with them true and wheel motion agree on a grippy floor, and wheels slip
 by friction where the floor is not.
+
+`Installation` says how far a robot, its camera and the markers are from what is written of them: an installer
+measures where markers hang, calibrates the camera, copies a wheel's radius from its data sheet, and is never quite
+right. What stands beside the bag or in it (``map.yaml``, ``robot.yaml``, ``camera_info``, ``tf_static``) is what the
+installer believes; ``installed.yaml`` is the truth.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from typing import Annotated, Any, Literal
 
 import cv2
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from fgloc_datasets.sim.floor import Floor
-from fgloc_datasets.sim.installation import NamedInstallation
-from fgloc_datasets.sim.section import Positive, Section, Vector2, Vector3
+from fgloc.types import FloatArray
+
+# --- Sections ---------------------------------------------------------------------------------------------------------
+
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Section(BaseModel):
+    """A part of a scenario: unknown keys are errors, values are immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def channel_rng(seed: int, channel: str) -> np.random.Generator:
+    """A generator of its own for each use, so that adding one draw does not change the others."""
+    return np.random.default_rng([seed, *channel.encode()])
+
+
+# --- Floors -----------------------------------------------------------------------------------------------------------
+
+
+class Patch(Section):
+    """A piece of floor with its own friction. ``points`` only for a polygon, relative to the center."""
+
+    shape: Literal["ellipse", "rectangle", "polygon"] = "ellipse"
+    center: Vector2
+    size: Vector2 = (1.0, 1.0)  # full length and width
+    yaw_deg: float = 0.0
+    points: tuple[Vector2, ...] = ()
+    mu: Positive
+
+
+class RandomPatches(Section):
+    """Patches of all shapes, drawn by the seed."""
+
+    count: int = Field(ge=0)
+    mu: Vector2 = (0.04, 0.15)
+    size_m: Vector2 = (0.6, 1.6)
+
+
+class Ramp(Section):
+    """Up, level, down along x."""
+
+    start_x: float
+    angle_deg: Positive = 7.0
+    rise_m: Positive = 1.0  # horizontal length of each slope
+    top_m: Positive = 1.0
+    center_y: float = 0.0
+    width_m: Positive = 2.0
+
+
+class Humps(Section):
+    """Smooth humps drawn by the seed."""
+
+    count: int = Field(ge=0)
+    height_m: Vector2 = (0.01, 0.03)
+    sigma_m: Vector2 = (0.12, 0.25)
+
+
+class Tilt(Section):
+    """The whole floor leans; it keeps its height in the middle of the room."""
+
+    slope_deg: float = Field(gt=0, le=15)
+    direction_deg: float = 0.0  # in which it rises
+
+    def height(self, x: float | FloatArray, y: float | FloatArray) -> float | FloatArray:
+        """Height [m] at a place [m]."""
+        c, s = math.cos(math.radians(self.direction_deg)), math.sin(math.radians(self.direction_deg))
+        return math.tan(math.radians(self.slope_deg)) * (c * x + s * y)
+
+
+class Rough(Section):
+    """A random field of heights, drawn by the seed: from ``height_m`` below the floor to ``height_m`` above it."""
+
+    height_m: Positive = 0.03
+    length_m: float = Field(0.3, ge=0.1)  # standard deviation of the Gaussian that smooths white noise
+
+
+class Floor(Section):
+    """Friction and height of the ground."""
+
+    mu: Positive = 0.8
+    patches: tuple[Patch, ...] = ()
+    random_patches: RandomPatches | None = None
+    ramp: Ramp | None = None
+    humps: Humps | None = None
+    ramps: tuple[Ramp, ...] = ()  # further ones
+    tilt: Tilt | None = None
+    rough: Rough | None = None
+
+    @property
+    def uneven(self) -> bool:
+        """Whether there is any height at all."""
+        return bool(self.ramp or self.humps or self.ramps or self.tilt or self.rough)
+
+
+# --- Installation -----------------------------------------------------------------------------------------------------
+
+Spread = Annotated[float, Field(ge=0)]
+_NAMES = ("as_installed", "perfect")
+
+
+class Installation(Section):
+    """Errors of an installation; each is drawn by the seed on a channel of its own. All are 0 unless given.
+
+    So ``Installation()`` has no error at all, ``Installation(marker_position_m=0.005)`` one of a single kind (the very
+    draw that it has among others), and ``Installation.as_installed()`` those of a careful person. In YAML:
+    ``installation: as_installed``, or ``installation: {marker_position_m: 0.005}``.
+    """
+
+    marker_position_m: Spread = 0.0  # sigma per axis, of what the map says
+    marker_direction_deg: Spread = 0.0  # sigma, about the vertical
+    marker_tilt_deg: Spread = 0.0  # sigma, about the marker's right and about its normal
+    camera_position_m: Spread = 0.0  # sigma per axis, of what tf says
+    camera_angle_deg: Spread = 0.0  # sigma per axis
+    focal_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform, fx and fy alike
+    principal_point_px: Spread = 0.0  # plus or minus per axis, uniform
+    distortion_k1: Spread = 0.0  # sigma
+    distortion_k2: Spread = 0.0  # sigma
+    camera_time_s: Spread = 0.0  # plus or minus, uniform: by how much stamps are later than the middle of the exposure
+    camera_jitter_s: Spread = 0.0  # sigma, anew for each image
+    wheel_time_s: Spread = 0.0  # plus or minus, uniform: of /odom and /joint_states, which are one packet
+    imu_time_s: Spread = 0.0  # plus or minus, uniform
+    wheel_radius_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform, both wheels: true over believed
+    wheel_difference_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: left over right
+    track_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: true over believed
+    imu_angle_deg: Spread = 0.0  # sigma per axis
+    gyro_scale_share: float = Field(0.0, ge=0, lt=0.1)  # sigma
+
+    @classmethod
+    def as_installed(cls) -> Installation:
+        """What a careful person leaves: tape measure and spirit level, checkerboard, data sheet, no common clock.
+
+        A checkerboard seldom reaches the image's corners: k1 and k2 stay uncertain by some thousandths. 0.005 of each
+        is 0.15 px half way to the corner of a camera of 640 x 480 at 525 px, where boards were seen, and 1.3 px in it.
+        """
+        return cls(
+            marker_position_m=0.005,
+            marker_direction_deg=0.5,
+            marker_tilt_deg=0.5,
+            camera_position_m=0.003,
+            camera_angle_deg=0.4,
+            focal_share=0.005,
+            principal_point_px=3.0,
+            distortion_k1=0.005,
+            distortion_k2=0.005,
+            camera_time_s=0.020,
+            camera_jitter_s=0.002,
+            wheel_time_s=0.005,
+            imu_time_s=0.005,
+            wheel_radius_share=0.01,
+            wheel_difference_share=0.004,
+            track_share=0.015,
+            imu_angle_deg=0.5,
+            gyro_scale_share=0.005,
+        )
+
+
+def _named(value: Any) -> Any:
+    """Read the names that stand for whole installations."""
+    if not isinstance(value, str):
+        return value
+    if value not in _NAMES:
+        raise ValueError(f"installation {value!r} is not known; expected {' or '.join(_NAMES)}, or a mapping of errors")
+    return None if value == "perfect" else Installation.as_installed()
+
+
+NamedInstallation = Annotated[Installation | None, BeforeValidator(_named)]
+
+
+# --- Scenarios --------------------------------------------------------------------------------------------------------
 
 # --- Robot ------------------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,10 @@
-"""What the robot's channels say about a log: streams of messages in the order of their arrival.
+"""Streams of messages from the robot's channels about a log, in the order of their arrival.
 
 When a message is received is known from the start; what it says is computed when it is written. So a finished log is
 written as a whole, and one that is still being filled as far as it reaches (`fgloc_datasets.sim.following`).
+
+Errors of UWB ranges and GNSS positions that last (no line of sight, multipath) come in stretches: a two-state Markov
+chain of the given share and mean length, with one draw of the error for each stretch.
 """
 
 from __future__ import annotations
@@ -9,27 +12,262 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fgloc.frames import rpy_matrix
+from fgloc import se2
+from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message
-from fgloc_datasets.sim.camera import Exposure, Shot, exposures, light_level, shots
-from fgloc_datasets.sim.corners import CornerDetector
+from fgloc_datasets.sim.camera import CornerDetector, Exposure, Shot, exposures, light_level, shots
 from fgloc_datasets.sim.installed import camera_jitter_s
-from fgloc_datasets.sim.mjcf import wheel_names
 from fgloc_datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
-from fgloc_datasets.sim.positioning import gnss_places, uwb_ranges
-from fgloc_datasets.sim.readings import encoders, mean_over, odometry, specific_force
-from fgloc_datasets.sim.rows import Rows
-from fgloc_datasets.sim.scenario import Gnss, Uwb
-from fgloc_datasets.sim.section import channel_rng
+from fgloc_datasets.sim.scenario import Gnss, Robot, Scenario, Uwb, channel_rng
+from fgloc_datasets.sim.scene import wheel_names
+
+# --- Rows -------------------------------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+
+
+class Rows(Generic[T]):
+    """Message by message, in order: from a finished log all are computed at once, else those that can be."""
+
+    def __init__(self, log: Log, ticks: IntArray, make: Callable[[int, int], T]) -> None:
+        """Compute nothing yet.
+
+        Args:
+            log: of the run, which may still go on.
+            ticks: ``(n,)`` row of the log that each message is of, ascending.
+            make: values of the messages from the first to before the last; asked in order, without gaps.
+        """
+        self._log, self._ticks, self._make = log, ticks, make
+        self._first = self._last = 0
+        self._block: T | None = None
+
+    def at(self, i: int) -> tuple[T, int]:
+        """A block of values and the message's row in it. Messages of earlier blocks are gone.
+
+        Raises:
+            IndexError: the log does not reach the message, or its block is gone.
+        """
+        if i >= self._last:
+            self._first, self._last = self._last, int(np.searchsorted(self._ticks, self._log.ticks))
+            self._block = self._make(self._first, self._last) if self._last > self._first else None
+        if self._block is None or not self._first <= i < self._last:
+            raise IndexError(
+                f"message {i}: the log has {self._log.ticks} ticks, the block {self._first} to {self._last}"
+            )
+        return self._block, i - self._first
+
+
+# --- Wheels and inertial sensors --------------------------------------------------------------------------------------
+
+_GRAVITY = np.array([0.0, 0.0, 9.81])
+
+
+def odometry(
+    log: Log, robot: Robot, every: int, messages: slice = slice(0, None), before: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """What the robot's driver makes of its encoders every ``every`` ticks.
+
+    Args:
+        log: of the run.
+        robot: whose *nominal* radii and track are taken.
+        every: ticks.
+        messages: which of them.
+        before: ``(3,)`` pose at the message before the first; None: there is none.
+
+    Returns:
+        Poses ``(n, 3)`` and twists ``(n, 2)`` (v, ω) of the last interval.
+    """
+    turned = encoders(log, robot, every, messages)[1]
+    left = turned[:, 0::2].mean(axis=1) * robot.radius_m
+    right = turned[:, 1::2].mean(axis=1) * robot.radius_m
+    along, turn = 0.5 * (left + right), (right - left) / (robot.track_m * robot.track_scale)
+    poses = np.zeros((len(turned), 3))
+    for i in range(len(poses)):
+        last = poses[i - 1] if i else before
+        if last is not None:
+            poses[i] = se2.compose(last, se2.exp((along[i], 0.0, turn[i])))
+    return poses, np.column_stack([along, turn]) / (every * TICK_S)
+
+
+def encoders(log: Log, robot: Robot, every: int, messages: slice) -> tuple[FloatArray, FloatArray]:
+    """Wheel angles of messages in whole encoder ticks, and how far each has turned since the message before [rad]."""
+    first = max(messages.start - 1, 0)  # the one before
+    last = None if messages.stop is None else (messages.stop - 1) * every + 1
+    tick = 2.0 * math.pi / robot.ticks_per_turn
+    angles = np.asarray(np.floor(log.wheel_angles[first * every : last : every] / tick) * tick)
+    turned = np.diff(angles, axis=0, prepend=angles[:1])
+    return angles[messages.start - first :], turned[messages.start - first :]
+
+
+def specific_force(log: Log, every: int, first: int, last: int, at: Sequence[float]) -> FloatArray:
+    """Means of the specific force over the samples ``(n, 3)`` [m/s²] at a place of the base, in its axes."""
+    before = max(first - 1, 0)
+    part = log.part(slice(before * every, (last - 1) * every + 1, every))
+    rotation = np.array([quaternion_matrix(q) for q in part.quaternions])
+    speeds = part.velocities + np.einsum("nij,nj->ni", rotation, np.cross(part.rates, at))
+    gained = np.diff(speeds, axis=0, prepend=speeds[:1]) / (every * TICK_S) + _GRAVITY
+    return np.asarray(np.einsum("nji,nj->ni", rotation, gained)[first - before :])
+
+
+def mean_over(values: FloatArray, every: int, first: int, last: int) -> FloatArray:
+    """Means ``(n, d)`` of the ``every`` ticks up to each of the messages from the first to before the last.
+
+    Message 0 has one tick.
+    """
+    head = values[:1] if first == 0 else values[:0]
+    after = max(first - 1, 0)
+    rows = values[1 + after * every : 1 + (last - 1) * every].reshape(-1, every, values.shape[1])
+    return np.concatenate([head, rows.mean(axis=1)])
+
+
+# --- GNSS and UWB -----------------------------------------------------------------------------------------------------
+
+Values = Callable[[int, int], FloatArray]
+_SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84
+_ITERATIONS = 8  # of the latitude; each gains two digits
+
+
+def anchors(scenario: Scenario, uwb: Uwb) -> FloatArray:
+    """Places ``(n, 3)`` in the map, evenly along the walls; anchor i has the number i + 1."""
+    length, width = scenario.world.size_m
+    along = (np.arange(uwb.anchors) + 0.5) / uwb.anchors * 2.0 * (length + width)
+    places = np.zeros((uwb.anchors, 3))
+    for i, s in enumerate(along):
+        if s < length:
+            x, y = s, 0.0
+        elif s < length + width:
+            x, y = length, s - length
+        elif s < 2.0 * length + width:
+            x, y = 2.0 * length + width - s, width
+        else:
+            x, y = 0.0, 2.0 * (length + width) - s
+        places[i] = x - 0.5 * length, y - 0.5 * width, uwb.heights_m[i % 2]
+    return places
+
+
+def uwb_ranges(scenario: Scenario, uwb: Uwb, log: Log, seed: int) -> tuple[IntArray, IntArray, Values]:
+    """Ticks of the log and numbers of the anchors, each ``(n,)``; and the ranges [m] of messages i to j."""
+    rng = channel_rng(seed, "uwb")
+    ticks = _fix_ticks(log, uwb.rate_hz)
+    which = np.arange(len(ticks)) % uwb.anchors
+    places = anchors(scenario, uwb)
+    seconds = log.stamps_s[ticks]
+    excess = np.zeros(len(ticks))
+    for anchor in range(uwb.anchors):
+        mine = np.flatnonzero(which == anchor)
+        stretch = _stretches(rng, seconds[mine], uwb.nlos_share, uwb.nlos_s)
+        draws = rng.exponential(uwb.nlos_mean_m, int(stretch.max(initial=0)) + 1)
+        excess[mine] = np.where(stretch > 0, draws[stretch], 0.0)
+    noise = rng.normal(0.0, uwb.sigma_m, len(ticks))
+
+    def ranges(first: int, last: int) -> FloatArray:
+        these = slice(first, last)
+        true = np.linalg.norm(_points(log, ticks[these], uwb.tag) - places[which[these]], axis=1)
+        return np.asarray(np.maximum(true + excess[these] + noise[these], 0.1))
+
+    return ticks, which + 1, ranges
+
+
+def uwb_settings(scenario: Scenario, uwb: Uwb) -> dict[str, Any]:
+    """Section ``uwb`` of ``robot.yaml``: what the installer surveyed, exactly."""
+    places = {i + 1: [round(float(v), 4) for v in place] for i, place in enumerate(anchors(scenario, uwb))}
+    return {"anchors": places, "tag": list(uwb.tag), "sigma_m": uwb.sigma_m}
+
+
+def gnss_places(gnss: Gnss, log: Log, seed: int) -> tuple[IntArray, Values]:
+    """Ticks of the log ``(n,)``; and latitude, longitude [degrees], altitude [m] ``(., 3)`` of messages i to j."""
+    rng = channel_rng(seed, "gnss")
+    ticks = _fix_ticks(log, gnss.rate_hz)
+    stretch = _stretches(rng, log.stamps_s[ticks], gnss.multipath_share, gnss.multipath_s)
+    count = int(stretch.max(initial=0)) + 1
+    far, direction = rng.exponential(gnss.multipath_mean_m, count), rng.uniform(-math.pi, math.pi, count)
+    off = np.where(stretch > 0, far[stretch], 0.0)
+    c, s = math.cos(gnss.yaw_rad), math.sin(gnss.yaw_rad)
+    east, north = (rng.normal(0.0, gnss.sigma_m, len(ticks)) for _ in range(2))
+    east, north = off * np.cos(direction[stretch]) + east, off * np.sin(direction[stretch]) + north
+
+    def places(first: int, last: int) -> FloatArray:
+        enu = _points(log, ticks[first:last], gnss.antenna) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+        enu[:, 0] += east[first:last]
+        enu[:, 1] += north[first:last]
+        return geodetic(enu, gnss.origin)
+
+    return ticks, places
+
+
+def gnss_settings(gnss: Gnss) -> dict[str, Any]:
+    """Section ``gnss`` of ``robot.yaml``."""
+    return {"origin": list(gnss.origin), "yaw_rad": gnss.yaw_rad, "antenna": list(gnss.antenna[:2])}
+
+
+def geodetic(enu: FloatArray, origin: tuple[float, float, float]) -> FloatArray:
+    """Latitude, longitude [degrees], altitude [m] ``(n, 3)`` of points east, north and up of an origin ``(n, 3)``.
+
+    Source: NIMA TR8350.2; the latitude by fixed-point iteration.
+    """
+    e2 = _FLATTENING * (2.0 - _FLATTENING)
+    phi, lam = math.radians(origin[0]), math.radians(origin[1])
+    normal = _SEMI_MAJOR_M / math.sqrt(1.0 - e2 * math.sin(phi) ** 2)
+    across, along = (normal + origin[2]) * math.cos(phi), (normal * (1.0 - e2) + origin[2]) * math.sin(phi)
+    center = np.array([across * math.cos(lam), across * math.sin(lam), along])
+    axes = np.array(
+        [
+            [-math.sin(lam), math.cos(lam), 0.0],
+            [-math.sin(phi) * math.cos(lam), -math.sin(phi) * math.sin(lam), math.cos(phi)],
+            [math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)],
+        ]
+    )
+    x, y, z = (center + enu @ axes).T
+    p = np.hypot(x, y)
+    latitude = np.arctan2(z, p * (1.0 - e2))
+    altitude = np.zeros_like(p)
+    for _ in range(_ITERATIONS):
+        normals = _SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
+        altitude = p / np.cos(latitude) - normals
+        latitude = np.arctan2(z, p * (1.0 - e2 * normals / (normals + altitude)))
+    return np.column_stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude])
+
+
+def _fix_ticks(log: Log, rate_hz: float) -> IntArray:
+    """Rows of the log at a rate."""
+    wanted = np.arange(log.stamps_s[0] + 1.0 / rate_hz, log.stamps_s[-1], 1.0 / rate_hz)
+    return np.asarray(np.unique(np.searchsorted(log.stamps_s, wanted).clip(max=len(log.stamps_s) - 1)))
+
+
+def _points(log: Log, ticks: IntArray, offset: tuple[float, float, float]) -> FloatArray:
+    """Places ``(n, 3)`` in the map of a point of the base."""
+    turned = np.array([quaternion_matrix(q) @ np.array(offset) for q in log.quaternions[ticks]])
+    return np.asarray(log.positions[ticks] + turned)
+
+
+def _stretches(rng: np.random.Generator, seconds: FloatArray, share: float, mean_s: float) -> IntArray:
+    """Number of the stretch that each time is in, from 1; 0: in none."""
+    number = np.zeros(len(seconds), dtype=np.int64)
+    if share <= 0.0 or not len(seconds):
+        return number
+    inside, count = bool(rng.uniform() < share), 0
+    count += inside
+    end = float(seconds[0])
+    for i, at in enumerate(seconds):
+        while at >= end:
+            if i or end > seconds[0]:
+                inside = not inside
+                count += inside
+            end += rng.exponential(mean_s if inside else mean_s * (1.0 - share) / share)
+        number[i] = count if inside else 0
+    return number
+
+
+# --- Streams ----------------------------------------------------------------------------------------------------------
 
 Sees = Literal["images", "corners", "nothing"]
 """What the camera sends."""

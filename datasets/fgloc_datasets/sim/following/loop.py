@@ -1,4 +1,4 @@
-"""The closed loop: sensors, pose, follower, motors. Nothing is known earlier than on a robot.
+"""The closed loop of a drive: sensors, pose, follower, motors. Nothing is known earlier than on a robot.
 
 A message reaches the pose's estimator at its simulated receive time; an image `PROCESSING_S` later, which stands for
 the time that detection and update take.
@@ -6,36 +6,347 @@ the time that detection and update take.
 
 from __future__ import annotations
 
+import csv
 import heapq
-from collections.abc import Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
+import yaml
+from pydantic import ValidationError
 
+from fgloc.ablation.failures import Kidnap, Lift, Truncated, corrupt, generators
+from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config, Role, config_of
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, EstimatorError
 from fgloc.files.atomic import atomic_folder
+from fgloc.files.settings import sentences
+from fgloc.live import Live
 from fgloc.recording.reader import events_of
 from fgloc.sensors.failures import Failure
+from fgloc.sensors.failures import Scene as FailureScene
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent
-from fgloc.types import Event, FloatArray
+from fgloc.types import Event, FloatArray, LandmarkMap, Mode, TruthEvent
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message
 from fgloc_datasets.sim.control import Command
-from fgloc_datasets.sim.following.failing import FailingSensors
-from fgloc_datasets.sim.following.path import Curve, WaypointPath
-from fgloc_datasets.sim.following.poses import PoseName, PoseSource, pose_source
-from fgloc_datasets.sim.following.pursuit import Pursuit, PursuitSettings, State
-from fgloc_datasets.sim.following.results import Followed, write_followed
+from fgloc_datasets.sim.following.pursuit import Curve, Pursuit, PursuitSettings, State, WaypointPath
 from fgloc_datasets.sim.physics import Scene, Simulation, make_scene
 from fgloc_datasets.sim.record import RUN_FILES, robot_settings, write_beside
 from fgloc_datasets.sim.scenario import Scenario
-from fgloc_datasets.sim.sensors import Sees, stamp_ns, streams
+from fgloc_datasets.sim.sensors import EPOCH_NS, Sees, stamp_ns, streams
+
+# --- Failures of sensors ----------------------------------------------------------------------------------------------
+
+_NOW = "/now"  # topic of the events that only tell how late it is
+
+
+class FailingSensors:
+    """Events in order of receipt go in, those that are left come out.
+
+    Attributes:
+        landmark_map: what the robot is given for a map.
+    """
+
+    def __init__(
+        self, failures: Sequence[Failure], config: Config, landmarks: LandmarkMap, duration_s: float, seed: int
+    ) -> None:
+        """Draw what is random in the failures.
+
+        Raises:
+            ConfigError: a failure that only a recording can have.
+        """
+        for failure in failures:
+            if failure.stage != "recorded" or isinstance(failure, Kidnap | Lift | Truncated):
+                raise ConfigError(
+                    f"failure '{failure.kind}' changes recordings or what was found in images; while a robot drives "
+                    "there are those of its messages: dropout, darkness, latency, encoder_dead, moved_marker, ..."
+                )
+        ids = tuple(sorted(landmarks.landmarks))
+        rngs = generators(len(failures), seed)
+        scenes = [FailureScene(EPOCH_NS, duration_s, config, ids, rng) for rng in rngs]
+        self.landmark_map = landmarks
+        for failure, scene in zip(failures, scenes, strict=True):
+            self.landmark_map = failure.corrupt_map(self.landmark_map, scene)
+        self._waiting: deque[Event] = deque()
+        self._now_ns = 0
+        self._out = corrupt(failures, "recorded", self._arriving(), scenes)
+
+    def after(self, events: Iterable[Event], now_ns: int) -> Iterator[Event]:
+        """What is left of events received up to now, and what was held back until now."""
+        self._waiting.extend(events)
+        self._now_ns = now_ns
+        for event in self._out:
+            if event.topic != _NOW:
+                yield event
+            elif event.received_ns > now_ns:
+                return
+
+    def _arriving(self) -> Iterator[Event]:
+        """What waits; then the time, again and again: failures that hold events back let go of them by it."""
+        while True:
+            if self._waiting:
+                yield self._waiting.popleft()
+            else:
+                self._now_ns += 1
+                yield TruthEvent(self._now_ns, self._now_ns, _NOW, "", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def read_failures(texts: Sequence[str]) -> tuple[Failure, ...]:
+    """Failures as a suite of ablations describes them, each a YAML mapping.
+
+    Raises:
+        ConfigError: no YAML, no such failure, or a wrong value.
+    """
+    if not texts:
+        return ()
+    try:
+        return FailureEntry.model_validate({"name": "given", "chain": [yaml.safe_load(text) for text in texts]}).chain
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--failure: no YAML ({error}); write {{kind: dropout, sensor: camera}}") from error
+    except ValidationError as error:
+        raise ConfigError("--failure: " + "; ".join(sentences(error, FailureEntry))) from error
+
+
+# --- Poses that guide the robot ---------------------------------------------------------------------------------------
+
+PoseName = Literal["truth", "fgloc", "fgloc-no-model", "fgloc-no-model-no-gyro", "fgloc-constant", "wheels", "learned"]
+POSES: tuple[PoseName, ...] = get_args(PoseName)
+_START_SIGMA = 1e-3  # m and rad: dead reckoning begins at the true pose
+_PATIENCE_S = 120.0  # of wall time, for what has been pushed
+_BLIND: dict[str, Any] = {"recording": {"topics": {"image": "none", "camera_info": "none", "sightings": "none"}}}
+_CHANGES: dict[PoseName, dict[str, Any]] = {
+    "fgloc": {},
+    "fgloc-no-model": {"motion": {"use": False}},
+    "fgloc-no-model-no-gyro": {"motion": {"use": False}, "gyro": {"use": False}},
+    "fgloc-constant": {"weights": {"adaptive": False}},
+    "wheels": {**_BLIND, "motion": {"use": False}, "gyro": {"use": False}},
+    "learned": {
+        "recording": {"topics": {**_BLIND["recording"]["topics"], "odometry": "none"}},
+        "wheels": {"source": "none"},
+    },
+}
+
+
+class PoseSource(Protocol):
+    """Takes the robot's messages as they arrive, and tells its pose."""
+
+    def push(self, event: Event) -> None:
+        """Take an event, in order of receipt."""
+
+    def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
+        """Pose ``(3,)`` (None: not known) and the standard deviation of its position in the worst direction [m]."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class TruePose:
+    """The pose itself, for comparison."""
+
+    def push(self, event: Event) -> None:
+        """Nothing is needed."""
+
+    def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
+        """The truth."""
+        return truth, 0.0
+
+    def close(self) -> None:
+        """Nothing is to be ended."""
+
+
+class LivePose:
+    """The pose of a `Live`: everything that has arrived is used before it is asked, so that runs can be repeated."""
+
+    def __init__(self, config: Config, landmark_map: LandmarkMap | None, roles: set[str], heeds_sigma: bool) -> None:
+        """Start it.
+
+        Args:
+            config: as on the robot.
+            landmark_map: None: dead reckoning.
+            roles: what will arrive; the run begins when all of it is there.
+            heeds_sigma: tell the pose's covariance; a dead-reckoned robot would stop at some time.
+        """
+        self._heeds_sigma = heeds_sigma
+        self._live = Live(config, landmark_map, roles=roles)
+
+    def push(self, event: Event) -> None:
+        """Take an event."""
+        self._live.push(event)
+
+    def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
+        """The newest pose, carried on to the stamp."""
+        if not self._live.wait(_PATIENCE_S):
+            raise EstimatorError(f"the live run did not use its events within {_PATIENCE_S:.0f} s")
+        known = self._live.pose_at(stamp_ns)
+        if known is None or known.mode in (Mode.UNCONFIRMED, Mode.LOST):
+            return None, 0.0
+        sigma = float(np.sqrt(np.linalg.eigvalsh(known.cov[:2, :2])[-1])) if self._heeds_sigma else 0.0
+        return known.pose, sigma
+
+    def close(self) -> None:
+        """End its threads."""
+        self._live.close()
+
+
+def pose_source(
+    name: PoseName, config: Config, landmark_map: LandmarkMap, sees: str, start: tuple[float, float, float]
+) -> PoseSource:
+    """A source by name.
+
+    Args:
+        name: "truth"; "fgloc", and the same without its learned motion, without that and the gyro, or with constant
+            weights; "wheels" or "learned": wheel odometry or the learned motion alone, carried on from the true start.
+        config: as in ``robot.yaml``.
+        landmark_map: as surveyed.
+        sees: role of the camera: "image" or "sightings".
+        start: true pose.
+    """
+    if name == "truth":
+        return TruePose()
+    changes = _CHANGES[name]
+    roles = {"odometry", "joints", "command", "imu"}
+    if name.startswith("fgloc"):
+        return LivePose(changed(config, changes), landmark_map, roles | {sees}, heeds_sigma=True)
+    begin = {"estimator": {"initial_pose": start, "initial_sigmas": (_START_SIGMA,) * 3}}
+    roles -= {"odometry"} if name == "learned" else set()
+    return LivePose(changed(changed(config, changes), begin), None, roles, heeds_sigma=False)
+
+
+def changed(config: Config, changes: dict[str, Any]) -> Config:
+    """The configuration with some of its values replaced, given as nested mappings."""
+
+    def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+        inner = {k: merged(old.get(k) or {}, v) if isinstance(v, dict) else v for k, v in new.items()}
+        return {**old, **inner}
+
+    return config_of(merged(config.model_dump(exclude_unset=True), changes))
+
+
+# --- Outcome of a drive -----------------------------------------------------------------------------------------------
+
+REACHED_M = 0.10  # a waypoint is reached if the robot has come so near
+_EVERY_M = 0.01  # of the true path, for means over its length
+_COLUMNS = ("t", "x", "y", "yaw", "sigma", "v", "omega", "state", "true_x", "true_y", "true_yaw")
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How well a path was followed.
+
+    Attributes:
+        track_mm: mean distance of the true path from the waypoints' curve, over the length of the true path.
+        worst_mm: the largest.
+        reached: share of the waypoints that the robot has come within 10 cm of.
+        arrived: whether the follower came to its end.
+        seconds: until then, or until the time was over.
+        pose_mm: mean distance of the pose that guided the robot from the truth.
+        stopped_s: how long the robot stood or searched because it had no pose to drive by.
+    """
+
+    track_mm: float
+    worst_mm: float
+    reached: float
+    arrived: bool
+    seconds: float
+    pose_mm: float | None
+    stopped_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """One drive.
+
+    Attributes:
+        times_s: ``(n,)`` of the commands.
+        poses: ``(n, 3)`` that the follower was given, NaN where there was none.
+        sigmas_m: ``(n,)`` of their position.
+        commands: ``(n, 2)`` v, omega.
+        states: of the follower.
+        true_poses: ``(n, 3)`` at the same times.
+        true_path: ``(m, 3)`` x, y, z of the whole drive.
+        score: how well.
+    """
+
+    times_s: FloatArray
+    poses: FloatArray
+    sigmas_m: FloatArray
+    commands: FloatArray
+    states: tuple[State, ...]
+    true_poses: FloatArray
+    true_path: FloatArray
+    score: Score
+
+    @classmethod
+    def of(cls, curve: Curve, true: FloatArray, rows: FloatArray, states: tuple[State, ...]) -> Followed:
+        """Score a drive.
+
+        Args:
+            curve: that was to be followed.
+            true: ``(m, 7)`` position and quaternion at every tick.
+            rows: ``(n, 7)`` of the loop, evenly over the ticks.
+            states: ``(n,)``.
+        """
+        every = round((len(true) - 1) / max(len(rows) - 1, 1))
+        at = true[: every * len(rows) : every]
+        x, y, z, w = at[:, 3:].T
+        true_poses = np.column_stack([at[:, :2], np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
+        known = np.isfinite(rows[:, 1])
+        errors = np.hypot(*(rows[known, 1:3] - true_poses[known, :2]).T)
+        off = curve.distances(_evenly(true[:, :2]))
+        waypoints = curve.points[curve.at_waypoints]
+        nearest = [float(np.hypot(*(true[:, :2] - p).T).min()) for p in waypoints]
+        waiting = np.array([s in (State.STOPPED, State.SEARCHING) for s in states])
+        arrived = State.ARRIVED in states
+        end = states.index(State.ARRIVED) if arrived else len(states) - 1
+        score = Score(
+            track_mm=1e3 * float(off.mean()),
+            worst_mm=1e3 * float(off.max()),
+            reached=float(np.mean(np.array(nearest) <= REACHED_M)),
+            arrived=arrived,
+            seconds=float(rows[end, 0]),
+            pose_mm=1e3 * float(errors.mean()) if known.any() else None,
+            stopped_s=float(waiting.sum() * (rows[1, 0] - rows[0, 0])),
+        )
+        return cls(rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:], states, true_poses, true[:, :3], score)
+
+
+def _evenly(places: FloatArray) -> FloatArray:
+    """Places ``(m, 2)`` at even distances along a path ``(n, 2)``."""
+    along = np.concatenate([[0.0], np.hypot(*np.diff(places, axis=0).T).cumsum()])
+    at = np.arange(0.0, along[-1] + _EVERY_M, _EVERY_M)
+    return np.column_stack([np.interp(at, along, places[:, k]) for k in range(2)])
+
+
+def write_followed(
+    followed: Followed, path: WaypointPath, pose: str, failures: Sequence[Failure], folder: Path
+) -> None:
+    """Write ``following.csv``, a row for each command, and ``following.yaml``: path, pose, failures and score."""
+    with (folder / "following.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(_COLUMNS)
+        for i, t in enumerate(followed.times_s):
+            numbers = (*followed.poses[i], followed.sigmas_m[i], *followed.commands[i])
+            true = [f"{v:.6f}" for v in followed.true_poses[i]]
+            table.writerow([f"{t:.3f}", *(f"{v:.6f}" for v in numbers), followed.states[i].value, *true])
+    content = {
+        "pose": pose,
+        "score": asdict(followed.score),
+        "failures": [failure.model_dump(mode="json") for failure in failures],
+        "path": path.model_dump(mode="json"),
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+    (folder / "following.yaml").write_text(text, encoding="utf-8")
+
+
+# --- The drive --------------------------------------------------------------------------------------------------------
 
 PROCESSING_S = 0.03  # on one core: detection in 640 x 480 takes 15 ms, an update 6 ms (99 %: 10 ms)
 _RESTS_S = 0.5  # at the end
@@ -101,8 +412,6 @@ def follow(drive: Drive, out: Path | None = None) -> Followed:
         )
     with ExitStack() as stack:
         if out is None:
-            from tempfile import TemporaryDirectory
-
             stage = Path(stack.enter_context(TemporaryDirectory()))
         else:
             stage = stack.enter_context(atomic_folder(out, own=(*RUN_FILES, "following.csv", "following.yaml")))
