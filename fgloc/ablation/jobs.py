@@ -36,8 +36,8 @@ from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
-from fgloc.sensors.markers.images import ImageError
-from fgloc.types import Mode, RawEvent, TruthEvent
+from fgloc.sensors.markers.images import ImageError, ImageEvent
+from fgloc.types import Mode, TruthEvent
 
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
 
@@ -296,7 +296,7 @@ def detect(job: Job, out: Path) -> None:
                 return
             memory = setup.detector.remembering(setup.detector, detections_path(out, job), None)
             for event in recording.events():
-                if isinstance(event, RawEvent):
+                if isinstance(event, ImageEvent):
                     with suppress(ImageError):
                         memory.detect(event)
     except FglocError:

@@ -175,15 +175,15 @@ def _tell(found: Survey, out: Path) -> None:
 
 def _with_markers(settings: Config, dictionary: str | None, size: float | None, given: LandmarkMap | None) -> Config:
     """The configuration with the markers of the command line or the given map."""
-    from fgloc.sensors import registry
+    from fgloc.sensors.base import with_values
 
     if size is not None and not 0.0 < size <= 5.0:
         raise ConfigError(f"--size {size:g}: expected the side of the black square in metres, more than 0 and up to 5")
-    markers = registry.raw_landmarks()
+    markers = settings.markers
     sizes = {m.size_m for m in given.landmarks.values() if m.size_m > 0.0} if given is not None else set()
-    dictionary = dictionary or markers.dictionary(settings) or (given.dictionary if given is not None else None) or None
-    size = size or markers.size(settings) or (sizes.pop() if len(sizes) == 1 else None)
-    return markers.given(settings, dictionary, size)
+    dictionary = dictionary or markers.dictionary or (given.dictionary if given is not None else None) or None
+    size = size or markers.default_size_m or (sizes.pop() if len(sizes) == 1 else None)
+    return with_values(settings, "markers", {"dictionary": dictionary, "default_size_m": size})
 
 
 def _distance(text: str) -> Distance:
