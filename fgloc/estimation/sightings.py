@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,67 +32,7 @@ from fgloc.sensors import registry
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, LandmarkMeasurement, PixelMeasurement, PointMeasurement, PoseMeasurement, Step
 
-# --- Measurements of registered sensors beyond the gate ---------------------------------------------------------------
-
-Judged = list[tuple[float, int, str]]
-"""Of each measurement: NIS, degrees of freedom, and why it is rejected ("" if it is not)."""
-Judge = Callable[[Sequence[LandmarkMeasurement], PoseWithCovariance], Judged]
-
-
-class SensorMeasurements:
-    """Revises what the gate makes of measurements of registered sensors; those of landmarks are left as they are."""
-
-    def __init__(self, config: Config, factors: LandmarkFactors) -> None:
-        self._adaptive = config.weights.adaptive
-        self._factors = factors
-        self._bias = InnovationBias(config.estimator.gate_probability, config.weights.window_s)
-
-    def forget(self) -> None:
-        """The pose was set anew."""
-        self._bias.forget()
-
-    def revise(
-        self, measurements: Sequence[LandmarkMeasurement], judged: Judged, predicted: PoseWithCovariance, judge: Judge
-    ) -> tuple[Sequence[LandmarkMeasurement], Judged]:
-        """The measurements to be used, and the verdict on each.
-
-        Args:
-            measurements: of one step.
-            judged: what the gate makes of them.
-            predicted: the pose.
-            judge: the gate, for other explanations.
-        """
-        if not any(isinstance(m, PoseMeasurement) for m in measurements):
-            return measurements, judged
-        taken, verdicts = list(measurements), list(judged)
-        for i, (m, verdict) in enumerate(zip(measurements, judged, strict=True)):
-            if not isinstance(m, PoseMeasurement):
-                continue
-            if not verdict[2] and self._adaptive and self._is_biased(m, predicted):
-                verdicts[i] = verdict[0], verdict[1], "biased"
-            if verdicts[i][2]:
-                taken[i], verdicts[i] = _explained_otherwise(m, verdicts[i], predicted, judge)
-        return taken, verdicts
-
-    def _is_biased(self, m: PoseMeasurement, predicted: PoseWithCovariance) -> bool:
-        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
-        return self._bias.is_biased((m.source, m.target), m.stamp_ns, one, predicted.cov)
-
-
-def _explained_otherwise(
-    m: PoseMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance, judge: Judge
-) -> tuple[PoseMeasurement, tuple[float, int, str]]:
-    """The first alternative of a rejected measurement that the gate accepts; else the measurement itself.
-
-    Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the most probable
-    component of a mixture stands for all of it; here the gate decides which.
-    """
-    if verdict[2] in ("gate", "biased"):
-        for other in m.alternatives(predicted.pose):
-            (found,) = judge([other], predicted)
-            if not found[2]:
-                return other, found
-    return m, verdict
+# --- Rows of a measurement in steps.csv -------------------------------------------------------------------------------
 
 
 def kind_of(m: LandmarkMeasurement) -> str:
@@ -115,6 +55,10 @@ def source_of(m: LandmarkMeasurement) -> str:
 # --- The gate, joint compatibility, misread ids -----------------------------------------------------------------------
 
 
+Judged = list[tuple[float, int, str]]
+"""NIS of each measurement, degrees of freedom, and why it is rejected ("" if it is not)."""
+
+
 class Association:
     """Weighs the sightings of one step against the prediction.
 
@@ -129,7 +73,7 @@ class Association:
         self._seen: Counter[int] = Counter()
         self.rejections: Counter[str] = Counter()
         self._contradicting: set[int] = set()
-        self._sensors = SensorMeasurements(config, factors)
+        self._bias = InnovationBias(config.estimator.gate_probability, config.weights.window_s)
         self.modes = LandmarkModes(config, factors)
 
     def judge(
@@ -147,7 +91,7 @@ class Association:
         """
         accepted, rejected, decisions = [], [], []
         judged = self._judge(measurements, predicted)
-        measurements, judged = self._sensors.revise(measurements, judged, predicted, self._judge)
+        measurements, judged = self._revise(measurements, judged, predicted)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, m.cauchy_k, alone)
@@ -175,6 +119,47 @@ class Association:
                 if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
             )
         return accepted, rejected, decisions
+
+    def _revise(
+        self, measurements: Sequence[LandmarkMeasurement], judged: Judged, predicted: PoseWithCovariance
+    ) -> tuple[Sequence[LandmarkMeasurement], Judged]:
+        """The measurements to be used and the verdict on each; registered sensors may be biased, or mean another.
+
+        Args:
+            measurements: of one step.
+            judged: what the gate makes of them.
+            predicted: the pose.
+        """
+        if not any(isinstance(m, PoseMeasurement) for m in measurements):
+            return measurements, judged
+        taken, verdicts = list(measurements), list(judged)
+        for i, (m, verdict) in enumerate(zip(measurements, judged, strict=True)):
+            if not isinstance(m, PoseMeasurement):
+                continue
+            if not verdict[2] and self._config.weights.adaptive and self._is_biased(m, predicted):
+                verdicts[i] = verdict[0], verdict[1], "biased"
+            if verdicts[i][2]:
+                taken[i], verdicts[i] = self._explained_otherwise(m, verdicts[i], predicted)
+        return taken, verdicts
+
+    def _is_biased(self, m: PoseMeasurement, predicted: PoseWithCovariance) -> bool:
+        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
+        return self._bias.is_biased((m.source, m.target), m.stamp_ns, one, predicted.cov)
+
+    def _explained_otherwise(
+        self, m: PoseMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance
+    ) -> tuple[PoseMeasurement, tuple[float, int, str]]:
+        """The first alternative of a rejected measurement that the gate accepts; else the measurement itself.
+
+        Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the most probable
+        component of a mixture stands for all of it; here the gate decides which.
+        """
+        if verdict[2] in ("gate", "biased"):
+            for other in m.alternatives(predicted.pose):
+                (found,) = self._judge([other], predicted)
+                if not found[2]:
+                    return other, found
+        return m, verdict
 
     def _reassociate(
         self,
@@ -247,10 +232,8 @@ class Association:
         self.rejections += Counter()  # drops the zeros
         return fit
 
-    def _judge(
-        self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
-    ) -> list[tuple[float, int, str]]:
-        """Of each: NIS, its degrees of freedom, and why it is rejected ("" if it is accepted)."""
+    def _judge(self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance) -> Judged:
+        """Verdict of the gate on each measurement."""
         if not self._factors.known:
             return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
         if not measurements:
@@ -275,8 +258,8 @@ class Association:
         self,
         measurements: Sequence[LandmarkMeasurement],
         predicted: PoseWithCovariance,
-        judged: list[tuple[float, int, str]],
-    ) -> list[tuple[float, int, str]]:
+        judged: Judged,
+    ) -> Judged:
         """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
 
         Between as many as that, those of the least NIS.
@@ -367,7 +350,7 @@ class Association:
     def forget_contradictions(self) -> None:
         """The pose was set anew: `contradicting` starts from 0."""
         self._contradicting.clear()
-        self._sensors.forget()
+        self._bias.forget()
 
     def begin_segment(self) -> None:
         """The clock jumped: nothing is known of when landmarks were seen last."""
