@@ -164,6 +164,7 @@ class SensorSetup:
         T_base_imu: ``(4, 4)`` its mounting; None likewise.
         sensors: those of other packages.
         notes: what the user should know.
+        sees: whether anything in the stream can tell where the robot is.
     """
 
     config: Config
@@ -176,6 +177,7 @@ class SensorSetup:
     T_base_imu: FloatArray | None
     sensors: tuple[Sensor, ...]
     notes: tuple[str, ...]
+    sees: bool
 
 
 def recorded_setup(
@@ -229,8 +231,9 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     if "imu" in facts.roles and config.gyro.use:
         imu_up = mounted_up(facts, config, facts.first)
         T_base_imu = mounted_imu(facts, config, facts.first)
+    sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(facts.roles)
     return SensorSetup(
-        config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, T_base_imu, sensors, tuple(notes)
+        config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, T_base_imu, sensors, tuple(notes), sees
     )
 
 

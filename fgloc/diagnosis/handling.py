@@ -86,7 +86,7 @@ def handling(signals: Signals, config: Config, path: Path, up: FloatArray) -> Ha
     rates = signals.rates()
     if rates is None:
         return Handling()
-    monitor, signs, sure, resting = LiftMonitor(math.inf, up), [], [], []
+    monitor, signs, resting = LiftMonitor(math.inf, up), [], []
     for k, (step, readings) in enumerate(_steps(signals, config, up)):
         at = (step.stamp_ns - signals.origin_ns) * 1e-9
         told = [d.reason for d in monitor.observe(k, step, readings)]
@@ -95,10 +95,7 @@ def handling(signals: Signals, config: Config, path: Path, up: FloatArray) -> Ha
         if any(reason != "carried" for reason in told):
             signs.append(at)
             monitor.carried = False  # a sign is one by itself
-            # Rough ground throws a robot that drives as hands do
-            if set(told) != {"vertical_velocity"} or (resting and resting[-1] == at):
-                sure.append(at)
-    lifted = tuple((a, b) for a, b in _merged(signs, _APART_S, _LASTS_S) if any(a <= at <= b for at in sure))
+    lifted = tuple(_merged(signs, _APART_S, _LASTS_S))
     held = tuple(_held(path, *rates[:2], up, lifted))
     times, force = rates[0], np.linalg.norm(rates[2], axis=1)
     rest = np.array(resting)

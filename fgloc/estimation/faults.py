@@ -329,6 +329,7 @@ _ROCKING = 0.015  # rad: a robot on the floor rocks so much when it stops, or wh
 _ON_SPOT_M = 0.02  # ... and goes no further in a second; half a wheel's width
 _SHAKES_M_S, _SHAKES_RAD_S = 0.02, 0.05  # m/s, rad/s
 _ONSET_S = 0.5  # from the start of a lift to its alarm
+_APART_S = 5.0  # between two signs of one handling: nobody sets a robot down for less
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it
 
 
@@ -353,6 +354,7 @@ class LiftMonitor:
         self._begin()
         self._since_fix_s = 0.0  # time in the air since a sighting has fixed the pose
         self._quiet_s = 0.0  # since the last sign
+        self._sure_s = math.inf  # since the last that the ground cannot make
 
     def observe(self, k: int, step: Step, readings: MotionReadings) -> list[Decision]:
         """Take in a step; rows of ``steps.csv`` while the robot is carried.
@@ -382,6 +384,12 @@ class LiftMonitor:
             for reason, nis, bound in signs
             if nis > bound
         ]
+        # Rough ground and skidding throw a robot that drives as hands do
+        drives = moving and readings.wheels is not None
+        sure = [d for d in told if not (drives and d.reason == "vertical_velocity")]
+        self._sure_s = 0.0 if sure else self._sure_s + step.dt
+        if self._sure_s > _APART_S:
+            told = []
         if told:
             self._quiet_s = 0.0
             if not self.carried:

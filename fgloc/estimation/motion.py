@@ -34,7 +34,72 @@ from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings,
 
 # --- Read -------------------------------------------------------------------------------------------------------------
 
+_SKID = 0.05  # of a turn: by so much wheels are wrong in one turn and not in the next
+_USUAL_SPEED = 0.5  # m/s, before the robot has driven
+_CHANGES_S = 600.0  # after such a time what the wheels are off by may be something else
 _MEMORIES = 2.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
+
+
+class TurnComparison:
+    """Turns of gyro and wheels compared, for a robot whose yaw nothing fixes: what the gyro's bias is likely to be.
+
+    A Kalman filter of the rate by which the two differ while the wheels turn [rad/s] and of the share of their turn by
+    which wheels turn too little. The rate is the gyro's bias and the yaw that unequal wheels gain; only their priors
+    divide it. (Speeds that change would tell the two apart, if errors of gyro and wheels were white, which lags and
+    skidding are not.)
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Start from the priors of gyro and wheels."""
+        wheels, gyro = config.wheels, config.gyro
+        share = math.hypot(wheels.turn_scale_sigma, wheels.scale_sigma, gyro.scale_sigma)
+        self._per_m, self._walk = wheels.yaw_per_m_sigma, gyro.bias_walk
+        self._mean = np.zeros(2)
+        self._cov = np.diag([gyro.bias_sigma**2 + (self._per_m * _USUAL_SPEED) ** 2, share**2])
+        self._change = np.array([[self._walk**2, 0.0], [0.0, share**2 / _CHANGES_S]])
+        self._way = self._driven_s = 0.0
+
+    def compare(self, seconds: float, turned: Turn, bias: float, wheels: MotionMeasurement | None) -> None:
+        """Correct the difference by a step.
+
+        Args:
+            seconds: length of the step.
+            turned: by the gyro, with this ``bias`` [rad/s] subtracted.
+            bias: of the gyro, as it was learned at rest.
+            wheels: as they report it; None: they were silent.
+        """
+        self._cov = self._cov + self._change * seconds
+        if wheels is None or not wheels.motion.any():
+            return
+        self._way += float(np.hypot(*wheels.motion[:2]))
+        self._driven_s += seconds
+        turn = float(wheels.motion[2])
+        by = np.array([seconds, turn])
+        noise = turned.noise + float(wheels.cov[2, 2]) + (_SKID * turn) ** 2
+        error, gain = turned.yaw + bias * seconds - turn - by @ self._mean, self._cov @ by
+        variance = float(by @ gain) + noise
+        if error**2 > chi2_bound(GATE, 1) * variance:  # slip, or turned by hand
+            return
+        self._mean = self._mean + gain * (error / variance)
+        self._cov = self._cov - np.outer(gain, gain) / variance
+
+    def corrected(self, turned: Turn, seconds: float, since_s: float, bias: float, variance: float) -> Turn:
+        """The gyro's turn with the bias that is likely beside these wheels.
+
+        Args:
+            turned: by the gyro, with ``bias`` subtracted.
+            seconds: length of the step.
+            since_s: how long before the step nothing has fixed the yaw.
+            bias: of the gyro, as it was learned at rest [rad/s].
+            variance: of that [rad²/s²].
+        """
+        speed = self._way / self._driven_s if self._driven_s > 0.0 else _USUAL_SPEED
+        of_wheels = (self._per_m * speed) ** 2 + float(self._cov[0, 0])
+        share = variance / (variance + of_wheels)
+        change = share * (float(self._mean[0]) - bias) if self._driven_s > 0.0 else 0.0
+        left = variance * (1.0 - share) if self._driven_s > 0.0 else variance
+        drift = left * ((since_s + seconds) ** 2 - since_s**2)
+        return replace(turned, yaw=turned.yaw - change * seconds, variance=turned.noise + drift)
 
 
 class MotionSources:
@@ -56,6 +121,7 @@ class MotionSources:
         self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s**2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
+        self._alone = TurnComparison(config) if sensors.alone and sensors.gyro is not None else None
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
         self._yaw_indirect_s = 0.0  # how far back the yaw rests on the gyro, where fixes observe it along the way only
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
@@ -69,6 +135,7 @@ class MotionSources:
             joint=self._joint,
             stopped_speed=self._likely * self._config.gate.max_speed,
             stopped_turn=self._likely * self._config.gate.max_yaw_rate,
+            turns_by_gyro=self._alone is not None and not self._wheels.from_commands,
         )
 
     @property
@@ -99,6 +166,10 @@ class MotionSources:
             without_yaw_s = max(since_fix_s, self._yaw_indirect_s)
             turn = self.gyro.measure(step, None if wheels is None or commanded_to_move(step) else motion, without_yaw_s)
             if turn is not None:
+                if self._alone is not None and not self._wheels.from_commands:
+                    bias, variance = self.gyro.bias, self.gyro.bias_variance
+                    self._alone.compare(step.dt, turn, bias, reported)
+                    turn = self._alone.corrected(turn, step.dt, without_yaw_s, bias, variance)
                 cov = np.diag([FAR_M2, FAR_M2, turn.variance])
                 name, turned = "gyro", with_yaw(motion, turn.yaw)
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)

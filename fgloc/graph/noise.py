@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from fgloc import se2
 from fgloc.errors import CovarianceError
 from fgloc.sensors.learned.network import JointCalibration
 from fgloc.types import FloatArray, MotionMeasurement, MotionReadings
@@ -128,10 +129,13 @@ class FusionRules:
         joint: correlation of the errors of wheels and learned motion; None: independent.
         stopped_speed: that wheels may be wrong by, if their encoders stopped [m/s].
         stopped_turn: likewise [rad/s].
+        turns_by_gyro: nothing fixes the yaw: the wheels' turns serve to learn the gyro's bias, and only it measures
+            turns.
     """
 
     wheels_are_commands: bool = False
     learned_has_gyro: bool = False
+    turns_by_gyro: bool = False
     joint: JointCalibration | None = None
     stopped_speed: float = 0.0
     stopped_turn: float = 0.0
@@ -193,6 +197,8 @@ class NoiseBudget:
                 learned = rules.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned) if m is not None]
         if gyro is not None and known:
+            if rules.turns_by_gyro:
+                known = [replace(m, cov=m.cov + np.diag([0.0, 0.0, se2.ANY_YAW])) for m in known]
             known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
         if readings.inertial is not None:
             known = [replace(m, inertial=readings.inertial) for m in known]

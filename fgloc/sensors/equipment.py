@@ -90,6 +90,7 @@ class MotionSensors:
         joint: its correlation with the wheels; None: the two are taken as independent.
         gyro: the gyro, if any.
         attitude: roll and pitch, on uneven ground; None: it is flat, or nothing measures them.
+        alone: nothing in the stream can tell where the robot is.
     """
 
     wheels: WheelMotion
@@ -97,6 +98,7 @@ class MotionSensors:
     joint: JointCalibration | None = None
     gyro: Gyro | None = None
     attitude: Attitude | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
