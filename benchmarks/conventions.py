@@ -184,7 +184,7 @@ def found_in(bag: Path, config: Config, mistake: Mistake | None) -> tuple[Findin
         T_base_sensor = imu_up = landmark_map = None
         R = np.eye(3)
         try:
-            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)[1]
+            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)
             T_base_sensor, imu_up, landmark_map = setup.T_base_sensor, setup.imu_up, setup.landmark_map
             R = R if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
         except FglocError:
@@ -211,7 +211,7 @@ def named_online(bag: Path, config: Config, mistake: Mistake | None) -> Iterator
     """Seconds of motion and what a running check of a live run finds then, whenever it compares."""
     with Recording(bag, config.recording) as recording:
         parts = assemble(recording, find_beside(bag, "map.yaml"), config, keep_all=False)
-        setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)[1]
+        setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)
         R = np.eye(3) if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
         moving_s = 0.0
         unread = ("image", "camera_info", "truth")

@@ -88,8 +88,7 @@ def assemble(
     Raises:
         FglocError: as `recorded_setup` has it.
     """
-    _, setup = recorded_setup(recording, map_path, config, landmark_map)
-    return _assembled(setup, keep_all)
+    return _assembled(recorded_setup(recording, map_path, config, landmark_map), keep_all)
 
 
 def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config: Config, keep_all: bool) -> Assembly:

@@ -233,10 +233,6 @@ class Replay:
         total.update(self._image_rejections)
         return total
 
-    def spans(self, origin_ns: int = 0) -> dict[str, TopicTimes]:
-        """When each topic had messages, in seconds from a time."""
-        return self.activity.spans(origin_ns)
-
     def _gated(self, events: Iterator[Event]) -> Iterator[Event]:
         began = time.perf_counter()
         for event in self.clocks.corrected(events):

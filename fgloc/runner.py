@@ -6,7 +6,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
 
@@ -98,7 +98,7 @@ def sentence(note: str) -> str:
 
 def never_found(replay: Replay, rejections: Counter[str]) -> str:
     """Message of a run without any pose: what was received and what was rejected."""
-    received = ", ".join(f"{topic} {span.count}" for topic, span in replay.spans().items()) or "nothing"
+    received = ", ".join(f"{topic} {span.count}" for topic, span in replay.activity.spans(0).items()) or "nothing"
     why = ", ".join(f"{reason} {n}" for reason, n in rejections.most_common(6)) or "nothing"
     return (
         f"the first pose was never found in {len(replay.step_ms)} steps. Received: {received}. Rejected: {why}. "
@@ -163,42 +163,40 @@ def run(
     smoothed = _smoothed(parts, outcome) if mode == "batch" else None
     all_estimates = replay.estimates if smoothed is None else smoothed.estimates
     estimates = last_pass(all_estimates)
-    left_out = len(all_estimates) - len(estimates)
     sane = parts.sanity.judge(estimates, causal=mode == "online")
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, outcome.roles, installed)
     contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction
     of_constants = contradiction_findings(found, contradiction, config) or contradictions(found, config)
-    findings = _findings(outcome, smoothed, left_out, of_constants, sane.findings)
-    result = _result(parts, replay, outcome, sane.simpler or estimates, smoothed)
-    wall_s = time.perf_counter() - began
-    return replace(
-        result,
-        findings=findings,
+    findings = [
+        *outcome.findings,
+        *note("batch", () if smoothed is None else smoothed.notes),
+        *note("clock.back", _left_out(len(all_estimates) - len(estimates))),
+        *of_constants,
+        *sane.findings,
+    ]
+    estimates = sane.simpler or estimates
+    return RunResult(
+        trajectory=_trajectory(estimates),
+        modes=tuple(e.mode for e in estimates),
+        decisions=tuple(replay.decisions),
+        counts=dict(parts.localizer.counts),
+        rejections=dict(sorted(outcome.rejections.items())),
+        findings=ordered(findings),
+        step_ms=np.array(replay.step_ms),
+        truth=replay.truth.trajectory(),
+        landmarks=parts.landmark_map if smoothed is None else smoothed.landmarks,
+        spans=replay.activity.spans(estimates[0].stamp_ns),
         source=recording_path,
-        config=config,
         found=found,
-        wall_s=wall_s,
+        installation=found_values(
+            parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
+        ),
+        cost=None if smoothed is None else smoothed.cost,
+        first_pose_s=replay.first_pose_s,
+        config=config,
         odometry=sane.odometry,
-    )
-
-
-def _findings(
-    outcome: Outcome,
-    smoothed: SmoothedRun | None,
-    left_out: int,
-    of_constants: Sequence[Finding],
-    sane: Sequence[Finding],
-) -> tuple[Finding, ...]:
-    """Findings of the whole run, the gravest first."""
-    return ordered(
-        [
-            *outcome.findings,
-            *note("batch", () if smoothed is None else smoothed.notes),
-            *note("clock.back", _left_out(left_out)),
-            *of_constants,
-            *sane,
-        ]
+        wall_s=time.perf_counter() - began,
     )
 
 
@@ -235,35 +233,6 @@ def _smoothed(parts: Assembly, outcome: Outcome) -> SmoothedRun:
         return smooth_run(parts)
     except EstimatorError as error:
         raise EstimatorError(outcome.failed(sentence(str(error)))) from error
-
-
-def _result(
-    parts: Assembly,
-    replay: Replay,
-    outcome: Outcome,
-    estimates: list[Estimate],
-    smoothed: SmoothedRun | None,
-) -> RunResult:
-    """The result of the replay and the smoothing; `run` adds the rest."""
-    installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
-    return RunResult(
-        trajectory=_trajectory(estimates),
-        modes=tuple(e.mode for e in estimates),
-        decisions=tuple(replay.decisions),
-        counts=dict(parts.localizer.counts),
-        rejections=dict(sorted(outcome.rejections.items())),
-        findings=(),
-        step_ms=np.array(replay.step_ms),
-        wall_s=0.0,
-        truth=replay.truth.trajectory(),
-        landmarks=parts.landmark_map if smoothed is None else smoothed.landmarks,
-        spans=replay.spans(estimates[0].stamp_ns),
-        installation=found_values(
-            parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
-        ),
-        cost=None if smoothed is None else smoothed.cost,
-        first_pose_s=replay.first_pose_s,
-    )
 
 
 def _left_out(poses: int) -> Iterator[str]:

@@ -182,8 +182,8 @@ class SensorSetup:
 
 def recorded_setup(
     recording: Recording, map_path: Path | None, config: Config, landmark_map: LandmarkMap | None = None
-) -> tuple[StreamFacts, SensorSetup]:
-    """The sensors of a recording, and the facts by which they were found.
+) -> SensorSetup:
+    """The sensors of a recording.
 
     Args:
         recording: to be run.
@@ -200,7 +200,7 @@ def recorded_setup(
     _need_motion(facts)
     if landmark_map is None and map_path is not None:
         landmark_map = configured_map(map_path, config)
-    return facts, sensor_setup(facts, landmark_map, config)
+    return sensor_setup(facts, landmark_map, config)
 
 
 def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: Config) -> SensorSetup:

@@ -291,7 +291,7 @@ def detect(job: Job, out: Path) -> None:
     cell, memory = job.cell, None
     try:
         with open_recording(cell.bag, cell.config.recording) as recording:
-            _, setup = recorded_setup(recording, cell.map, resolved(cell.config, cell.map))
+            setup = recorded_setup(recording, cell.map, resolved(cell.config, cell.map))
             if setup.detector is None:
                 return
             memory = setup.detector.remembering(setup.detector, detections_path(out, job), None)

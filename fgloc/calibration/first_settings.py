@@ -126,7 +126,7 @@ def _compared(bag: Path, text: str) -> Conventions:
     landmark_map = T_base_sensor = imu_up = None
     with Recording(bag, config.recording) as recording:
         try:
-            _, setup = recorded_setup(recording, map_path, config)
+            setup = recorded_setup(recording, map_path, config)
             landmark_map, T_base_sensor, imu_up = setup.landmark_map, setup.T_base_sensor, setup.imu_up
         except FglocError:  # what is missing is said elsewhere; without it less can be compared
             pass

@@ -138,7 +138,7 @@ class _Search:
 
     def begin(self, recording: Recording) -> tuple[SensorSetup, RememberedDetections | None]:
         """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
-        setup = recorded_setup(recording, self._map_path, self.config)[1]
+        setup = recorded_setup(recording, self._map_path, self.config)
         if setup.detector is None:
             return setup, None
         memory = setup.detector.remembering(setup.detector.following(), None, self.detections)

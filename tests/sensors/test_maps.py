@@ -319,7 +319,7 @@ def test_a_run_has_the_map_in_the_units_of_the_settings():
     config = load_config(sample / "robot.yaml")
     config = config.model_copy(update={"map": config.map.model_copy(update={"scale": 2.0})})
     with Recording(sample / "bag", config.recording) as recording:
-        landmark_map = recorded_setup(recording, sample / "map.yaml", config)[1].landmark_map
+        landmark_map = recorded_setup(recording, sample / "map.yaml", config).landmark_map
     assert landmark_map is not None
     for i, landmark in load_map(sample / "map.yaml").landmarks.items():
         assert np.allclose(landmark_map.landmarks[i].position, 2.0 * landmark.position)
