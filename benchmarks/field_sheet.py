@@ -100,11 +100,13 @@ SHEET: tuple[Trap, ...] = (
     Trap("pinto1", "truth's yaw offset 53-57°", "", rf"truth.*turned by {_NUMBER}", 55.0, 4.0),
     Trap("turtlebot_aruco", "odometry 0.05-0.07 s after the truth", r"clock\.(truth|odometry)",
          rf"truth.*{_NUMBER} s (ahead|before|earl|behind|after|late)", 0.06, 0.03),
+    Trap("turtlebot_aruco", "range is depth", r"sightings\.depth", r"[Rr]anges are distances along the sensor's axis"),
     Trap("turtlebot_aruco", "range 0.044 m long", r"sightings\.(scale|range_offset)", r"(range|distance).* long"),
     *(
         trap
         for k in range(1, 6)
         for trap in (
+            Trap(f"mrclam6_{k}", "range is depth", r"sightings\.depth", r"[Rr]anges are distances along the sensor's axis"),
             Trap(f"mrclam6_{k}", "gaps of the commands", "", r"/cmd_vel.*(silence|gap)"),
             Trap(f"mrclam6_{k}", "no encoder: commands", "", r"command(s|ed).*(stand|used|alone|no (encoder|odometry|wheel))"),
             Trap(f"mrclam6_{k}", "ids of robots are not in the map", r"sightings\.(unknown_id|unused)|map\.ids",
@@ -169,7 +171,7 @@ SOUND: tuple[Sound, ...] = (
     Sound("turtlebot_aruco", rf"{_PLAIN}|{_MAPPED}|wheels\.turn|imu\.\w+"),
     *(Sound(f"mrclam6_{k}", rf"{_PLAIN}|{_MAPPED.replace('|ids', '')}|imu\.\w+") for k in range(1, 6)),
     *(Sound(f"mrclam5_{k}", rf"{_PLAIN}|{_MAPPED}|imu\.\w+") for k in "ABCDE"),
-    Sound("turtlebot3_15_11_34", r"floor\.\w+|sightings\.(axes|mirrored)|map\.(mirrored|ids|unit|scale)|wheels\.sign"),
+    Sound("turtlebot3_15_11_34", r"floor\.\w+|sightings\.(axes|mirrored|depth)|map\.(mirrored|ids|unit|scale)|wheels\.sign"),
     *(Sound(f"turtlebot3_{name}", r"floor\.\w+|imu\.(axes|sign|unit|gravity)|wheels\.sign|yaw\.sign|odometry\.yaw_\w+unit")
       for name in _TB3),
     *(Sound(name, rf"{_PLAIN}|truth\.(axes|yaw_sign)") for name in ("mecanum_bag1", "mecanum_bag2", "plaza", "car_park")),

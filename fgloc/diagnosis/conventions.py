@@ -27,6 +27,7 @@ from fgloc.diagnosis.pairs import (
     Mounting,
     Noise,
     RateFit,
+    compared,
     fit_body,
     fit_map,
     fit_on_map,
@@ -54,6 +55,9 @@ _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
 _BIAS_M = 0.03  # of a range
+_ASKEW_RAD = 0.08  # standard deviation of bearings from which on depths differ from ranges, by 1 % at two of them
+_LEAST_COS = math.cos(math.radians(80.0))  # as the measurement has it
+_GAIN, _GAIN_SIGMAS = 0.05, 3.0  # of the log-likelihood of a sighting, by which another reading is named
 _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
@@ -90,6 +94,7 @@ class Conventions:
         noise: of the sensor of landmarks, where its axes are right; no finding, but a better start than the defaults.
         handling: when a person had the robot in hand; nothing is compared there.
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
+        commanded: whether commands stand in for wheels.
     """
 
     config: Config
@@ -98,6 +103,7 @@ class Conventions:
     noise: Noise | None = None
     handling: Handling = field(default_factory=Handling)
     opposite: bool = False
+    commanded: bool = False
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
         """Note a finding, and set its lines."""
@@ -130,6 +136,7 @@ def conventions(
     _odometry(found, signals)
     _yaw_of_gyro(found, signals, imu_up)
     path = signals.path(found.config)
+    found.commanded = signals.source == "command"
     if path is None or path.length_m < 0.05:
         if (rates := signals.rates()) is not None:
             _gravity(found, rates[2], _unit(imu_up))
@@ -559,6 +566,10 @@ def _sensor(
     reach = float(np.median(np.abs(planar(as_given.points, best.axes))))
     if best.misfit > _FITS * reach or best.scale.sigma > 0.3 * best.scale.value:
         return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
+    if _along_axis(found, path, seen, best, T_base_sensor, landmark_map):
+        as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
+        fits = fit_sightings(path, as_given) or fits
+        best = _best(fits)
     sound = fits.get("body")
     if best.axes == "body" or (
         sound is not None and sound.misfit < (_WORSE if seen.spatial else _MIRRORED) * best.misfit
@@ -601,10 +612,44 @@ def _as_configured(config: Config, seen: Sightings, T_base_sensor: FloatArray | 
     section = config.landmarks
     distance = np.maximum(np.linalg.norm(seen.points, axis=1, keepdims=True), 1e-9)
     ranged = section.range_scale * np.maximum(1.0 - section.range_bias_m / distance, 1e-3) * seen.points
+    if section.range_along_axis and not seen.spatial:
+        bearing = np.arctan2(seen.points[:, 1], seen.points[:, 0]) - section.bearing_bias_rad
+        ranged = ranged / np.maximum(np.cos(bearing), _LEAST_COS)[:, None]
     turned = ranged if T_base_sensor is None else ranged @ T_base_sensor[:3, :3].T
     c, s = math.cos(section.bearing_bias_rad), math.sin(section.bearing_bias_rad)
     level = np.column_stack([turned[:, :2] @ np.array([[c, -s], [s, c]]), turned[:, 2:]])
     return Sightings(seen.times, seen.ids, level, seen.spatial), ranged
+
+
+def _along_axis(
+    found: Conventions,
+    path: Path,
+    seen: Sightings,
+    m: Mounting,
+    T_base_sensor: FloatArray | None,
+    landmark_map: LandmarkMap | None,
+) -> bool:
+    """Name ranges that are distances along the sensor's axis (depths, as of cameras), or the other way round."""
+    bearing = np.arctan2(seen.points[:, 1], seen.points[:, 0])
+    if seen.spatial or float(np.std(bearing)) < _ASKEW_RAD:  # ahead the two are alike
+        return False
+    other = with_line(found.config, "landmarks.range_along_axis", along := not found.config.landmarks.range_along_axis)
+    places = {} if landmark_map is None else {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
+    first, second = (_as_configured(config, seen, T_base_sensor)[0] for config in (found.config, other))
+    gains = {"the wheels' motion": compared(path, first, second, m, {})}
+    if len(places) > 2:
+        gains["the map"] = compared(path, first, second, m, places)
+    by, gain = max(gains.items(), key=lambda item: item[1].value / item[1].sigma)
+    if min(g.value for g in gains.values()) < 0.0 or not gain.value > max(_GAIN, _GAIN_SIGMAS * gain.sigma):
+        return False
+    text = (
+        "Ranges are distances along the sensor's axis (depths)"
+        if along
+        else "Ranges are distances to the landmarks, not along the sensor's axis"
+    )
+    text += f": so they fit {by} better (gain of log-likelihood a sighting {gain.value:.2f} ± {gain.sigma:.2f})"
+    found.add("sightings.depth", text, {"landmarks.range_along_axis": along}, gain, Severity.ERROR)
+    return True
 
 
 def _best(fits: Mapping[str, Mounting]) -> Mounting:

@@ -237,6 +237,55 @@ def _refined(
     )
 
 
+def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, places: dict[int, FloatArray]) -> Figure:
+    """How much better the second of two readings of the same sightings explains them: mean gain of cost of a track.
+
+    Each reading has the mounting that suits it best. With a map (three landmarks or more) landmarks are where it has
+    them, else each is at the mean place of its track by the wheels. The sigma is by the scatter from track to track;
+    infinite: too little is seen.
+
+    Args:
+        path: motion of the wheels.
+        first: sightings, read in one way.
+        second: the same, in another.
+        m: mounting by the first.
+        places: ``(2,)`` of landmarks on the map [m], by id; empty: no map.
+    """
+    tracks = np.zeros(0, dtype=np.int64)
+    spreads: list[FloatArray] = []
+    errors: list[FloatArray] = []
+    for seen in (first, second):
+        z = planar(seen.points, m.axes)
+        on_map = _OnMap(path, seen, z, places) if len(places) > 2 else None
+        if on_map is not None and len(on_map) >= _FEWEST_ON_MAP and on_map.window.max() >= 2:
+            along, across, _ = on_map.errors(on_map.adapted(_start(m)))
+            times, ids = on_map.times, on_map.ids
+        else:
+            keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
+            times, ids, z = (part[keep][:: max(1, int(keep.sum()) // 3000)] for part in (seen.times, seen.ids, z))
+            if len(z) < _FEWEST_ON_MAP:
+                return Figure(0.0, math.inf)
+            part = _Places(path, times, z, _tracks(times, ids))
+            start = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
+            fit = least_squares(part.residuals, start, loss="cauchy", diff_step=1e-4, max_nfev=30)
+            along, across = np.split(part.residuals(fit.x)[: 2 * len(z)] * part.SIGMA, 2)
+        errors.append(np.array([along, across]))
+        spreads.append(_MAD * np.median(np.abs(errors[-1]), axis=1))
+        tracks = np.unique(_tracks(times, ids), return_inverse=True)[1]
+    least = np.maximum(np.min(spreads, axis=0), 1e-4)[:, None]
+    costs = [np.bincount(tracks, np.log1p((e / (_CAUCHY * least)) ** 2).sum(axis=0)) for e in errors]
+    gains = (costs[0] - costs[1]) / np.bincount(tracks)
+    if len(gains) < _FEWEST_TRACKS:
+        return Figure(0.0, math.inf)
+    return Figure(float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains)) + 1e-9)
+
+
+def _start(m: Mounting) -> FloatArray:
+    """Start of `_OnMap.solve`."""
+    place = np.clip([m.x.value, m.y.value], -1.0, 1.0)
+    return np.array([0.0, 0.0, m.yaw.value, *place, m.late_s.value + _NUDGE_S])
+
+
 def jackknife(left_out: FloatArray) -> FloatArray:
     """Standard deviations ``(p,)`` of estimates, from those ``(b, p)`` with one block of data left out."""
     b = len(left_out)
@@ -678,6 +727,7 @@ _WINDOW_S = (
 )
 _SPREAD_M = 0.5  # of the landmarks of a window, for its yaw
 _ROUNDS = 3  # of the noise and the fit
+_FEWEST_ON_MAP = 100  # sightings
 _LONGEST_CORRELATION_S = 2.0
 
 
@@ -753,6 +803,15 @@ class _OnMap:
                 break
         return x
 
+    def adapted(self, x: FloatArray) -> FloatArray:
+        """`solve` with the noise that the residuals show, which is kept."""
+        for _ in range(_ROUNDS):
+            x = self.solve(x)
+            along, across, _ = self.errors(x)
+            self.sigma_m = max(_MAD * float(np.median(np.abs(along))), 0.005)
+            self.sigma_rad = max(_MAD * float(np.median(np.abs(across))), 0.001)
+        return x
+
 
 def fit_on_map(
     path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]
@@ -766,16 +825,11 @@ def fit_on_map(
         places: ``(2,)`` of landmarks on the map [m], by id.
     """
     on_map = _OnMap(path, seen, planar(seen.points, "body"), places)
-    if len(on_map) < 100 or on_map.window.max() < 2:
+    if len(on_map) < _FEWEST_ON_MAP or on_map.window.max() < 2:
         return None
     x = np.array([0.0, 0.0, mounting.yaw.value, mounting.x.value, mounting.y.value, mounting.late_s.value])
     x[3:5] = np.clip(x[3:5], -1.0, 1.0)
-
-    for _ in range(_ROUNDS):
-        x = on_map.solve(x)
-        along, across, _ = on_map.errors(x)
-        on_map.sigma_m = max(_MAD * float(np.median(np.abs(along))), 0.005)
-        on_map.sigma_rad = max(_MAD * float(np.median(np.abs(across))), 0.001)
+    x = on_map.adapted(x)
     blocks = (on_map.window * _BLOCKS) // (int(on_map.window.max()) + 1)
     typical = float(np.median(np.abs(on_map.z)))
 

@@ -34,6 +34,7 @@ class Broken:
 
     bearing: float = 1.0
     range: float = 1.0
+    depth: bool = False
     sightings_late: float = 0.0
     imu_axes: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     imu_unit: float = 1.0
@@ -75,6 +76,8 @@ def record(folder: Path, wrong: Broken) -> Path:
             ranges = np.hypot(*away.T) + rng.normal(0.0, 0.02, len(away))
             bearings = np.arctan2(away[:, 1], away[:, 0]) - YAW[k] + rng.normal(0.0, 0.01, len(away))
             bearings = np.arctan2(np.sin(bearings), np.cos(bearings))
+            if wrong.depth:
+                ranges = ranges * np.cos(bearings)
             near = [
                 (i, wrong.range * r, wrong.bearing * b)
                 for i, (r, b) in enumerate(zip(ranges.tolist(), bearings.tolist(), strict=True))
@@ -111,6 +114,7 @@ CASES = {
     "sightings mirrored (F4)": (Broken(bearing=-1.0), "sightings.mirrored", None),
     "ranges in feet": (Broken(range=1.0 / FOOT), "sightings.scale", FOOT),
     "ranges in centimetres": (Broken(range=100.0), "sightings.scale", 0.01),
+    "ranges are depths": (Broken(depth=True), "sightings.depth", None),
     "sightings late (F5)": (Broken(sightings_late=0.15), "clock.sightings", 0.15),
     "IMU z flipped (G1)": (Broken(imu_axes=((1, 0, 0), (0, 1, 0), (0, 0, -1))), "imu.axes", None),
     "IMU x and z exchanged (G2)": (Broken(imu_axes=((0, 0, 1), (0, 1, 0), (1, 0, 0))), "imu.axes", None),
@@ -161,6 +165,14 @@ def test_what_init_writes_undoes_what_is_broken(tmp_path):
     made = first_settings(bag)
     assert {"sightings.mirrored", "imu.unit", "truth.axes", "map.unit"} <= {f.code for f in made.found}
     assert not conventions_of(bag, config_of(yaml.safe_load(made.text)))
+
+
+def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
+    bag = record(tmp_path, Broken())
+    config = config_of({"landmarks": {"range_along_axis": True}})
+    assert conventions_of(bag, config)[0].lines == {"landmarks.range_along_axis": "false"}
+    depths = record(tmp_path / "depths", Broken(depth=True))
+    assert not conventions_of(depths, config)
 
 
 def test_a_truth_that_freezes_and_topics_that_nothing_reads_are_named(tmp_path):
