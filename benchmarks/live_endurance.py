@@ -30,8 +30,7 @@ from benchmarks.live_streams import (
     wrong_ids,
 )
 from fgloc.config import Config, Role
-from fgloc.live.facts import LiveFacts
-from fgloc.live.run import OnlineRun
+from fgloc.live.run import LiveFacts, OnlineRun
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.types import Camera, Event, LandmarkMap, Step
 

@@ -13,7 +13,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
-from fgloc.live.facts import role_of
+from fgloc.live.run import role_of
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent

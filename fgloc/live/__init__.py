@@ -1,6 +1,7 @@
 """Localization on a running robot: `Live`."""
 
+from fgloc.live.engine import LiveStatus, TopicStatus
+from fgloc.live.extrapolation import LivePose
 from fgloc.live.live import Live
-from fgloc.live.status import LivePose, LiveStatus, TopicStatus
 
 __all__ = ["Live", "LivePose", "LiveStatus", "TopicStatus"]

@@ -1,54 +1,217 @@
-"""The threads of a live run: one estimates, one finds markers in images."""
+"""The threads of a live run: one estimates, one finds markers in images, one compares signals, one saves the state."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
 
-from fgloc.config import LiveConfig
-from fgloc.errors import EstimatorError, FglocError, unexpected
+from fgloc.config import Config, Role
+from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.instrumentation import one_blas_thread
-from fgloc.live.anchors import Outlet
-from fgloc.live.detection import DetectionWorker, Queued, State
-from fgloc.live.reception import role_of
-from fgloc.live.run import OnlineRun
-from fgloc.types import Estimate, Event, RawEvent, Step
+from fgloc.live.extrapolation import Outlet
+from fgloc.live.run import LiveFacts, OnlineRun, role_name
+from fgloc.live.state import Resumed, fingerprint, read_state, write_state
+from fgloc.sensors.markers.detector import Detector, use_one_thread
+from fgloc.sensors.markers.images import ImageError
+from fgloc.types import Camera, Estimate, Event, Finding, LandmarkMap, Mode, RawEvent, SightingsEvent, Step
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStatus:
+    """How one topic comes in."""
+
+    role: str
+    count: int
+    rate_hz: float  # by receive times, lately
+    delay_s: float  # receive time less stamp, lately; of sensors whose clock is another one, the offset is in it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveStatus:
+    """A live run at one time."""
+
+    running: bool = False  # its parts are built; before that it waits for what `waiting_for` names
+    mode: Mode | None = None  # of the last keyframe; None: no pose yet
+    stamp_ns: int | None = None  # of the last keyframe
+    keyframes: int = 0
+    step_ms: float = 0.0  # mean wall time of an update, lately
+    step_ms_max: float = 0.0  # longest one so far
+    reordering_s: float = 0.0  # how far the last keyframe was behind the newest stamp when it was made
+    queued_events: int = 0
+    queued_images: int = 0
+    topics: Mapping[str, TopicStatus] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)  # by role: for overload, not for their contents
+    rejections: Mapping[str, int] = field(default_factory=dict)  # by "sensor.reason", as in reports
+    waiting_for: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what is wrong, one sentence each
+    findings: tuple[Finding, ...] = ()  # of sensors, settings and estimate; their sentences are notes too
+
+
+# --- Marker detection: one worker, and a queue that drops the oldest waiting image ------------------------------------
+
+
+class State(Enum):
+    """Of a queued event."""
+
+    WAITING = "an image whose markers are not looked for yet"
+    DETECTING = "an image that the worker has"
+    READY = "an event to be used"
+    GONE = "an image that was dropped, or could not be decoded"
+
+
+@dataclass(slots=True, eq=False)
+class Queued:
+    """An event on its way to the estimator. An image is replaced by the markers that are found in it."""
+
+    event: Event | None
+    state: State
+    is_image: bool = False
+
+
+class DetectionWorker:
+    """Finds markers in one thread. All state is guarded by the condition that it is given.
+
+    Attributes:
+        detector: what finds them; may be exchanged.
+        rejections: images that could not be decoded, as "image." and the reason.
+        dropped: images dropped under overload.
+        error: what ended the thread, if it was not `stop`.
+    """
+
+    def __init__(self, changed: threading.Condition, most_waiting: int) -> None:
+        """Start the thread.
+
+        Args:
+            changed: notified whenever an image is done.
+            most_waiting: images that may wait, from their arrival until the estimator has their markers.
+        """
+        use_one_thread()
+        self.detector: Detector | None = None
+        self.rejections: Counter[str] = Counter()
+        self.dropped = 0
+        self.error: Exception | None = None
+        self._changed = changed
+        self._most = most_waiting
+        self._images: deque[Queued] = deque()  # from arrival until used
+        self._todo: deque[Queued] = deque()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="fgloc-detection", daemon=True)
+        self._thread.start()
+
+    @property
+    def queued(self) -> int:
+        """Images that wait."""
+        return len(self._images)
+
+    def arrived(self, image: Queued) -> None:
+        """Count an image in; of too many the oldest that the worker does not have is dropped. Hold the condition."""
+        self._images.append(image)
+        waiting = [q for q in self._images if q.state is not State.DETECTING]
+        if len(waiting) > self._most:
+            self.dropped += 1
+            self.discard(waiting[0])
+
+    def discard(self, image: Queued) -> None:
+        """An image is of no use any more, or was used. Hold the condition."""
+        if image.state is not State.DETECTING:
+            image.event, image.state = None, State.GONE
+        if image in self._images:
+            self._images.remove(image)
+
+    def submit(self, image: Queued) -> None:
+        """Have an image's markers found. Hold the condition."""
+        self._todo.append(image)
+        self._changed.notify_all()
+
+    def stop(self) -> None:
+        """End the thread; images that wait are left."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _next(self) -> tuple[Queued, RawEvent, Detector] | None:
+        with self._changed:
+            while not self._stopping:
+                while self._todo:
+                    image = self._todo.popleft()
+                    if isinstance(image.event, RawEvent) and self.detector is not None:
+                        image.state = State.DETECTING
+                        return image, image.event, self.detector
+                self._changed.wait()
+        return None
+
+    def _run(self) -> None:
+        while (task := self._next()) is not None:
+            image, event, detector = task
+            found: SightingsEvent | None = None
+            reason = ""
+            try:
+                found = detector.detect(event)
+            except ImageError as error:
+                reason = error.reason
+            except Exception as error:  # told by whoever feeds this thread
+                self.error = error
+                return self._wake()
+            with self._changed:
+                if reason:
+                    self.rejections[f"image.{reason}"] += 1
+                image.event, image.state = found, State.GONE if found is None else State.READY
+                if found is None and image in self._images:
+                    self._images.remove(image)
+                self._changed.notify_all()
+
+
+# --- Estimation -------------------------------------------------------------------------------------------------------
 
 _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot
 _MEAN_OF = 20  # steps, in the mean of their time
+_SAVE_EVERY_S = 1.0
+_COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
-class Engine:
+@dataclass(frozen=True, slots=True, eq=False)
+class Settings:
+    """Of a live run, as `Live` has them. Can be pickled."""
+
+    config: Config
+    landmark_map: LandmarkMap | None
+    state: Path | None
+    roles: Collection[Role] | None
+    camera: Camera | None
+
+
+class Estimation:
     """Events go in by `put`, from any thread; estimates come out in the estimation thread.
 
     Attributes:
-        busy: held while the run is used; take it to look into the run.
-        changed: guards the queues and the counters; notified of every change.
-        dropped: events that were not used whatever is in them, by role; images are counted by the worker.
-        notes: what the user should know, one sentence each.
-        step_s, longest_s: wall time of an update: mean of the last ones, and the longest.
+        run: what the threads feed.
     """
 
-    def __init__(self, run: OnlineRun, outlet: Outlet, config: LiveConfig) -> None:
-        """Start the threads.
-
-        Args:
-            run: what is to be fed.
-            outlet: takes what comes out.
-            config: how long its roles are waited for, by receive times, and how many images may wait.
-        """
-        self.busy = threading.RLock()
-        self.changed = threading.Condition()
-        self.dropped: Counter[str] = Counter()
-        self.notes: dict[str, None] = {}  # an ordered set
-        self.step_s = self.longest_s = 0.0
-        self._run = run
+    def __init__(self, settings: Settings, outlet: Outlet) -> None:
+        """Start the threads; what is found goes to ``outlet``."""
+        config, landmark_map, self._state = settings.config, settings.landmark_map, settings.state
+        read = Resumed(None, "") if self._state is None else read_state(self._state, fingerprint(landmark_map))
+        facts = LiveFacts(config, settings.roles, settings.camera)
+        self.run = OnlineRun(config, landmark_map, facts, read.state)
+        self._busy = threading.RLock()  # held while the run is used
+        self._changed = threading.Condition()  # guards the queues and what follows; notified of every change
+        self._dropped: Counter[str] = Counter()  # for overload, by role; images are counted by the worker
+        self._notes: dict[str, None] = {read.note: None} if read.note else {}  # an ordered set
+        self._step_s = self._longest_s = 0.0  # wall time of an update: mean of the last ones, and the longest
         self._outlet = outlet
-        self._startup_s = config.startup_s
+        self._startup_s = config.live.startup_s
         self._inbox: deque[Queued | PoseWithCovariance] = deque()
         self._line: deque[Queued] = deque()  # gated, in order; only the estimation thread changes it
         self._held: deque[Queued] = deque(maxlen=_MOST_EVENTS)  # before the parts are built
@@ -56,72 +219,103 @@ class Engine:
         self._working = False
         self._closing = False
         self._failed: FglocError | None = None
-        self.worker = DetectionWorker(self.changed, config.image_queue)
-        self._thread = threading.Thread(target=self._estimate, name="fgloc-estimation", daemon=True)
-        self._thread.start()
+        self._worker = DetectionWorker(self._changed, config.live.image_queue)
+        self._threads = [_started("estimation", self._estimate), _started("diagnosis", self._compare_regularly)]
+        if self._state is not None:
+            self._threads.append(_started("state", self._save_regularly))
 
     # --- any thread ---
 
     def put(self, events: Iterable[Event]) -> None:
-        """Queue events; of too many, the oldest is dropped."""
-        with self.changed:
-            self.check_alive()
+        """Queue events; of too many, the oldest is dropped.
+
+        Raises:
+            EstimatorError: `close` was called.
+            FglocError: the run has failed.
+        """
+        with self._changed:
+            self._check_alive()
             for event in events:
                 is_image = isinstance(event, RawEvent)
                 queued = Queued(event, State.WAITING if is_image else State.READY, is_image)
                 if is_image:
-                    self.worker.arrived(queued)
+                    self._worker.arrived(queued)
                 self._inbox.append(queued)
             while len(self._inbox) > _MOST_EVENTS:
                 lost = self._inbox.popleft()
                 if isinstance(lost, Queued) and lost.event is not None:
-                    self.dropped[role_of(lost.event)] += 1
-                    self.worker.discard(lost)
-            self.changed.notify_all()
+                    self._dropped[role_name(lost.event)] += 1
+                    self._worker.discard(lost)
+            self._changed.notify_all()
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
-        """Queue a pose to go on from."""
-        with self.changed:
-            self.check_alive()
+        """Queue a pose to go on from; raises as `put`."""
+        with self._changed:
+            self._check_alive()
             self._inbox.append(belief)
-            self.changed.notify_all()
+            self._changed.notify_all()
 
     def wait(self, timeout_s: float | None) -> bool:
         """Until everything queued has been used; False if it was not in time."""
-        with self.changed:
-            done = self.changed.wait_for(lambda: self._idle() or self._failed is not None, timeout_s)
+        with self._changed:
+            done = self._changed.wait_for(lambda: self._idle() or self._failed is not None, timeout_s)
             self.check_failed()
             return done
 
-    def pause(self, seconds: float) -> bool:
-        """Sleep; False at once when the run ends."""
-        with self.changed:
-            return not self.changed.wait_for(lambda: self._closing or self._failed is not None, seconds)
+    def status(self) -> LiveStatus:
+        """How it fares, but for what is known of topics where they are received."""
+        run, worker = self.run, self._worker
+        with self._busy:
+            newest, rejections, findings = run.newest, run.rejections, run.findings()
+            keyframes, running, waiting = run.keyframes, run.parts is not None, run.facts.waiting_for()
+            reordering_s = run.reordering_s
+        with self._changed:
+            rejections += worker.rejections
+            return LiveStatus(
+                running=running,
+                mode=None if newest is None else newest.mode,
+                stamp_ns=None if newest is None else newest.stamp_ns,
+                keyframes=keyframes,
+                step_ms=self._step_s * 1e3,
+                step_ms_max=self._longest_s * 1e3,
+                reordering_s=reordering_s,
+                queued_events=len(self._inbox) + len(self._line) + len(self._held),
+                queued_images=worker.queued,
+                dropped=dict(self._dropped + Counter({"image": worker.dropped})),
+                rejections=dict(sorted(rejections.items())),
+                waiting_for=waiting,
+                notes=tuple(dict.fromkeys((*self._notes, *(f.text for f in findings)))),
+                findings=findings,
+            )
 
-    def close(self) -> bool:
-        """Use what is queued, but for images, and end the threads; False if that was done before."""
-        with self.changed:
+    def save(self, path: Path) -> bool:
+        """As `Live.save`."""
+        with self._busy:
+            snapshot = self.run.snapshot()
+        if snapshot is not None:
+            write_state(path, snapshot)
+        return snapshot is not None
+
+    def close(self) -> None:
+        """Use what is queued, but for images, save the state, and end the threads; as `Live.close`."""
+        with self._changed:
             closed, self._closing = self._closing, True
-            self.changed.notify_all()
-        self.worker.stop()
-        self._thread.join()
-        return not closed
-
-    @property
-    def queued(self) -> int:
-        """Events that wait."""
-        return len(self._inbox) + len(self._line) + len(self._held)
-
-    def check_alive(self) -> None:
-        """Raises: EstimatorError: closed, or failed."""
-        self.check_failed()
-        if self._closing:
-            raise EstimatorError("the live run is closed; make a new Live")
+            self._changed.notify_all()
+        self._worker.stop()
+        for thread in self._threads:
+            thread.join()
+        if self._state is not None and not closed:
+            self.save(self._state)
 
     def check_failed(self) -> None:
         """Raises: FglocError: what ended the estimation thread."""
         if self._failed is not None:
             raise self._failed
+
+    def _check_alive(self) -> None:
+        self.check_failed()
+        if self._closing:
+            raise EstimatorError("the live run is closed; make a new Live")
 
     def _idle(self) -> bool:
         return not (self._inbox or self._working or self._line)
@@ -132,30 +326,30 @@ class Engine:
     def _estimate(self) -> None:
         try:
             while (batch := self._next_batch()) is not None:
-                with self.busy:
+                with self._busy:
                     for item in batch:
                         self._take(item)
                     self._use_line()
-                with self.changed:
+                with self._changed:
                     self._working = False
-                    self.changed.notify_all()
-            with self.busy:
+                    self._changed.notify_all()
+            with self._busy:
                 self._use_line()
-                self._report(self._run.finish())
+                self._report(self.run.finish())
         except Exception as error:  # raised again by the next call from outside
             failure = unexpected(error, "the live run")
-            with self.changed:
+            with self._changed:
                 self._failed = failure
                 self._working = False
-                self.changed.notify_all()
+                self._changed.notify_all()
             self._outlet.failed(failure)
 
     def _next_batch(self) -> list[Queued | PoseWithCovariance] | None:
         """What has come in, possibly nothing when only an image is done; None at the end."""
-        with self.changed:
-            self.changed.wait_for(lambda: self._closing or self._inbox or self._image_done())
-            if self.worker.error is not None:
-                raise self.worker.error
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._inbox or self._image_done())
+            if self._worker.error is not None:
+                raise self._worker.error
             if self._closing and not self._inbox:
                 return None
             self._working = True
@@ -165,18 +359,18 @@ class Engine:
 
     def _image_done(self) -> bool:
         done = bool(self._line) and self._line[0].state not in _UNFOUND
-        return done or self.worker.error is not None
+        return done or self._worker.error is not None
 
     def _take(self, item: Queued | PoseWithCovariance) -> None:
         """Take an event through the gate, or hold it until the parts are built."""
         if isinstance(item, PoseWithCovariance):
-            return self._run.reset_pose(item)
-        event, facts = item.event, self._run.facts
+            return self.run.reset_pose(item)
+        event, facts = item.event, self.run.facts
         if event is None:  # an image that was dropped
             return
         if not facts.topic_is_used(event):
             return self._refuse(item, event)
-        if self._run.parts is not None:
+        if self.run.parts is not None:
             if facts.is_news(event) and facts.note(event):
                 self._build()
             return self._admit(item)
@@ -189,58 +383,88 @@ class Engine:
                 self._admit(self._held.popleft())
 
     def _build(self) -> None:
-        detector = self._run.build().detector
-        self.worker.detector = None if detector is None else detector.following()
-        assert self._run.anchors is not None
-        self._outlet.built(self._run.anchors.parts)
+        detector = self.run.build().detector
+        self._worker.detector = None if detector is None else detector.following()
+        assert self.run.anchors is not None
+        self._outlet.built(self.run.anchors.parts)
 
     def _refuse(self, item: Queued, event: Event) -> None:
         """An event of another topic than the one that plays its role."""
-        role = role_of(event)
-        with self.changed:
-            if not self._run.facts.is_configured(event):
-                self.notes.setdefault(
+        role = role_name(event)
+        with self._changed:
+            if not self.run.facts.is_configured(event):
+                self._notes.setdefault(
                     f"{event.topic}: a second topic of the role {role} is not used; choose one by "
                     f"recording.topics.{role}"
                 )
-            self.dropped[role] += 1
-            self.worker.discard(item)
+            self._dropped[role] += 1
+            self._worker.discard(item)
 
     def _admit(self, item: Queued) -> None:
         event = item.event
         if event is None:
             return
-        passed = self._run.check(event) if self._run.facts.is_there(event) else None
-        with self.changed:
+        passed = self.run.check(event) if self.run.facts.is_there(event) else None
+        with self._changed:
             if passed is None:
-                return self.worker.discard(item)
+                return self._worker.discard(item)
             if item.state is State.GONE:
                 return
             item.event = passed
             self._line.append(item)
             if item.is_image:
-                self.worker.submit(item)
+                self._worker.submit(item)
 
     def _use_line(self) -> None:
         """Use all events up to the first image whose markers are not yet found; at the end, up to the last."""
         while self._line:
-            with self.changed:
+            with self._changed:
                 item = self._line[0]
                 if item.state in _UNFOUND and not self._closing:
                     return
                 self._line.popleft()
                 event, ready = item.event, item.state is State.READY
-                self.worker.discard(item)
+                self._worker.discard(item)
             if ready and event is not None:
-                self._report(self._run.use(event, item.is_image))
+                self._report(self.run.use(event, item.is_image))
 
     def _report(self, steps: Iterable[tuple[Step, Estimate | None]]) -> None:
         began = time.perf_counter()
         for step, estimate in steps:
             took = time.perf_counter() - began
-            with self.changed:
-                self.step_s += (took - self.step_s) / min(self._run.keyframes, _MEAN_OF)
-                self.longest_s = max(self.longest_s, took)
+            with self._changed:
+                self._step_s += (took - self._step_s) / min(self.run.keyframes, _MEAN_OF)
+                self._longest_s = max(self._longest_s, took)
             if estimate is not None:
-                self._outlet.estimated(self._run.anchor(step, estimate), estimate)
+                self._outlet.estimated(self.run.anchor(step, estimate), estimate)
             began = time.perf_counter()
+
+    # --- threads beside it ---
+
+    def _pause(self, seconds: float) -> bool:
+        """Sleep; False at once when the run ends."""
+        with self._changed:
+            return not self._changed.wait_for(lambda: self._closing or self._failed is not None, seconds)
+
+    def _compare_regularly(self) -> None:
+        """Compare signals beside the estimation, which goes on meanwhile."""
+        while self._pause(_COMPARE_EVERY_S):
+            with self._busy:
+                comparison = self.run.comparison()
+            if comparison is not None:
+                comparison()
+
+    def _save_regularly(self) -> None:
+        while self._pause(_SAVE_EVERY_S):
+            try:
+                assert self._state is not None
+                self.save(self._state)
+            except OutputError as error:
+                with self._changed:
+                    self._notes.setdefault(str(error))
+
+
+def _started(name: str, work: Callable[[], None]) -> threading.Thread:
+    thread = threading.Thread(target=work, name=f"fgloc-{name}", daemon=True)
+    thread.start()
+    return thread

@@ -3,30 +3,162 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fgloc.config import Config, Role
 from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.anchors import Anchor, MotionParts
-from fgloc.live.estimation import Estimation, Settings
-from fgloc.live.events import EventMaker
-from fgloc.live.extrapolation import Extrapolator
+from fgloc.intake.clocks import Source, TopicClocks, source_of
+from fgloc.intake.validation import EventValidator, reported_bounds
+from fgloc.live.engine import Estimation, LiveStatus, Settings, TopicStatus
+from fgloc.live.extrapolation import Anchor, Extrapolator, LivePose, MotionParts
 from fgloc.live.process import EstimationProcess
-from fgloc.live.reception import Reception
-from fgloc.live.status import LivePose, LiveStatus
+from fgloc.live.run import LiveFacts, role_name
+from fgloc.sensors import registry
+from fgloc.sensors.base import SENSOR, When
 from fgloc.sensors.learned.sensor import learned_motion
 from fgloc.sensors.maps import configured_map
-from fgloc.types import Camera, Estimate, Event, LandmarkMap
+from fgloc.types import Camera, CameraInfoEvent, Estimate, Event, FloatArray, LandmarkMap, MotionEvent, TransformEvent
+
+# --- Reception: rates and delays by topic, publishers, and clocks that were reset -------------------------------------
+
+_SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
+_SUCCESSION_NS = (
+    1_000_000_000  # a publisher that sends nothing for this long has ended; another one of the topic is used
+)
 
 
-class Live(EventMaker):
+_MEAN_OF = 20  # messages, in the means of their interval and delay
+_REGULAR_S = 1.0  # a topic that comes more often is missed
+
+
+class _TopicMeter:
+    """Rate and delay of one topic: exponential means over the last messages.
+
+    Attributes:
+        last_ns: when the last one was received.
+    """
+
+    def __init__(self, role: str) -> None:
+        """Nothing has come yet."""
+        self._role = role
+        self._count = 0
+        self.last_ns = 0
+        self._interval_s = 0.0
+        self._delay_s = 0.0
+
+    def add(self, stamp_ns: int, received_ns: int) -> None:
+        """Take in one message."""
+        delay = (received_ns - stamp_ns) * 1e-9
+        if self._count:
+            interval = max(received_ns - self.last_ns, 0) * 1e-9
+            share = 1.0 / min(self._count, _MEAN_OF)
+            self._interval_s += share * (interval - self._interval_s)
+            self._delay_s += share * (delay - self._delay_s)
+        else:
+            self._delay_s = delay
+        self._count += 1
+        self.last_ns = received_ns
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether it comes often enough to be missed."""
+        return self._role != "tf" and self._count > 2 and self._interval_s < _REGULAR_S
+
+    def status(self) -> TopicStatus:
+        """As it is now."""
+        rate = 1.0 / self._interval_s if self._interval_s > 0.0 else 0.0
+        return TopicStatus(self._role, self._count, rate, self._delay_s)
+
+
+@dataclass(slots=True)
+class _Publisher:
+    """Whose messages of a topic are used."""
+
+    name: str
+    received_ns: int
+
+    def has_the_topic(self, name: str, received_ns: int) -> bool:
+        """Whether a message is of that publisher, or of one that takes its place."""
+        if name != self.name and received_ns - self.received_ns < _SUCCESSION_NS:
+            return False
+        self.name, self.received_ns = name, received_ns
+        return True
+
+
+class Reception:
+    """Takes every event as it arrives; used under the lock of its owner.
+
+    Attributes:
+        dropped: events that are not used whatever is in them, by role.
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Nothing has arrived."""
+        self._selection = LiveFacts(config, None, None)
+        self._gate = EventValidator(reported_bounds(config))
+        self.dropped: Counter[str] = Counter()
+        self._publishers: dict[Source, _Publisher] = {}
+        self._meters: dict[str, _TopicMeter] = {}
+        self._clocks = TopicClocks()
+        self._notes: dict[str, None] = {}  # an ordered set
+
+    def receive(self, event: Event, publisher: str) -> list[Event]:
+        """The events that are to be used now: mostly this one; see `TopicClocks`."""
+        role = role_name(event)
+        if not isinstance(event, TransformEvent) and not self._is_of_its_publisher(event, publisher):
+            self.dropped[role] += 1
+            self.note(
+                f"{event.topic}: two publishers; only the messages of the first are used: stop or rename one of them"
+            )
+            return []
+        if event.topic not in self._meters:
+            self._meters[event.topic] = _TopicMeter(role)
+        self._meters[event.topic].add(event.stamp_ns, event.received_ns)
+        return self._clocks.correct(event)
+
+    def _is_of_its_publisher(self, event: Event, publisher: str) -> bool:
+        """Whether a message is of the one publisher that its topic should have; transforms have any number."""
+        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
+        return first.has_the_topic(publisher, event.received_ns)
+
+    def motion(self, event: Event) -> MotionEvent | None:
+        """An event that was received, if it is of the motion source to be used, and as the gate lets it through."""
+        if not isinstance(event, MotionEvent) or not self._selection.topic_is_used(event):
+            return None
+        passed = self._gate.check(event)
+        return passed if isinstance(passed, MotionEvent) else None
+
+    def note(self, text: str) -> None:
+        """Remember a sentence for the user."""
+        self._notes.setdefault(text)
+
+    def topics(self) -> Mapping[str, TopicStatus]:
+        """How each topic comes in."""
+        return {topic: meter.status() for topic, meter in sorted(self._meters.items())}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        newest = max((meter.last_ns for meter in self._meters.values()), default=0)
+        gaps = [
+            f"{topic}: no message for {(newest - meter.last_ns) * 1e-9:.0f} s"
+            for topic, meter in sorted(self._meters.items())
+            if meter.is_regular and newest - meter.last_ns > _SILENT_NS
+        ]
+        return (*self._notes, *self._clocks.notes, *gaps)
+
+
+class Live(registry.SensorInput):
     """Localizes a robot while it drives.
 
     Events may be pushed from any thread, in the order in which they arrive; `push` takes microseconds. One thread
@@ -132,6 +264,40 @@ class Live(EventMaker):
         """
         self._results.subscribe(callback)
 
+    # --- events from plain numbers: topics have the names that the configuration gives them, else of their roles ---
+
+    def camera_info(
+        self,
+        width: int,
+        height: int,
+        K: ArrayLike,
+        D: ArrayLike = (),
+        model: str = "plumb_bob",
+        frame_id: str = SENSOR,
+    ) -> None:
+        """The camera's calibration ``(3, 3)``, ``(n,)``; see `fgloc.types.Camera` for the models. Told once."""
+        now = time.time_ns()
+        arrays: tuple[Any, Any] = np.asarray(K, dtype=float).reshape(3, 3), np.asarray(D, dtype=float).ravel()
+        topic = self._recording.topics.camera_info or "camera_info"
+        self._deliver(CameraInfoEvent(now, now, topic, frame_id, width, height, model, *arrays))
+
+    def transform(self, parent: str, child: str, translation: ArrayLike, rotation: ArrayLike) -> None:
+        """A fixed transform ``T_parent_child``: translation ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
+        now = time.time_ns()
+        t: FloatArray = np.asarray(translation, dtype=float)
+        q: FloatArray = np.asarray(rotation, dtype=float)
+        self._deliver(TransformEvent(now, now, "/tf_static", parent, child, t, q, True))
+
+    def _when(self, role: Role, stamp_ns: int) -> When:
+        """Stamp as the configuration corrects it, receive time and topic."""
+        received = time.time_ns()
+        stamp = received if role in self._recording.received_stamps else int(stamp_ns)
+        given: str | None = getattr(self._recording.topics, role)
+        return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, given or role
+
+    def _deliver(self, event: Event) -> None:
+        self.push(event)
+
     # --- out ---
 
     def pose_at(self, stamp_ns: int | None = None) -> LivePose | None:
@@ -183,9 +349,6 @@ class Live(EventMaker):
             OutputError: the state cannot be written.
         """
         self._estimation.close()
-
-    def _deliver(self, event: Event) -> None:
-        self.push(event)
 
 
 def _begun(process: bool | EstimationProcess, settings: Settings, results: _Results) -> Estimation | EstimationProcess:

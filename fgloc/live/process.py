@@ -6,31 +6,35 @@ would hold up the threads that receive messages and publish poses.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import math
+import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Iterable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from fgloc.errors import EstimatorError, FglocError
+from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.anchors import Outlet
-from fgloc.live.estimation import Settings
-from fgloc.live.reception import role_of
-from fgloc.live.status import LiveStatus
-from fgloc.types import Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
+from fgloc.live.engine import Estimation, LiveStatus, Settings
+from fgloc.live.extrapolation import Anchor, MotionParts, Outlet
+from fgloc.live.run import role_name
+from fgloc.types import Estimate, Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
 
-_START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.worker import main; main()"
+_START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
 _STATUS_S = 0.5  # if the process does not say how it fares in this time, what it said last is told ...
 _SILENT_S = 3.0  # ... and from then on that it does not answer: an update takes milliseconds, a search of the map 1 s
@@ -171,7 +175,7 @@ class EstimationProcess:
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
         self._images -= isinstance(event, RawEvent)
-        self._dropped[role_of(event)] += 1
+        self._dropped[role_name(event)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:
         """Its answer comes after all that what was put before has led to."""
@@ -248,3 +252,71 @@ class EstimationProcess:
             self._changed.notify_all()
         for answer in asked.values():
             answer.set_exception(error)
+
+
+# --- The child process ------------------------------------------------------------------------------------------------
+
+_ANSWERING = 4  # threads that answer questions
+
+
+def main() -> None:
+    """Of the child process: do what comes through the pipe."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager ends the parent too, which ends this one in order
+    _Worker(Connection(int(sys.argv[1]))).run()
+
+
+class _Worker:
+    """Feeds an `Estimation` from a pipe, and answers through it."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()
+
+    def built(self, parts: MotionParts) -> None:
+        self._tell("built", parts)
+
+    def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
+        self._tell("estimated", anchor, estimate)
+
+    def failed(self, error: FglocError) -> None:
+        self._tell("failed", error)
+
+    def run(self) -> None:
+        """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
+        gc.freeze()  # what was imported stays: nothing is to be collected there
+        try:
+            self._tell("ready")
+            estimation = Estimation(self._connection.recv(), self)
+            pool = ThreadPoolExecutor(_ANSWERING)
+            while True:
+                self._use(estimation, pool, self._connection.recv())
+        except (EOFError, OSError):
+            os._exit(1)
+        except Exception as error:
+            self._tell("failed", unexpected(error, "the live run"))  # the settings cannot be used
+
+    def _use(self, estimation: Estimation, pool: ThreadPoolExecutor, batch: Iterable[Any]) -> None:
+        """In order."""
+        for is_event, items in groupby(batch, lambda item: isinstance(item, Event)):
+            with suppress(FglocError):  # it has failed, and has told so
+                if is_event:
+                    estimation.put(items)
+                    continue
+                for item in items:
+                    if isinstance(item, PoseWithCovariance):
+                        estimation.reset_pose(item)
+                    else:
+                        pool.submit(self._answer, estimation, *item)
+
+    def _answer(self, estimation: Estimation, number: int, method: str, arguments: tuple[Any, ...]) -> None:
+        try:
+            result = getattr(estimation, method)(*arguments)
+            if method == "close":
+                result = estimation.status()
+        except Exception as error:
+            result = unexpected(error, "the live run")
+        self._tell("answer", number, result)
+
+    def _tell(self, *message: Any) -> None:
+        with self._sending:
+            self._connection.send(message)

@@ -16,8 +16,7 @@ from benchmarks.live_endurance import run_of
 from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
 from fgloc.estimation.pose_fit import PoseFit
 from fgloc.live.extrapolation import Extrapolator
-from fgloc.live.facts import LiveFacts
-from fgloc.live.run import OnlineRun
+from fgloc.live.run import LiveFacts, OnlineRun
 from fgloc.types import Mode, MotionEvent
 
 SECOND = 1_000_000_000

@@ -19,7 +19,7 @@ from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.estimation.localizer import Localizer
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
-from fgloc.live.status import LiveStatus
+from fgloc.live.engine import LiveStatus
 from fgloc.live.wire.node import described
 from fgloc.recording.standard_messages import diagnostics
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent

@@ -13,11 +13,18 @@ from wire import DOMAIN, wait_until
 
 from fgloc.config import RecordingConfig, TopicsConfig, role_names
 from fgloc.errors import WireError
-from fgloc.live.wire import intake, play
-from fgloc.live.wire.clock import WireClock
-from fgloc.live.wire.intake import Intake
-from fgloc.live.wire.names import dds_topic, dds_type, ros_topic, ros_type
-from fgloc.live.wire.participant import Participant, Publication, Sample
+from fgloc.live.wire import node, play
+from fgloc.live.wire.node import Intake
+from fgloc.live.wire.participant import (
+    Participant,
+    Publication,
+    Sample,
+    WireClock,
+    dds_topic,
+    dds_type,
+    ros_topic,
+    ros_type,
+)
 from fgloc.live.wire.participant import Writer as WireWriter
 from fgloc.live.wire.play import Player
 from fgloc.recording.messages import Messages
@@ -26,7 +33,7 @@ from fgloc.recording.reader import converters_of, open_recording
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
-    monkeypatch.setattr(intake, "SETTLED_S", 0.2)
+    monkeypatch.setattr(node, "SETTLED_S", 0.2)
     monkeypatch.setattr(play, "_QUIET_S", 0.5)
 
 

@@ -21,13 +21,11 @@ from fgloc.config import Config, load_config
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.live import LivePose
-from fgloc.live.wire import intake, play
-from fgloc.live.wire.node import Node
-from fgloc.live.wire.odom_frame import OdomFrame
+from fgloc.live.wire import node, play
+from fgloc.live.wire.node import Node, Teller
+from fgloc.live.wire.outputs import SPAN_S, OdomFrame, RecentPoses
 from fgloc.live.wire.participant import Participant
 from fgloc.live.wire.play import Player
-from fgloc.live.wire.recent import SPAN_S, RecentPoses
-from fgloc.live.wire.teller import Teller
 from fgloc.recording.storage import Storage
 from fgloc.runner import run
 from fgloc.sensors.base import with_values
@@ -47,7 +45,7 @@ OUTPUTS = {
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
-    monkeypatch.setattr(intake, "SETTLED_S", 0.2)
+    monkeypatch.setattr(node, "SETTLED_S", 0.2)
     monkeypatch.setattr(play, "_QUIET_S", 0.5)
 
 

@@ -1,4 +1,4 @@
-"""A participant on ROS 2's wire: finds publications, writes and reads messages as CDR.
+"""A participant on ROS 2's wire: finds publications, writes and reads messages as CDR, and knows what time it is.
 
 cyclonedds is imported late: it comes with the extra ``live``.
 """
@@ -6,18 +6,112 @@ cyclonedds is imported late: it comes with the extra ``live``.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 from fgloc.errors import WireError
-from fgloc.live.wire.dds_types import cdr_type
-from fgloc.live.wire.names import dds_topic, ros_topic, ros_type
-from fgloc.recording.messages import Messages
+from fgloc.recording.messages import FieldLayout, Messages
 
 if TYPE_CHECKING:
     from cyclonedds.domain import Domain
+
+
+# --- Names of topics and types in DDS ---------------------------------------------------------------------------------
+
+OWN = "/fgloc/"  # topics below are outputs of `fgloc live`, of this process or another
+_TOPIC = "rt/"
+
+
+def dds_topic(topic: str) -> str:
+    """``/odom`` as ``rt/odom``."""
+    return _TOPIC + topic.lstrip("/")
+
+
+def ros_topic(dds: str) -> str | None:
+    """``rt/odom`` as ``/odom``; None: no topic of ROS (a service, an action's part, another program's)."""
+    return "/" + dds.removeprefix(_TOPIC) if dds.startswith(_TOPIC) else None
+
+
+def dds_type(message_type: str) -> str:
+    """``nav_msgs/msg/Odometry`` as ``nav_msgs::msg::dds_::Odometry_``."""
+    package, kind, name = message_type.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def ros_type(dds: str) -> str | None:
+    """``nav_msgs::msg::dds_::Odometry_`` as ``nav_msgs/msg/Odometry``; None: no message type of ROS."""
+    parts = dds.split("::")
+    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
+        return None
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+
+
+# --- DDS types, built from message definitions; rosbags (de)serializes what goes through them -------------------------
+
+
+def cdr_type(message_type: str, layout: Mapping[str, Sequence[FieldLayout]]) -> type[Any]:
+    """A topic type of cyclonedds whose samples are made of, and hold, a message's CDR as ``cdr``.
+
+    DDS gets the true type, so that others can check against it what they exchange with us, and damaged samples are
+    dropped on arrival; cyclonedds' own (de)serialization in Python, which is slow, is left out.
+
+    Args:
+        message_type: "pkg/msg/Name".
+        layout: fields of it and of all the types inside it, by type.
+
+    Raises:
+        WireError: a field is of a kind that DDS lacks.
+    """
+    made: dict[str, type[Any]] = {}
+    kind = _struct(message_type, layout, made)
+
+    def init(self: Any, cdr: bytes) -> None:
+        self.cdr = cdr
+
+    def serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None) -> bytes:
+        return bytes(self.cdr)
+
+    def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
+        return cls(data)
+
+    kind.__init__ = init
+    kind.serialize = serialize
+    kind.deserialize = kind.deserialize_key = classmethod(deserialize)  # a key comes alone when a writer leaves
+    return kind
+
+
+def _struct(name: str, layout: Mapping[str, Sequence[FieldLayout]], made: dict[str, type[Any]]) -> type[Any]:
+    from cyclonedds.idl import make_idl_struct
+
+    if name not in made:
+        fields = {field.name: _field(field, layout, made) for field in layout[name]}
+        typename = dds_type(name).replace("::", ".")  # cyclonedds' spelling
+        made[name] = make_idl_struct(name.rsplit("/", 1)[-1] + "_", typename, fields)
+    return made[name]
+
+
+def _field(field: FieldLayout, layout: Mapping[str, Sequence[FieldLayout]], made: dict[str, type[Any]]) -> Any:
+    from cyclonedds.idl import types
+
+    plain = {"string": str, "bool": bool, "char": types.uint8}
+    inner: Any
+    if field.nested:
+        inner = _struct(field.element, layout, made)
+    else:
+        inner = plain.get(field.element) or getattr(types, field.element, None)
+        if inner is None:
+            raise WireError(f"field {field.name} is a {field.element}, which cannot be put on the wire; leave it out")
+    if field.array is not None:
+        return types.array[inner, field.array]
+    if field.sequence is not None:
+        return types.sequence[inner]  # bounds do not change the CDR
+    return inner
+
+
+# --- Participant ------------------------------------------------------------------------------------------------------
 
 _LOOPBACK = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="true"/></Interfaces>
@@ -282,3 +376,48 @@ def _loopback(domain: int) -> Domain:
         if known is None:
             known = _domains[domain] = Domain(domain, _LOOPBACK)
         return known
+
+
+# --- Time: of /clock where there is one, else the machine's -----------------------------------------------------------
+
+CLOCK = "/clock"
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+_ALIKE_NS = 1_000_000_000  # clocks closer than this are one clock: ROS counts on it between machines
+
+
+class WireClock:
+    """Follows /clock from its first message on."""
+
+    def __init__(self, participant: Participant) -> None:
+        """Subscribe."""
+        self._messages = participant.messages
+        self._lock = threading.Lock()
+        self._simulated_ns: int | None = None
+        participant.read(CLOCK, CLOCK_TYPE, self._on_clock)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether there is a /clock."""
+        return self._simulated_ns is not None
+
+    def now_ns(self) -> int:
+        """The time. Simulation time stands still between messages, as in ROS."""
+        with self._lock:
+            return time.time_ns() if self._simulated_ns is None else self._simulated_ns
+
+    def received_ns(self, sample: Sample) -> int:
+        """When a message came.
+
+        That is when it was written, which neither the network nor a busy processor delays, if its writer has our clock:
+        simulation time (as `fgloc play` has it; other players and simulators write by the machine's clock), or the
+        machine's.
+        """
+        now = self.now_ns()
+        apart = abs(sample.source_ns - now)
+        ours = apart <= abs(sample.source_ns - time.time_ns()) if self.simulated else apart < _ALIKE_NS
+        return sample.source_ns if ours else now
+
+    def _on_clock(self, sample: Sample) -> None:
+        stamp = self._messages.decode(CLOCK_TYPE, sample.cdr).clock
+        with self._lock:
+            self._simulated_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -8,9 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fgloc.errors import FglocError, WireError
-from fgloc.live.wire.clock import TOPIC as CLOCK
-from fgloc.live.wire.clock import TYPE as CLOCK_TYPE
-from fgloc.live.wire.participant import Participant, Writer
+from fgloc.live.wire.participant import CLOCK, CLOCK_TYPE, Participant, Writer
 from fgloc.recording.messages import Messages, ros2_type
 from fgloc.recording.storage import Channel, Storage
 
