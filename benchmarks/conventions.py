@@ -10,15 +10,18 @@ Each convention of each sensor is broken, one at a time, in recordings that agre
   running check within so many seconds of motion; ``conventions.online_named``: their share of all.
   ``conventions.online_false``: what a running check names meanwhile of the recordings as they are.
 
-Recordings: two samples of the simulator, and those of other people that the folder ``FGLOC_REAL_DATA`` holds. The
-half of the mistakes that ``--quick`` has was looked at while thresholds were chosen; the other was not.
+Recordings: two samples of the simulator, and those of other people that the folder ``FGLOC_REAL_DATA`` holds; two of
+these have surveyed maps (of text, `benchmarks.field_recordings` makes bags). Markers in images, and the map and camera
+with them, are compared by fits: `benchmarks.gross`. The half of the mistakes that ``--quick`` has was looked at while
+thresholds were chosen; the other was not.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,7 @@ import numpy as np
 import yaml
 
 from benchmarks.common import Row, main
+from benchmarks.field_recordings import RECORDINGS as FIELD
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
@@ -38,8 +42,17 @@ from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors.marker_pose import MarkerPose
 from fgloc.sensors.range_bearing import RangeBearing
-from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Event, Finding, InertialEvent, Severity, SightingsEvent, TruthEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import (
+    ControlEvent,
+    Event,
+    Finding,
+    InertialEvent,
+    LandmarkMap,
+    Severity,
+    SightingsEvent,
+    TruthEvent,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = Path(os.environ.get("FGLOC_REAL_DATA", ROOT.parent / "shared" / "data"))
@@ -51,6 +64,7 @@ RECORDINGS = {
     "husky": REAL / "robot_localization_bags" / "test1.bag",
     "tb3_imu": REAL / "turtlebot3" / "rosbag2_2025_11_06-17_25_46",
 }
+_MAPPED = ("turtlebot_aruco", "mrclam6_1")  # text: bags are made of them
 _ONLINE_S = 40.0  # of motion: what is not named by then is not named online
 Change = Callable[[Any], Any]
 
@@ -60,7 +74,7 @@ class Mistake:
     """One broken convention.
 
     Attributes:
-        of: class of event that it is in.
+        of: class of event that it is in, or the map.
         change: of an event.
         code: of the finding that has to come first.
         value: figure that the finding has to have; None: it has none.
@@ -68,7 +82,7 @@ class Mistake:
         choice: whether it was looked at while thresholds were chosen.
     """
 
-    of: type[Event]
+    of: type[Event] | type[LandmarkMap]
     change: Change
     code: str
     value: float | None = None
@@ -137,6 +151,24 @@ def _turned(angle: float) -> Change:
     return change
 
 
+def _joints(factor: float) -> Change:
+    return lambda e: replace(e, position=factor * e.position, velocity=factor * e.velocity)
+
+
+def _map(change: Callable[[int, Any], tuple[int, Any]]) -> Change:
+    """A change of a map's landmarks by their ids and positions."""
+
+    def changed(landmark_map: LandmarkMap) -> LandmarkMap:
+        moved = (change(i, m.position) for i, m in landmark_map.landmarks.items())
+        every = zip(moved, landmark_map.landmarks.values(), strict=True)
+        return replace(
+            landmark_map, landmarks={i: replace(m, landmark_id=i, position=place) for (i, place), m in every}
+        )
+
+    return changed
+
+
+_CLOCKS = "clock.imu|clock.odometry|clock.joints|clock.sightings"  # of two, either may be wrong
 MISTAKES: dict[str, Mistake] = {
     "sightings mirrored": Mistake(SightingsEvent, _sightings(_mirrored), "sightings.mirrored|sightings.axes"),
     "sightings axes": Mistake(SightingsEvent, _sightings(_axes), "sightings.axes", choice=False),
@@ -169,6 +201,22 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "yaw rate negated": Mistake(OdometryEvent, lambda e: replace(e, angular=-e.angular), "odometry.yaw_sign"),
     "twist in the world": Mistake(OdometryEvent, _in_world, "odometry.twist_frame", choice=False),
+    "odometry 0.3 s late": Mistake(OdometryEvent, _late(0.3), _CLOCKS, 0.3, 0.05),
+    "joints 0.3 s late": Mistake(JointsEvent, _late(0.3), _CLOCKS, 0.3, 0.05, choice=False),
+    "joints reversed": Mistake(JointsEvent, _joints(-1.0), "yaw.sign|wheels.sign|wheels.reversed"),
+    "joints in degrees": Mistake(JointsEvent, _joints(180.0 / math.pi), "wheels.unit|odometry.yaw_unit", choice=False),
+    "commands in mm/s": Mistake(
+        ControlEvent, lambda e: replace(e, v=1e3 * e.v), "wheels.scale|sightings.scale", 1e3, 0.1, choice=False
+    ),
+    "commands in feet/s": Mistake(
+        ControlEvent, lambda e: replace(e, v=e.v / 0.3048), "wheels.scale|sightings.scale", 0.3048, 0.1
+    ),
+    "map in feet": Mistake(LandmarkMap, _map(lambda i, p: (i, p / 0.3048)), "map.unit", 0.3048),
+    "map x 0.3048": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.3048)), "map.unit", 0.3048, choice=False),
+    "map in cm": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 100.0)), "map.unit", 0.01, choice=False),
+    "map in km": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.001)), "map.unit", 1e3),
+    "map mirrored": Mistake(LandmarkMap, _map(lambda i, p: (i, p * [1.0, -1.0, 1.0])), "map.mirrored"),
+    "ids off by one": Mistake(LandmarkMap, _map(lambda i, p: (i + 1, p)), "map.ids", choice=False),
     "truth in NED": Mistake(TruthEvent, _ned, "truth.axes"),
     "truth 0.5 s late": Mistake(TruthEvent, _late(0.5), "clock.truth", 0.5, 0.05),
     "truth in mm": Mistake(
@@ -178,28 +226,60 @@ MISTAKES: dict[str, Mistake] = {
 }
 
 
-def found_in(bag: Path, config: Config, mistake: Mistake | None) -> tuple[Finding, ...]:
-    """Findings on a recording with one convention broken; none broken: as it is."""
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A recording, decoded once: its events but for images, in order, and the sensors as they are configured."""
+
+    bag: Path
+    map_path: Path | None
+    config: Config
+    events: Sequence[Event]
+    roles: dict[Any, str]
+    T_base_sensor: Any = None
+    imu_up: Any = None
+    landmark_map: LandmarkMap | None = None
+    R: Any = None  # of the IMU in the base
+
+    def has(self, kind: type) -> bool:
+        """Whether there is anything of a class that the engine reads."""
+        return self.landmark_map is not None if kind is LandmarkMap else any(isinstance(e, kind) for e in self.events)
+
+    def broken(self, mistake: Mistake | None) -> Iterator[Event]:
+        """Events with one convention broken; an IMU on its side has the robot's axes broken, not its own."""
+        for event in self.events:
+            if mistake is not None and isinstance(event, mistake.of):
+                event = _turned_imu(self.R.T, mistake.change(_turned_imu(self.R, event)))
+            yield event
+
+
+def heard(bag: Path, config: Config) -> Heard:
+    """Decode a recording."""
+    map_path = find_beside(bag, "map.yaml")
     with Recording(bag, config.recording) as recording:
-        T_base_sensor = imu_up = landmark_map = None
-        R = np.eye(3)
+        found = Heard(bag, map_path, config, [], dict(recording.roles), R=np.eye(3))
         try:
-            setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)
-            T_base_sensor, imu_up, landmark_map = setup.T_base_sensor, setup.imu_up, setup.landmark_map
-            R = R if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
+            setup = recorded_setup(recording, map_path, config)
+            R = np.eye(3) if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
+            found = replace(
+                found, T_base_sensor=setup.T_base_sensor, imu_up=setup.imu_up, landmark_map=setup.landmark_map, R=R
+            )
         except FglocError:
             pass
-        collector = SignalCollector(config)
-        collector.found.images = "image" in recording.roles
         role_of = {topic: role for role, topic in recording.roles.items() if role not in ("image", "camera_info")}
-        for message in recording.messages(role_of.keys()):
-            for event in recording.decode(message, role_of[message[0]]):
-                broken = mistake is not None and isinstance(event, mistake.of)
-                collector.found.delays[role_of[message[0]]].append((event.received_ns - event.stamp_ns) * 1e-9)
-                if broken and mistake is not None:  # an IMU on its side has the robot's axes broken, not its own
-                    event = _turned_imu(R.T, mistake.change(_turned_imu(R, event)))
-                collector.add(event)
-        found = conventions(collector.found, config, T_base_sensor, imu_up, landmark_map)
+        return replace(
+            found,
+            events=[e for m in recording.messages(role_of.keys()) for e in recording.decode(m, role_of[m[0]])],
+        )
+
+
+def found_in(recording: Heard, mistake: Mistake | None) -> tuple[Finding, ...]:
+    """Findings on a recording with one convention broken; none broken: as it is."""
+    collector, landmark_map = SignalCollector(recording.config, recording.roles), recording.landmark_map
+    for event in recording.broken(mistake):
+        collector.add(event)
+    if mistake is not None and mistake.of is LandmarkMap:
+        landmark_map = mistake.change(landmark_map)
+    found = conventions(collector.found, recording.config, recording.T_base_sensor, recording.imu_up, landmark_map)
     return tuple(sorted(found.findings, key=lambda f: -f.severity))
 
 
@@ -207,40 +287,28 @@ def _turned_imu(R: Any, event: Event) -> Event:
     return _imu(R)(event) if isinstance(event, InertialEvent) else event
 
 
-def named_online(bag: Path, config: Config, mistake: Mistake | None) -> Iterator[tuple[float, tuple[Finding, ...]]]:
+def named_online(heard: Heard, mistake: Mistake | None) -> Iterator[tuple[float, tuple[Finding, ...]]]:
     """Seconds of motion and what a running check of a live run finds then, whenever it compares."""
-    with Recording(bag, config.recording) as recording:
-        parts = assemble(recording, find_beside(bag, "map.yaml"), config, keep_all=False)
-        setup = recorded_setup(recording, find_beside(bag, "map.yaml"), config)
-        R = np.eye(3) if setup.T_base_imu is None else setup.T_base_imu[:3, :3]
-        moving_s = 0.0
-        unread = ("image", "camera_info", "truth")
-        role_of = {topic: role for topic, role in ((t, r) for r, t in recording.roles.items()) if role not in unread}
-        for message in recording.messages(role_of.keys()):
-            for event in recording.decode(message, role_of[message[0]]):
-                if mistake is not None and isinstance(event, mistake.of):
-                    event = _turned_imu(R.T, mistake.change(_turned_imu(R, event)))
-                parts.diagnosis.add(event)
-                passed = parts.gate.check(event)
-                for step in () if passed is None else parts.stepper.push(passed):
-                    measured = parts.wheels.measure(step)
-                    motion = np.zeros(3) if measured is None else measured.motion
-                    parts.diagnosis.observe(step, motion=motion)
-                    if math.hypot(motion[0], motion[1]) > 0.01 * step.dt or abs(motion[2]) > 0.02 * step.dt:
-                        moving_s += step.dt
-                comparison = parts.diagnosis.comparison()
-                if comparison is not None:
-                    comparison()
-                    yield moving_s, parts.diagnosis.found
-                if moving_s > _ONLINE_S:
-                    return
-
-
-def has(bag: Path, config: Config, kind: type[Event]) -> bool:
-    """Whether a recording has events of a class that the engine reads."""
-    with Recording(bag, config.recording) as recording:
-        roles = {SightingsEvent: "sightings", InertialEvent: "imu", OdometryEvent: "odometry", TruthEvent: "truth"}
-        return roles[kind] in recording.roles
+    with Recording(heard.bag, heard.config.recording) as recording:
+        parts = assemble(recording, heard.map_path, heard.config, keep_all=False)
+    moving_s = 0.0
+    for event in heard.broken(mistake):
+        if isinstance(event, TruthEvent):
+            continue
+        parts.diagnosis.add(event)
+        passed = parts.gate.check(event)
+        for step in () if passed is None else parts.stepper.push(passed):
+            measured = parts.wheels.measure(step)
+            motion = np.zeros(3) if measured is None else measured.motion
+            parts.diagnosis.observe(step, motion=motion)
+            if math.hypot(motion[0], motion[1]) > 0.01 * step.dt or abs(motion[2]) > 0.02 * step.dt:
+                moving_s += step.dt
+        comparison = parts.diagnosis.comparison()
+        if comparison is not None:
+            comparison()
+            yield moving_s, parts.diagnosis.found
+        if moving_s > _ONLINE_S:
+            return
 
 
 def named(mistake: Mistake, found: tuple[Finding, ...]) -> bool:
@@ -257,41 +325,50 @@ def named(mistake: Mistake, found: tuple[Finding, ...]) -> bool:
     return min(abs(math.log(abs(value) / mistake.value)), abs(math.log(abs(value) * mistake.value))) < mistake.tolerance
 
 
+def bags() -> Iterator[tuple[str, Path]]:
+    """Name and bag of each recording that is there."""
+    yield from ((name, bag) for name, bag in RECORDINGS.items() if bag.exists())
+    with tempfile.TemporaryDirectory() as folder:
+        for one in FIELD:
+            if one.name in _MAPPED and (REAL / one.source).exists():
+                (Path(folder) / one.name).mkdir()
+                yield one.name, one.bag(Path(folder) / one.name)
+
+
 def measure(quick: bool) -> Iterator[Row]:
     """A row for each recording, and the totals; a quick run has the mistakes that thresholds were chosen on."""
-    total, hits, false = 0, 0, 0
+    total, hits, false, recordings = 0, 0, 0, 0
     online: list[float] = []
     online_false = 0
-    for name, bag in RECORDINGS.items():
-        if not bag.exists():
-            continue
-        config = config_of(yaml.safe_load(first_settings(bag).text))
-        sound = found_in(bag, config, None)
+    for name, bag in bags():
+        recordings += 1
+        recording = heard(bag, config_of(yaml.safe_load(first_settings(bag).text)))
+        sound = found_in(recording, None)
         if sound:
             print(f"  {name} as it is: {[(f.code, f.value) for f in sound]}")
         grave = (f for f in sound if f.severity is not Severity.NOTE)
         wrong = sum(not f.code.startswith("motion.") for f in grave)  # held and lifted it was
         false += wrong
-        early = {f.code for _, found in named_online(bag, config, None) for f in found if f.severity is Severity.ERROR}
+        early = {f.code for _, found in named_online(recording, None) for f in found if f.severity is Severity.ERROR}
         early -= {f.code for f in sound}
         if early:
             print(f"  {name} as it is, online: {sorted(early)}")
         online_false += len(early)
         count = right = 0
         for what, mistake in MISTAKES.items():
-            if (quick and not mistake.choice) or not has(bag, config, mistake.of):
+            if (quick and not mistake.choice) or not recording.has(mistake.of):
                 continue
             if what == "sightings axes" and name != "duarte":
                 continue  # ranges and bearings have no axes
             known = {f.code for f in sound}  # what is true of the recording itself
-            found = tuple(f for f in found_in(bag, config, mistake) if f.code not in known)
+            found = tuple(f for f in found_in(recording, mistake) if f.code not in known)
             ok = named(mistake, found)
             count, right = count + 1, right + ok
             if not ok:
                 print(f"  {name}: {what}: {[(f.code, f.value) for f in found[:2]]}")
-            if mistake.of is not TruthEvent:
+            if mistake.of not in (TruthEvent, LandmarkMap):
                 codes = set(mistake.code.split("|"))
-                running = named_online(bag, config, mistake)
+                running = named_online(recording, mistake)
                 at_s = next((s for s, by_then in running if codes & {f.code for f in by_then}), math.inf)
                 online.append(at_s)
                 if at_s > 20.0:
@@ -302,12 +379,12 @@ def measure(quick: bool) -> Iterator[Row]:
             f"conventions.false.{name}", sum(not f.code.startswith("motion.") for f in sound), n=1, unit="findings"
         )
     yield Row("conventions.named", hits / max(total, 1), n=total, unit="share")
-    yield Row("conventions.false", false, n=len(RECORDINGS), unit="findings")
+    yield Row("conventions.false", false, n=recordings, unit="findings")
     in_time = sorted(s for s in online if math.isfinite(s))
     worst = float(np.quantile(in_time, 0.9)) if in_time else None
     yield Row("conventions.online_s", worst, n=len(in_time), unit="s", reason="" if in_time else "nothing was named")
     yield Row("conventions.online_named", len(in_time) / max(len(online), 1), n=len(online), unit="share")
-    yield Row("conventions.online_false", online_false, n=len(RECORDINGS), unit="findings")
+    yield Row("conventions.online_false", online_false, n=recordings, unit="findings")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.sensors.maps import write_map
-from fgloc.types import Landmark, LandmarkMap, Severity
+from fgloc.types import Finding, Landmark, LandmarkMap, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 
 START_S, SECONDS, STEP_S = 1_700_000_000.0, 50.0, 0.005
@@ -41,6 +41,7 @@ class Broken:
     imu_late: float = 0.0
     speed: float = 1.0
     yaw_rate: float = 1.0
+    turn: float = 1.0
     world_twist: bool = False
     truth: str = ""
     truth_late: float = 0.0
@@ -65,6 +66,10 @@ def record(folder: Path, wrong: Broken) -> Path:
             v, turned = wrong.speed * SPEED[k], YAW[k] if wrong.world_twist else 0.0
             twist = (v * math.cos(turned), v * math.sin(turned), wrong.yaw_rate * RATE[k])
             pose = (X[k], Y[k], YAW[k])
+            if wrong.turn != 1.0:
+                heading = wrong.turn * YAW
+                pose = (*(float(STEP_S * SPEED[:k] @ f(heading[:k])) for f in (np.cos, np.sin)), heading[k])
+                twist = (SPEED[k], 0.0, wrong.turn * RATE[k])
             messages.append((received, lambda s=stamp, p=pose, t=twist, r=received: bag.odometry("/odom", s, p, t, r)))
         M = np.array(wrong.imu_axes, dtype=float)
         for k, stamp, received in at(50.0, wrong.imu_late):
@@ -90,7 +95,8 @@ def record(folder: Path, wrong: Broken) -> Path:
             place, yaw = [X[k], Y[k]], YAW[k] + wrong.truth_yaw
             if wrong.truth == "ned":
                 place, yaw = place[::-1], 0.5 * math.pi - yaw
-            place = [*(wrong.truth_unit * np.array(place)).tolist(), 0.0]
+            height = math.tan(math.radians(3.0)) * X[k] if wrong.truth == "tilted" else 0.0
+            place = [*(wrong.truth_unit * np.array(place)).tolist(), height]
             turn = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
             messages.append((received, lambda s=stamp, p=place, q=turn, r=received: bag.truth("/truth", s, p, q, r)))
         for _, write in sorted(messages, key=lambda m: m[0]):
@@ -173,6 +179,27 @@ def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     assert conventions_of(bag, config)[0].lines == {"landmarks.range_along_axis": "false"}
     depths = record(tmp_path / "depths", Broken(depth=True))
     assert not conventions_of(depths, config)
+
+
+def test_a_truth_tells_its_tilt_and_a_yaw_that_is_not_its_own(tmp_path):
+    found = {f.code: f for f in inspect_all(record(tmp_path, Broken(truth="tilted")), None, Config()).found}
+    assert found["truth.tilt"].value == pytest.approx(3.0, abs=0.1)
+    assert found["truth.yaw_is_odometry"].severity is Severity.NOTE
+    level = {f.code for f in inspect_all(record(tmp_path / "turned", Broken(turn=0.5)), None, Config()).found}
+    assert not level & {"truth.tilt", "truth.yaw_is_odometry"}
+
+
+def test_a_truth_tells_how_much_wheels_turn(tmp_path):
+    config = config_of({"recording": {"topics": {"imu": "none", "sightings": "none"}}})
+    found = [f for f in conventions_of(record(tmp_path, Broken(turn=0.5)), config) if f.code.startswith("wheels")]
+    assert [f.code for f in found] == ["wheels.turn"]
+    assert found[0].value == pytest.approx(2.0, abs=0.05)
+    assert not found[0].lines  # a truth judges the wheels in sentences only
+
+
+def test_remarks_are_not_named_before_what_was_compared():
+    compared = Finding("truth.tilt", "tilted")
+    assert ordered([Finding("run", "a default"), compared, Finding("run", "bad", Severity.ERROR)])[1] is compared
 
 
 def test_a_truth_that_freezes_and_topics_that_nothing_reads_are_named(tmp_path):
