@@ -33,12 +33,13 @@ from fgloc.diagnosis.pairs import (
     fit_on_map,
     fit_rate,
     fit_sightings,
+    irls,
     jackknife,
     planar,
     track_noise,
     weighted,
 )
-from fgloc.diagnosis.signals import Path, Sightings, Signals
+from fgloc.diagnosis.signals import Path, Sightings, Signals, in_order, turn_by
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.sensors.wheels.sensor import settings_of
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
@@ -186,11 +187,9 @@ def unit_of(scale: float) -> tuple[float, str] | None:
 
 
 def _odometry(found: Conventions, signals: Signals) -> None:
-    rows = np.array(signals.odometry)
+    rows = in_order(signals.odometry)
     if len(rows) < 50:
         return
-    _, first = np.unique(rows[:, 0], return_index=True)
-    rows = rows[first]
     times, yaw = rows[:, 0], np.unwrap(rows[:, 3])
     place = rows[:, 1] + 1j * rows[:, 2]
     span = max(1, round(0.4 / max(float(np.median(np.diff(times))), 1e-3)))
@@ -222,7 +221,7 @@ def _twist_speed(
     body = moved * np.exp(-1j * yaw)
     fits = {}
     for frame, reference in (("body", body), ("world", moved)):
-        slope = _complex_slope(reference, twist)
+        slope = complex(irls(reference[:, None], twist, 0.05 * float(np.quantile(np.abs(twist), 0.9)) + 1e-9)[0][0])
         fits[frame] = (
             slope,
             float(np.mean(np.minimum(np.abs(twist - slope * reference) / abs(slope or 1.0), 1.0) ** 2)),
@@ -292,29 +291,16 @@ def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
     return lines if found.config.wheels.source == "twist" else {"wheels.source": "pose"}
 
 
-def _complex_slope(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> complex:
-    weights = np.ones(len(x))
-    slope = 0j
-    for _ in range(5):
-        slope = complex(np.sum(weights * x.conj() * y) / max(float(np.sum(weights * np.abs(x) ** 2)), 1e-12))
-        residual = np.abs(y - slope * x)
-        spread = 1.5 * float(np.median(residual)) + 0.05 * float(np.quantile(np.abs(y), 0.9)) + 1e-12
-        weights = 1.0 / (1.0 + (residual / (2.4 * spread)) ** 2)
-    return slope
-
-
 # --- one measurement twice, and hands ---------------------------------------------------------------------------------
 
 
 def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None) -> None:
     """Name an odometry whose yaw is the gyro's: it goes with the gyro where the angles of the wheels turn otherwise."""
-    rates, rows = signals.rates(), np.array(signals.odometry)
+    rates, rows = signals.rates(), in_order(signals.odometry)
     if rates is None or len(rows) < 50:
         return
-    _, first = np.unique(rows[:, 0], return_index=True)
-    rows = rows[first]
     times, omega, _ = rates
-    turned = np.append(0.0, np.cumsum(0.5 * ((omega[1:] + omega[:-1]) @ _unit(imu_up)) * np.diff(times)))
+    turned = turn_by(times, omega @ _unit(imu_up))
     at = np.arange(max(times[0], rows[0, 0]), min(times[-1], rows[-1, 0]) - 0.5, 0.5)
     if len(at) < 20:
         return
@@ -866,11 +852,6 @@ def _drifts(
     return drifting
 
 
-def turn_by(times: FloatArray, rate: FloatArray) -> FloatArray:
-    """Integral ``(n,)`` of a rate over times."""
-    return np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(times)))
-
-
 def _clocks(
     found: Conventions,
     signals: Signals,
@@ -1028,10 +1009,9 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
 
 def _shared_yaw(found: Conventions, signals: Signals, truth: FloatArray) -> None:
     """Name a truth whose yaw is the odometry's: two measurements never agree so well."""
-    if len(signals.odometry) < 50:
+    rows = in_order(signals.odometry)
+    if len(rows) < 50:
         return
-    rows = np.array(signals.odometry)
-    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     at = np.arange(max(truth[0, 0], rows[0, 0]), min(truth[-1, 0], rows[-1, 0]), 1.0)
     if len(at) < 2:
         return
@@ -1078,8 +1058,7 @@ def _normal(places: FloatArray) -> tuple[FloatArray, float, float]:
 
 def _frozen(found: Conventions, signals: Signals, path: Path) -> None:
     """Name a truth that repeats its pose while the wheels move."""
-    rows = np.array(signals.truth)
-    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    rows = in_order(signals.truth)
     repeated = np.append(False, np.abs(np.diff(rows[:, 1:], axis=0)).max(axis=1) == 0.0)
     place = path.at(np.column_stack([rows[:, 0] - _FROZEN_S, rows[:, 0]]).ravel())[:, :2].reshape(-1, 2, 2)
     moving = np.linalg.norm(place[:, 1] - place[:, 0], axis=1) > _FROZEN_S * _MOVES_MPS

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import Config
-from fgloc.diagnosis.signals import Path, Signals
+from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.estimation.faults import LiftMonitor
 from fgloc.frames import rotation_of
 from fgloc.sensors.cameras import up_in_base
@@ -161,7 +161,7 @@ def _held(path: Path, times: FloatArray, rates: FloatArray, up: FloatArray, lift
     if len(at) < 2:
         return
     end = at + _HELD_WINDOW_S
-    turned = np.append(0.0, np.cumsum(0.5 * ((rates[1:] + rates[:-1]) @ up) * np.diff(times)))
+    turned = turn_by(times, rates @ up)
     gyro = np.interp(end, times, turned) - np.interp(at, times, turned)
     before, after = path.at(at), path.at(end)
     wheels, way = after[:, 2] - before[:, 2], np.hypot(*(after - before)[:, :2].T)

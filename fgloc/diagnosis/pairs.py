@@ -37,6 +37,8 @@ _RATE_HALF_S = 0.15  # yaw rates are means over twice this
 _TURN_HALF_S = 1.0
 _MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _CLIPPED = 4.0  # standard deviations beyond which a rate counts as this much: spikes of a driver
+_REWEIGHTED = 6  # times
+_SITS = 1e-2  # information on a place on the robot, over that of a row: it is small where the robot does not turn
 FOLLOWS = 0.5  # share of a motion that another explains: enough for a lag with its sigma
 _CAUCHY = 2.385  # tuning constant of 95 % efficiency
 
@@ -58,6 +60,26 @@ def weighted(figures: Sequence[Figure]) -> Figure:
     weights = np.array([figure.sigma for figure in figures]) ** -2.0
     mean = float(weights @ np.array([figure.value for figure in figures]) / weights.sum())
     return Figure(mean, float(weights.sum() ** -0.5))
+
+
+def irls(A: ComplexArray, y: ComplexArray, floor: float, prior: float = 0.0) -> tuple[ComplexArray, FloatArray]:
+    """Robust least squares of complex rows with Cauchy weights: solution ``(k,)`` and absolute residuals ``(n,)``.
+
+    Args:
+        A: ``(n, k)``.
+        y: ``(n,)``.
+        floor: residuals below are none.
+        prior: information that a row of 1 gives, on the last unknown.
+    """
+    weights = np.ones(len(y))
+    x, residual = np.zeros(A.shape[1], dtype=complex), np.abs(y)
+    for _ in range(_REWEIGHTED):
+        H = (A.conj().T * weights) @ A
+        H[-1, -1] += prior * weights.sum() / len(y)
+        x = np.linalg.solve(H + 1e-12 * np.eye(len(x)), (A.conj().T * weights) @ y)
+        residual = np.abs(A @ x - y)
+        weights = 1.0 / (1.0 + (residual / (_CAUCHY * (_MAD * float(np.median(residual)) + floor))) ** 2)
+    return x, residual
 
 
 # --- landmarks against the wheels -------------------------------------------------------------------------------------
@@ -181,17 +203,7 @@ def _similarity(
     p1, r1 = _complex_poses(path, times[first] - late)
     p2, r2 = _complex_poses(path, times[last] - late)
     A = np.column_stack([r1 * z[first] - r2 * z[last], r1 - r2])
-    y = p2 - p1
-    # β is small: a prior of a metre keeps it so where the robot does not turn
-    weights = np.ones(len(y))
-    x = np.zeros(2, dtype=complex)
-    for _ in range(5):
-        H = (A.conj().T * weights) @ A
-        H[1, 1] += 1e-2 * weights.sum() / len(y)
-        x = np.linalg.solve(H + 1e-12 * np.eye(2), (A.conj().T * weights) @ y)
-        residual = np.abs(A @ x - y)
-        scale = _MAD * float(np.median(residual)) + 1e-9
-        weights = 1.0 / (1.0 + (residual / (_CAUCHY * scale)) ** 2)
+    x, residual = irls(A, p2 - p1, 1e-9, _SITS)
     size = abs(x[0])
     return complex(x[0]), complex(x[1]), math.inf if size < 1e-9 else float(np.median(residual)) / size
 
@@ -574,16 +586,7 @@ def _body(
     phi = np.asarray(np.unwrap(np.angle(turn))) if len(turn) else np.zeros(0)
     phi = np.interp(start + window_s, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
     turns = _explained(turned, phi)[0] if float(np.std(phi)) > 0.05 else 1.0
-    A = np.column_stack([own, -(turn - 1.0)])
-    weights = np.ones(len(start))
-    x = np.zeros(2, dtype=complex)
-    for _ in range(6):
-        H = (A.conj().T * weights) @ A
-        H[1, 1] += 1e-2
-        x = np.linalg.solve(H + 1e-9 * np.eye(2), (A.conj().T * weights) @ base)
-        residual = np.abs(A @ x - base)
-        spread = _MAD * float(np.median(residual)) + 1e-6
-        weights = 1.0 / (1.0 + (residual / (_CAUCHY * spread)) ** 2)
+    x, residual = irls(np.column_stack([own, -(turn - 1.0)]), base, 1e-6, _SITS)
     size = abs(x[0])
     relative = complex(x[0]) / size**2 if size > 1e-9 else 1e9 + 0j  # e^{iδ} over s: its distances over the robot's
     return (complex(relative), complex(x[1]), turns), float(np.median(residual)), float(np.median(np.abs(base)))

@@ -98,6 +98,17 @@ class Path:
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
 
 
+def in_order(rows: Sequence[Sequence[float]]) -> FloatArray:
+    """Rows ``(n, c)`` in order of their first column, the time, each time once."""
+    table = np.array(rows, dtype=float)
+    return table if not len(table) else np.asarray(table[np.unique(table[:, 0], return_index=True)[1]])
+
+
+def turn_by(times: FloatArray, rate: FloatArray) -> FloatArray:
+    """Integral ``(n,)`` of a rate over times."""
+    return np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(times)))
+
+
 @dataclass(eq=False)
 class Signals:
     """What was collected. Times are seconds from ``origin_ns``.
@@ -171,9 +182,7 @@ class Signals:
         """Times ``(n,)``, rates and forces ``(n, 3)`` of the IMU in order of time; None: too few."""
         if len(self.imu) < 50:
             return None
-        rows = np.array(self.imu)
-        _, first = np.unique(rows[:, 0], return_index=True)
-        rows = rows[first]
+        rows = in_order(self.imu)
         size = np.abs(rows[:, 1:4]).max(axis=1)
         rows = rows[size <= _SPIKE * max(float(np.quantile(size, 0.99)), 0.1)]
         return rows[:, 0], rows[:, 1:4], rows[:, 4:7]
@@ -182,9 +191,7 @@ class Signals:
         """Rows of time, x, y, continuous yaw of the truth, frozen repetitions left out; None: too few."""
         if len(self.truth) < 30:
             return None
-        rows = np.array(self.truth)
-        _, first = np.unique(rows[:, 0], return_index=True)
-        rows = rows[first]
+        rows = in_order(self.truth)
         rows = rows[np.append(True, np.abs(np.diff(rows[:, 1:], axis=0)).max(axis=1) > 0.0)]
         if len(rows) < 30:
             return None
