@@ -45,6 +45,7 @@ from fgloc.sensors.wheels.sensor import settings_of
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
+_LATE_SIGMAS = 4.0  # of a lag that is corrected: its sigma is the larger of two jackknives
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
 _UNSURE = 0.1  # share of a scale by which it is not known
@@ -59,6 +60,7 @@ _BIAS_M = 0.03  # of a range
 _ASKEW_RAD = 0.08  # standard deviation of bearings from which on depths differ from ranges, by 1 % at two of them
 _LEAST_COS = math.cos(math.radians(80.0))  # as the measurement has it
 _GAIN, _GAIN_SIGMAS = 0.05, 3.0  # of the log-likelihood of a sighting, by which another reading is named
+_BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones are in another unit than it
 _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
@@ -311,8 +313,11 @@ def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None
         return
     lines = {f"wheels.{key}": value for key, value in given.items()}
     with_angles = found.config
-    for key, value in lines.items():
-        with_angles = with_line(with_angles, key, value)
+    try:
+        for key, value in lines.items():
+            with_angles = with_line(with_angles, key, value)
+    except ValueError:  # no wheels are like this: the angles have another unit
+        return
     angles = signals.path(with_angles)
     if angles is None:
         return
@@ -597,7 +602,8 @@ def _as_configured(config: Config, seen: Sightings, T_base_sensor: FloatArray | 
     """Sightings in the base's axes about the sensor, with what is configured of it; the points in its own axes."""
     section = config.landmarks
     distance = np.maximum(np.linalg.norm(seen.points, axis=1, keepdims=True), 1e-9)
-    ranged = section.range_scale * np.maximum(1.0 - section.range_bias_m / distance, 1e-3) * seen.points
+    bias_m = section.range_bias_m if float(np.median(distance)) > _BIASED * abs(section.range_bias_m) else 0.0
+    ranged = section.range_scale * np.maximum(1.0 - bias_m / distance, 1e-3) * seen.points
     if section.range_along_axis and not seen.spatial:
         bearing = np.arctan2(seen.points[:, 1], seen.points[:, 0]) - section.bearing_bias_rad
         ranged = ranged / np.maximum(np.cos(bearing), _LEAST_COS)[:, None]
@@ -696,7 +702,8 @@ def _constants(
             f"The sensor of the landmarks {' and '.join(what)} than configured, by the wheels' motion",
             {"recording.sightings_pose": [round(v, 4) + 0.0 for v in sensor_pose(moved, optical)]},
             m.yaw if turned else place[0][1],
-            Severity.ERROR,
+            # by a path that is not the configured one, a small turn may be that path's own
+            Severity.WARNING if "wheels.source" in _lines_of(found) else Severity.ERROR,
         )
     if not (scaled or place or turned):
         found.compared.append(
@@ -704,6 +711,11 @@ def _constants(
             f"{math.degrees(m.yaw.value):+.1f} ± {math.degrees(m.yaw.sigma):.1f}° to the left"
         )
     return m
+
+
+def _lines_of(found: Conventions) -> set[str]:
+    """Keys that what was found sets."""
+    return {key for finding in found.findings for key in finding.lines}
 
 
 def _by_map(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmark_map: LandmarkMap | None) -> Mounting:
@@ -911,7 +923,7 @@ def _clocks(
 
 
 def _surely_late(lag: Figure) -> bool:
-    return lag.off(0.0, _LATE_S)
+    return lag.off(0.0, _LATE_S, _LATE_SIGMAS)
 
 
 def _varied(path: Path) -> bool:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +35,8 @@ _MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _RATE_HALF_S = 0.15  # yaw rates are means over twice this
 _TURN_HALF_S = 1.0
+_MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a map: the shortest that shows three
+_MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _CLIPPED = 4.0  # standard deviations beyond which a rate counts as this much: spikes of a driver
 _REWEIGHTED = 6  # times
@@ -628,17 +630,15 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
     p, r = _complex_poses(path, seen.times - mounting.late_s.value)
     q = p + r * (alpha * z + complex(mounting.x.value, mounting.y.value))
     windows: list[dict[int, complex]] = []
-    for start in np.arange(seen.times[0], seen.times[-1], 5.0):
-        use = (seen.times >= start) & (seen.times < start + 8.0) & np.isfinite(q)
-        if use.any() and path.known(np.array([start + 0.0]), np.array([min(start + 8.0, path.times[-1])]))[0]:
-            ids, places_seen = seen.ids[use], q[use]
-            of_each = {int(i): places_seen[ids == i] for i in np.unique(ids)}
-            windows.append({i: complex(np.median(own.real), np.median(own.imag)) for i, own in of_each.items()})
+    for width in _MAP_WINDOWS_S:  # a narrow view takes longer to see three landmarks
+        windows = list(_places_seen(path, seen, q, width))
+        if sum(len(window) > 2 for window in windows) >= _FEWEST_WINDOWS:
+            break
     best: tuple[float, bool, int, list[float]] | None = None
     for shift in (0, 1, -1):
         for mirrored in (False, True):
             scales, misfits = _laid_on(windows, places, shift, mirrored)
-            if len(misfits) >= 3 and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
+            if len(misfits) >= _FEWEST_WINDOWS and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
                 best = (float(np.median(misfits)), mirrored, shift, scales)
     if best is None:
         return None
@@ -650,10 +650,20 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
     for b in range(min(_BLOCKS, len(ids))):
         kept = [{i: q for i, q in w.items() if i not in ids[b::_BLOCKS]} for w in windows]
         part, _ = _laid_on(kept, places, shift, mirrored)
-        if len(part) >= 3:
+        if len(part) >= _FEWEST_WINDOWS:
             left_out.append([float(np.median(part))])
     sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else math.inf
     return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
+
+
+def _places_seen(path: Path, seen: Sightings, q: ComplexArray, width: float) -> Iterator[dict[int, complex]]:
+    """Places of landmarks by the wheels' path ``q (n,)``, in each window of time [s] whose motion is known."""
+    for start in np.arange(seen.times[0], seen.times[-1], _MAP_STEP * width):
+        use = (seen.times >= start) & (seen.times < start + width) & np.isfinite(q)
+        if use.any() and path.known(np.array([start]), np.array([min(start + width, path.times[-1])]))[0]:
+            ids, there = seen.ids[use], q[use]
+            of_each = {int(i): there[ids == i] for i in np.unique(ids)}
+            yield {i: complex(np.median(own.real), np.median(own.imag)) for i, own in of_each.items()}
 
 
 def _laid_on(

@@ -36,6 +36,7 @@ class Broken:
     range: float = 1.0
     depth: bool = False
     sightings_late: float = 0.0
+    view: float = 1.2  # rad to each side
     imu_axes: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     imu_unit: float = 1.0
     imu_late: float = 0.0
@@ -86,7 +87,7 @@ def record(folder: Path, wrong: Broken) -> Path:
             near = [
                 (i, wrong.range * r, wrong.bearing * b)
                 for i, (r, b) in enumerate(zip(ranges.tolist(), bearings.tolist(), strict=True))
-                if abs(b) < 1.2
+                if abs(b) < wrong.view
             ]
             messages.append((received, lambda s=stamp, n=near, r=received: bag.range_bearing("/landmarks", s, n, r)))
         for k, stamp, received in at(20.0, wrong.truth_late):
@@ -136,6 +137,7 @@ CASES = {
     "truth turned (F12)": (Broken(truth_yaw=1.0), "truth.mounting", 1.0),
     "truth in mm": (Broken(truth_unit=1000.0), "truth.scale", 1000.0),
     "map in feet (G5)": (Broken(map=1.0 / FOOT), "map.unit", FOOT),
+    "map in feet, seen by a narrow view": (Broken(map=1.0 / FOOT, view=0.4), "map.unit", FOOT),
     "map x 0.3048 (G6)": (Broken(map=FOOT), "map.unit", 1.0 / FOOT),
     "map x 100 (G6)": (Broken(map=100.0), "map.unit", 0.01),
     "ids off by one (G6)": (Broken(shift=1), "map.ids", None),
@@ -161,6 +163,13 @@ def test_a_sound_recording_has_none(tmp_path):
 
 def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
     assert not [f for f in conventions_of(record(tmp_path, Broken(map=1.08)), Config()) if f.code.startswith("map.")]
+
+
+def test_a_range_bias_in_another_unit_than_the_ranges_hides_no_unit(tmp_path):
+    config = Config.model_validate({"landmarks": {"range_bias_m": 0.08}})
+    found = conventions_of(record(tmp_path, Broken(range=0.001)), config)
+    assert found[0].code == "sightings.scale"
+    assert found[0].value == pytest.approx(1000.0, rel=0.05)
 
 
 WRITTEN = replace(Broken(), bearing=-1.0, imu_unit=180.0 / math.pi, truth="ned", map=1.0 / FOOT)
