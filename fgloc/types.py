@@ -339,9 +339,28 @@ class MotionReadings:
     at_rest: bool = False  # wheels report no motion, and the gyro none but its bias
 
 
+def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
+    """Covariance ``(2, 2)`` (bearing, range) that an uncertain motion adds to a sighted point."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    R = np.array([[c, -s], [s, c]])
+    J_point = np.column_stack([R, R @ np.array([-point[1], point[0]])])  # of motion ∘ point, by right perturbation
+    cb, sb = math.cos(bearing), math.sin(bearing)
+    J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
+    J = J_polar @ J_point
+    return np.asarray(J @ cov @ J.T)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelMeasurement:
     """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
+
+    row_kind: ClassVar[str] = "corners"  # in steps.csv
+    counted_as: ClassVar[str] = "sightings"  # where it is rejected
+    of_landmark: ClassVar[bool] = True  # of the map; False: of a place that only its sensor knows
+    gives_pose: ClassVar[bool] = True  # of the base, by itself, where the landmark is known
+    in_pixels: ClassVar[bool] = True
+    errors_repeat: ClassVar[bool] = False  # the next sighting of the landmark has much the same error
+    observes_yaw: ClassVar[bool] = True
 
     stamp_ns: int
     landmark_id: int
@@ -363,10 +382,44 @@ class PixelMeasurement:
         """Length of the residual."""
         return 8
 
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind [1/px²]."""
+        return 1.0 / self.sigma_px**2
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> PixelMeasurement:
+        """The sighting, moved to the keyframe.
+
+        Args:
+            motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
+            cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+        """
+        ad = se2.adjoint(motion)
+        x, y, yaw = motion
+        T = np.eye(4)
+        T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        T[:2, 3] = x, y
+        camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
+        spread = cov if self.motion_cov is None else cov + self.motion_cov
+        return replace(self, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ self.twist)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointMeasurement:
     """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
+
+    row_kind: ClassVar[str] = "range_bearing"  # in steps.csv
+    counted_as: ClassVar[str] = "sightings"  # where it is rejected
+    of_landmark: ClassVar[bool] = True  # of the map; False: of a place that only its sensor knows
+    gives_pose: ClassVar[bool] = False  # of the base, by itself, where the landmark is known
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = True  # the next sighting of the landmark has much the same error
+    observes_yaw: ClassVar[bool] = True
 
     stamp_ns: int
     landmark_id: int
@@ -387,10 +440,42 @@ class PointMeasurement:
         """Length of the residual."""
         return 2
 
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> PointMeasurement:
+        """The sighting, moved to the keyframe.
+
+        Args:
+            motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
+            cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+        """
+        ad = se2.adjoint(motion)
+        x, y = self.point
+        px, py, _ = se2.compose(motion, (x, y, 0.0))
+        r, bearing = math.hypot(px, py), math.atan2(py, px)
+        added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
+        return replace(self, range_m=r, bearing_rad=bearing, cov=self.cov + added, twist=ad @ self.twist)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMeasurement:
     """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
+
+    row_kind: ClassVar[str] = "marker_pose"  # in steps.csv
+    counted_as: ClassVar[str] = "sightings"  # where it is rejected
+    of_landmark: ClassVar[bool] = True  # of the map; False: of a place that only its sensor knows
+    gives_pose: ClassVar[bool] = True  # of the base, by itself, where the landmark is known
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = True  # the next sighting of the landmark has much the same error
+    observes_yaw: ClassVar[bool] = True
 
     stamp_ns: int
     landmark_id: int
@@ -405,6 +490,27 @@ class FrameMeasurement:
         """Length of the residual."""
         return 3
 
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> FrameMeasurement:
+        """The sighting, moved to the keyframe.
+
+        Args:
+            motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
+            cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
+        """
+        pose = se2.compose(motion, self.pose)
+        moved = se2.compose_cov(cov, self.pose, self.cov)
+        return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseMeasurement(ABC):
@@ -413,6 +519,11 @@ class PoseMeasurement(ABC):
     A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
     the first pose are made of that.
     """
+
+    of_landmark: ClassVar[bool] = False  # as in PixelMeasurement
+    gives_pose: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = False
 
     source: str  # in steps.csv and in the counts
     stamp_ns: int
@@ -452,6 +563,32 @@ class PoseMeasurement(ABC):
     def landmark_id(self) -> int:
         """A number that no landmark of the map has."""
         return -2 - self.target
+
+    @property
+    def row_kind(self) -> str:
+        """Kind of its row in ``steps.csv``: the source, with the number of what was measured."""
+        return self.source if self.target < 0 else f"{self.source}.{self.target}"
+
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``: none."""
+        return -1
+
+    @property
+    def counted_as(self) -> str:
+        """Source under which it is counted where it is rejected."""
+        return self.source
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> PoseMeasurement:
+        """The measurement, moved to the keyframe; see `PixelMeasurement.compensated`."""
+        known = np.zeros((3, 3)) if self.motion_cov is None else self.motion_cov
+        moved = se2.compose_cov(cov, self.T_keyframe_then, known)
+        return replace(self, T_keyframe_then=se2.compose(motion, self.T_keyframe_then), motion_cov=moved)
 
     def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residual and Jacobian of `residual_at`, by the pose at the keyframe."""

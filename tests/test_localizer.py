@@ -29,7 +29,6 @@ from scipy.stats import chi2
 from fgloc import se2
 from fgloc.estimation.pose_fit import fit_pose
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.sensors.equipment import compensated
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.settings import MotionConfig
@@ -152,7 +151,7 @@ def test_carried_corners_are_as_uncertain_as_the_motion_that_carries_them():
     for _ in range(40):
         seen = PixelMeasurement(0, 0, project(then, landmark) + rng.normal(0, 0.5, (4, 2)), 0.5, CAMERA)
         wrong = se2.compose(motion, se2.exp(rng.multivariate_normal(np.zeros(3), cov)))
-        fit = fit_pose(keyframe, [compensated(seen, wrong, cov)], factors)
+        fit = fit_pose(keyframe, [seen.compensated(wrong, cov)], factors)
         error = se2.log(se2.between(fit.pose, keyframe))
         values.append(float(error @ np.linalg.solve(fit.cov, error)))
     assert np.mean(values) < 3.0 * 1.5

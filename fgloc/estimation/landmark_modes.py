@@ -27,7 +27,7 @@ from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
 from fgloc.graph.observation import Linearized, Observations
 from fgloc.stats import chi2_bound, evidence_bound
-from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement, PixelMeasurement, PoseMeasurement
+from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
 
 # --- How a displacement explains a sighting ---------------------------------------------------------------------------
 
@@ -142,8 +142,8 @@ class LandmarkModes:
         """
         if not len(self._ids):
             return None
-        seen = [s for s in fused if not isinstance(s.alone, PoseMeasurement)]
-        against = [s for s in rejected if not isinstance(s.alone, PoseMeasurement)]
+        seen = [s for s in fused if s.alone.of_landmark]
+        against = [s for s in rejected if s.alone.of_landmark]
         for s in (*seen, *against):
             self._follow(s.alone.landmark_id)
         if motions:
@@ -221,13 +221,13 @@ class LandmarkModes:
         G, parts, row = -(found.H @ self._M), [], 0
         for m, one in zip(seen, lines, strict=True):
             parts.append(slice(row, row + len(one.residual)))
-            if not isinstance(m, PoseMeasurement):
+            if m.of_landmark:
                 G[self._rows[m.landmark_id], parts[-1]] -= by_displacement(one, belief.pose)
             row = parts[-1].stop
         W = sighting_whitening(found.cov)  # lower triangular: each sighting given those before it
         w, G = W @ (found.residual - found.H @ there), W @ G
         for m, part in zip(seen, parts, strict=True):
-            if not isinstance(m, PoseMeasurement):
+            if m.of_landmark:
                 self._weigh(m, w[part], G[:, part])
         self._M += (P @ found.H.T @ W.T) @ G
 
@@ -308,9 +308,7 @@ class LandmarkModes:
             cost[row], moved[row], cov[row] = own[0][0], own[1][0], own[2][0]
         explains = cost < misread
         if explains[row]:
-            self._add_information(
-                row, np.linalg.inv(cov[row]) - np.linalg.inv(self._cov[row]), isinstance(m, PixelMeasurement)
-            )
+            self._add_information(row, np.linalg.inv(cov[row]) - np.linalg.inv(self._cov[row]), m.in_pixels)
         self._moved[explains], self._cov[explains] = moved[explains], cov[explains]
         self._evidence[:, row] += min(float(w @ w), misread) - np.minimum(cost, misread)
         self._seen[:, row] += 1.0
@@ -329,7 +327,7 @@ class LandmarkModes:
 
     def _shared(self, m: LandmarkMeasurement) -> float:
         """Scale on the sigma of a rejected sighting, as errors of one landmark are correlated for some time."""
-        if isinstance(m, PixelMeasurement):
+        if not m.errors_repeat:
             return 1.0
         return math.sqrt(repetition(self._repeat_s, self._last_ns.get(m.landmark_id), m.stamp_ns))
 

@@ -13,7 +13,7 @@ from fgloc.config import Config
 from fgloc.estimation.log import JUMP, mode_decisions, place_decision, segment_decision
 from fgloc.estimation.motion import MotionJudge
 from fgloc.estimation.place import InitialPose
-from fgloc.estimation.sightings import SightingJudge, kind_of
+from fgloc.estimation.sightings import SightingJudge
 from fgloc.estimation.tracking import Tracking
 from fgloc.graph.estimators import make_estimator
 from fgloc.graph.ground import spatial
@@ -65,7 +65,7 @@ class Recorder:
         """Count the factors of a new keyframe."""
         self.counts.update(() if frame.prior is None else ("prior",))
         self.counts.update(m.source for m in frame.motions)
-        self.counts.update(kind_of(s.measurement) for s in frame.sightings)
+        self.counts.update(s.measurement.row_kind for s in frame.sightings)
 
     def clock_jumped(self, k: int, step: Step) -> None:
         """Note a new segment, to be reported with its first estimate."""

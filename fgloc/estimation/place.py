@@ -18,7 +18,6 @@ from fgloc.graph.joint import FAR_M2, MOST_JOINT, MOST_STEPS, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR
 from fgloc.sensors.cameras import planar_base_candidates
-from fgloc.sensors.equipment import compensated
 from fgloc.stats import ROUNDING
 from fgloc.types import (
     FloatArray,
@@ -90,8 +89,8 @@ class PlaceSearch:
             fit = trimmed
         information_of: dict[int, float] = {}
         for m in agreeing:
-            information_of[m.landmark_id] = information_of.get(m.landmark_id, 0.0) + _information(m)
-        share = sum(information_of.values()) / sum(map(_information, sightings))
+            information_of[m.landmark_id] = information_of.get(m.landmark_id, 0.0) + m.information
+        share = sum(information_of.values()) / sum(m.information for m in sightings)
         residuals = {m.landmark_id: m.dof for m in agreeing}
         if len(residuals) < 2:
             share = len(agreeing) / len(sightings)
@@ -102,7 +101,7 @@ class PlaceSearch:
             len(residuals),
             sum(residuals.values()) - se2.DOF,
             frozenset(seen - information_of.keys()),
-            all(isinstance(m, PoseMeasurement) for m in agreeing),
+            not any(m.of_landmark for m in agreeing),
             _lasting(agreeing, self._window_ns),
             sum(n > 1 for n in Counter(i for i, _ in {(m.landmark_id, m.stamp_ns) for m in agreeing}).values()),
         )
@@ -134,13 +133,8 @@ def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[Lan
 def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
     """Whether a place follows from registered sensors alone for most of a time."""
     stamps = [m.stamp_ns for m in sightings]
-    by_sensors = all(isinstance(m, PoseMeasurement) for m in sightings)
+    by_sensors = not any(m.of_landmark for m in sightings)
     return bool(stamps) and by_sensors and max(stamps) - min(stamps) > WHOLE_SHARE * window_ns
-
-
-def _information(m: LandmarkMeasurement) -> float:
-    """What a sighting weighs, in comparison with others of its kind."""
-    return 1.0 / (m.sigma_px**2 if isinstance(m, PixelMeasurement) else float(np.trace(m.cov[:2, :2])))
 
 
 # --- The search over time ---------------------------------------------------------------------------------------------
@@ -301,7 +295,7 @@ class GlobalSearch:
         here = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
         for collected, then in zip(reversed(self._steps), _back(here, self._steps), strict=True):
             for m in collected.sightings:
-                yield compensated(m, then.pose, then.cov)
+                yield m.compensated(then.pose, then.cov)
 
 
 def _back(newest: PoseWithCovariance, steps: Sequence[SearchStep]) -> Iterator[PoseWithCovariance]:

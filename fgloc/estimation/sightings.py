@@ -28,28 +28,10 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
-from fgloc.sensors import registry
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, LandmarkMeasurement, PixelMeasurement, PointMeasurement, PoseMeasurement, Step
 
 # --- Rows of a measurement in steps.csv -------------------------------------------------------------------------------
-
-
-def kind_of(m: LandmarkMeasurement) -> str:
-    """Of a measurement's row in ``steps.csv``: of a registered sensor with the number of what it measured."""
-    if not isinstance(m, PoseMeasurement):
-        return registry.kind_of(type(m))
-    return m.source if m.target < 0 else f"{m.source}.{m.target}"
-
-
-def row_id(m: LandmarkMeasurement) -> int:
-    """Of a landmark in a measurement's row in ``steps.csv``; -1: none."""
-    return -1 if isinstance(m, PoseMeasurement) else m.landmark_id
-
-
-def source_of(m: LandmarkMeasurement) -> str:
-    """Of a measurement's rejections."""
-    return m.source if isinstance(m, PoseMeasurement) else "sightings"
 
 
 # --- The gate, joint compatibility, misread ids -----------------------------------------------------------------------
@@ -98,13 +80,13 @@ class Association:
             reason = "quarantined" if self.modes.excludes(m.landmark_id) else gate
             if reason:
                 rejected.append(sighting)
-                self.rejections[f"{source_of(m)}.{reason}"] += 1
+                self.rejections[f"{m.counted_as}.{reason}"] += 1
             else:
                 accepted.append(sighting)
                 self._last_used_ns[m.landmark_id] = m.stamp_ns
             used = 0.0 if reason else weight
             decisions.append(
-                Decision(k, stamp_ns, kind_of(m), row_id(m), nis**0.5, nis, dof, used, reason, self._gate(dof))
+                Decision(k, stamp_ns, m.row_kind, m.row_id, nis**0.5, nis, dof, used, reason, self._gate(dof))
             )
         if accepted:
             self._contradicting.clear()
@@ -116,7 +98,7 @@ class Association:
             self._contradicting.update(
                 s.measurement.landmark_id
                 for s, d in zip(rejected, decisions, strict=True)
-                if d.reason != "quarantined" and not isinstance(s.measurement, PoseMeasurement)
+                if d.reason != "quarantined" and s.measurement.of_landmark
             )
         return accepted, rejected, decisions
 
@@ -205,7 +187,7 @@ class Association:
                 (
                     misread,
                     sighting,
-                    Decision(k, stamp_ns, kind_of(m), other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
+                    Decision(k, stamp_ns, m.row_kind, other, math.sqrt(nis), nis, dof, 1.0, "", self._gate(dof)),
                 )
             )
         self.rejections += Counter()  # drops the zeros
@@ -227,7 +209,7 @@ class Association:
         if fit is None or not checked or apart(predicted.pose, fit.pose):
             return None
         self.rejections.subtract(
-            f"{source_of(s.measurement)}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
+            f"{s.measurement.counted_as}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
         )
         self.rejections += Counter()  # drops the zeros
         return fit
@@ -336,7 +318,7 @@ class Association:
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
-        if isinstance(m, PixelMeasurement | PoseMeasurement):
+        if isinstance(m, PixelMeasurement | PoseMeasurement):  # whose errors do not repeat
             return m, 1.0
         last = self._last_used_ns.get(m.landmark_id)
         scale = repetition(self._config.landmarks.repeat_s, last, m.stamp_ns)
@@ -386,7 +368,7 @@ class JudgedSightings:
     @property
     def observes_yaw(self) -> bool:
         """Whether any accepted one determines the yaw by itself."""
-        return any(not isinstance(s.measurement, PoseMeasurement) or s.measurement.observes_yaw for s in self.accepted)
+        return any(s.measurement.observes_yaw for s in self.accepted)
 
     def dropped(self, reason: str) -> JudgedSightings:
         """The same where the graph could not take any of them."""

@@ -23,7 +23,7 @@ from fgloc.graph.joint import MOST_STEPS, fuse
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.noise import whitening_of
 from fgloc.stats import ROUNDING, chi2_bound
-from fgloc.types import FloatArray, FrameMeasurement, IntArray, Landmark, PixelMeasurement, PointMeasurement
+from fgloc.types import FloatArray, FrameMeasurement, IntArray, Landmark, PointMeasurement
 
 # --- Initial values, order of elimination, covariances ----------------------------------------------------------------
 
@@ -366,7 +366,7 @@ class BatchSmoother:
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
         seen = [s for frame in self.frames for s in _seen(frame)]
-        covs = [s.alone.cov for s in seen if not isinstance(s.measurement, PixelMeasurement)]  # type: ignore[union-attr]
+        covs = [s.alone.cov for s in seen if not s.measurement.in_pixels]  # type: ignore[union-attr]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total

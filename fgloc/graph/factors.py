@@ -31,7 +31,6 @@ from fgloc.types import (
     MotionMeasurement,
     PixelMeasurement,
     PointMeasurement,
-    PoseMeasurement,
 )
 
 # --- Linear factors, and the keys of the installation in them ---------------------------------------------------------
@@ -252,7 +251,7 @@ class LandmarkFactors:
         """
         if self._known is None:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
-        if not isinstance(m, PoseMeasurement) and m.landmark_id not in self._known:
+        if m.of_landmark and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
         if not isinstance(m, PixelMeasurement) and (problem := covariance_problem(m.cov)):
             raise CovarianceError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.sensors import registry
@@ -24,12 +22,10 @@ from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     FloatArray,
-    FrameMeasurement,
     LandmarkMap,
     LandmarkMeasurement,
     LandmarkSighting,
     PixelMeasurement,
-    PoseMeasurement,
     SightingsEvent,
     Step,
 )
@@ -117,48 +113,6 @@ class PoseSensors:
 _SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
 
 
-def compensated(m: LandmarkMeasurement, motion: FloatArray, cov: FloatArray) -> LandmarkMeasurement:
-    """Move a sighting to the keyframe.
-
-    Args:
-        m: the sighting, as made from the base at its own time.
-        motion: ``T_keyframe_then`` ``(3,)``: the base at the sighting's time, seen from the keyframe.
-        cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the sighting itself has.
-    """
-    if isinstance(m, PoseMeasurement):
-        known = np.zeros((3, 3)) if m.motion_cov is None else m.motion_cov
-        moved = se2.compose_cov(cov, m.T_keyframe_then, known)
-        return dataclasses.replace(m, T_keyframe_then=se2.compose(motion, m.T_keyframe_then), motion_cov=moved)
-    ad = se2.adjoint(motion)
-    if isinstance(m, PixelMeasurement):
-        x, y, yaw = motion
-        T = np.eye(4)
-        T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-        T[:2, 3] = x, y
-        camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
-        spread = cov if m.motion_cov is None else cov + m.motion_cov
-        return dataclasses.replace(m, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ m.twist)
-    if isinstance(m, FrameMeasurement):
-        pose = se2.compose(motion, m.pose)
-        return dataclasses.replace(m, pose=pose, cov=se2.compose_cov(cov, m.pose, m.cov), twist=ad @ m.twist)
-    x, y = m.point
-    px, py, _ = se2.compose(motion, (x, y, 0.0))
-    r, bearing = math.hypot(px, py), math.atan2(py, px)
-    added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
-    return dataclasses.replace(m, range_m=r, bearing_rad=bearing, cov=m.cov + added, twist=ad @ m.twist)
-
-
-def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
-    """Covariance ``(2, 2)`` (bearing, range) that an uncertain motion adds to a sighted point."""
-    c, s = math.cos(motion[2]), math.sin(motion[2])
-    R = np.array([[c, -s], [s, c]])
-    J_point = np.column_stack([R, R @ np.array([-point[1], point[0]])])  # of motion ∘ point, by right perturbation
-    cb, sb = math.cos(bearing), math.sin(bearing)
-    J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
-    J = J_polar @ J_point
-    return np.asarray(J @ cov @ J.T)
-
-
 def _tilted(seen: Sequence[LandmarkMeasurement], rates: FloatArray, seconds: float) -> list[LandmarkMeasurement]:
     """Corners as the base sees them that has not yet tilted, or has tilted, by the rates ``(2,)`` about x and y."""
     T = np.eye(4)
@@ -207,13 +161,13 @@ class MotionCompensation:
                 motion, cov = self._wheels.motion_between(step, step.stamp_ns, exposure_ns)
                 if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
                     motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
-                late = [compensated(m, motion, cov) for m in late]
+                late = [m.compensated(motion, cov) for m in late]
             measured.extend(late)
         for sensed in step.sensed:
             now: list[LandmarkMeasurement] = list(self._sensor_of[type(sensed)].measure(sensed))
             if now and sensed.stamp_ns != step.stamp_ns:
                 motion, cov = self._motion_to(step, sensed.stamp_ns)
-                now = [compensated(m, motion, cov) for m in now]
+                now = [m.compensated(motion, cov) for m in now]
             measured.extend(now)
         return measured
 

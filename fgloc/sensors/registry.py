@@ -179,16 +179,6 @@ def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[L
     return made
 
 
-def kind_of(measured: type[LandmarkSighting]) -> str:
-    """Name of a landmark measurement in ``steps.csv``: that of the sensor whose it is."""
-    return _kinds()[measured]
-
-
-@cache
-def _kinds() -> dict[type, str]:
-    return {measured: sensor.name for sensor in built_in() for measured in sensor.measured}
-
-
 def landmark_kinds() -> tuple[str, ...]:
     """Names of all landmark measurements."""
     return tuple(sensor.name for sensor in built_in() if sensor.measured)

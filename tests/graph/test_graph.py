@@ -22,7 +22,6 @@ from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 from fgloc.graph.noise import gaussian
 from fgloc.graph.observation import cartesian
-from fgloc.sensors.equipment import compensated
 from fgloc.types import (
     Camera,
     FrameMeasurement,
@@ -174,7 +173,7 @@ def test_carried_sightings_agree_with_those_made_at_the_keyframe():
         point_sighting(then, landmarks.landmarks[9], np.diag([1e-4, 1e-2])),
         FrameMeasurement(0, 0, se2.between(then, landmarks.landmarks[0].planar), np.eye(3) * 1e-2),
     ]
-    carried = [compensated(m, motion, np.eye(3) * 1e-6) for m in sightings]
+    carried = [m.compensated(motion, np.eye(3) * 1e-6) for m in sightings]
     for one in factors.linearize(carried, keyframe):
         assert one.residual == pytest.approx(0.0, abs=1e-5)
 

@@ -24,7 +24,6 @@ from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.runner import run
 from fgloc.sensors.base import Context
-from fgloc.sensors.equipment import compensated
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
@@ -159,7 +158,7 @@ def test_jacobians_are_the_residuals_derivatives(uwb, gnss, which, moved):
     origin = (48.137154, 11.576124, 519.0)
     m = range_of(uwb) if which == "uwb" else position_of(gnss, gnss.GnssConfig(origin=origin, antenna=(0.2, -0.1)))
     if moved:
-        m = compensated(m, np.array([-0.08, 0.01, 0.05]), 1e-4 * np.eye(3))
+        m = m.compensated(np.array([-0.08, 0.01, 0.05]), 1e-4 * np.eye(3))
     pose = np.array([1.2, 2.3, 0.7])
     _, J = m.residual_at_keyframe(pose)
     for i, d in enumerate(1e-6 * np.eye(3)):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fgloc import se2
-from fgloc.sensors.equipment import compensated
 from fgloc.types import FrameMeasurement, PointMeasurement
 
 MOTION = np.array([-0.3, 0.1, 0.4])
@@ -23,7 +22,7 @@ def test_covariance_of_a_compensated_marker_pose_holds_that_of_the_motion(own):
     """Against the spread of 4000 draws of motion and sighting; the sighting's own part alone would be too small."""
     rng = np.random.default_rng(3)
     pose, cov = np.array([2.0, -0.5, 2.5]), np.eye(3) * own**2
-    found = compensated(FrameMeasurement(0, 7, pose, cov), MOTION, MOTION_COV)
+    found = FrameMeasurement(0, 7, pose, cov).compensated(MOTION, MOTION_COV)
     draws = []
     for slip, noise in zip(normal(rng, MOTION_COV), normal(rng, cov), strict=True):
         motion, seen = se2.compose(MOTION, se2.exp(slip)), se2.compose(pose, se2.exp(noise))
@@ -37,7 +36,7 @@ def test_covariance_of_a_compensated_marker_pose_holds_that_of_the_motion(own):
 def test_covariance_of_a_compensated_range_and_bearing_holds_that_of_the_motion():
     rng = np.random.default_rng(4)
     cov = np.diag([0.005, 0.01]) ** 2  # bearing, range
-    found = compensated(PointMeasurement(0, 7, 2.0, 0.3, cov), MOTION, MOTION_COV)
+    found = PointMeasurement(0, 7, 2.0, 0.3, cov).compensated(MOTION, MOTION_COV)
     draws = []
     for slip, noise in zip(normal(rng, MOTION_COV), normal(rng, cov), strict=True):
         motion = se2.compose(MOTION, se2.exp(slip))
