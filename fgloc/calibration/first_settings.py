@@ -24,6 +24,11 @@ from fgloc.sensors.base import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
 _UNCALIBRATED = {"range_scale_sigma": 0.03, "bearing_bias_sigma_rad": 0.02, "time_offset_sigma_s": 0.05}
+_WHEELS = (
+    "  # Nobody has calibrated this odometry: radii and track may be off by more than those of measured wheels.",
+    "  scale_sigma: 0.02",
+    "  turn_scale_sigma: 0.05",
+)
 _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
 _COMMANDED = (
     "  # Commands stand in for wheels. A robot follows them by a share that nobody has measured (5 to 12 % less is",
@@ -97,9 +102,11 @@ def first_settings(bag: Path) -> RobotFile:
     compared = None if seen.info.problems else _compared(bag, text)
     found = () if compared is None else ordered(compared.findings)
     text = with_findings(text, found)
-    if compared is not None and compared.noise is not None:
-        text = _with_lines(text, _noise_lines(compared.noise))
-    if compared is not None and compared.commanded:
+    if compared is not None and "sightings" in seen.info.roles:
+        text = _with_lines(text, _noise_lines(compared.noise, seen.has_map))
+    if compared is not None and seen.has_map:  # without a map these constants are not estimated
+        text = _with_lines(text, {"wheels": _COMMANDED if compared.commanded else _WHEELS})
+    elif compared is not None and compared.commanded:
         text = _with_lines(text, {"wheels": _COMMANDED})
     missing += [f.text for f in found if not f.lines]
     lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
@@ -107,25 +114,25 @@ def first_settings(bag: Path) -> RobotFile:
     return RobotFile(text, dict(seen.info.roles), tuple(dict.fromkeys(missing)), found)
 
 
-def _noise_lines(noise: Noise) -> dict[str, list[str]]:
-    """Noise of the sensor of landmarks that the recording shows beyond the defaults, by section.
+def _noise_lines(noise: Noise | None, has_map: bool) -> dict[str, list[str]]:
+    """Noise of the sensor of landmarks that the recording shows beyond the defaults, and its priors, by section.
 
     A recording can show that errors are larger than the defaults; that they are smaller it does not: over seconds the
     errors of one view are alike, and hidden.
     """
     section, lines = Config().landmarks, []
-    repeat_s = max(noise.correlated_s, _CORRELATED_S)
+    repeat_s = _CORRELATED_S if noise is None else max(noise.correlated_s, _CORRELATED_S)
     lines += ["  # So long the errors of one landmark are taken to be alike.", f"  repeat_s: {repeat_s:.2g}"]
-    wide = {"range_sigma_m": noise.range_m, "bearing_sigma_rad": noise.bearing_rad}
+    wide = {} if noise is None else {"range_sigma_m": noise.range_m, "bearing_sigma_rad": noise.bearing_rad}
     wide = {key: value for key, value in wide.items() if value > getattr(section, key)}
     if wide:
         lines += ["  # Noise that the wheels' motion leaves unexplained."]
         lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
-    if noise.map_m is not None:  # without a map these constants are not estimated
+    if has_map:  # without one these constants are not estimated
         lines += ["  # Nobody has calibrated this sensor: it may be off by more than a measured one (the defaults)."]
         lines += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
     blocks = {"landmarks": lines}
-    if noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
+    if noise is not None and noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
         about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."
         blocks["map"] = [about, f"  position_sigma_m: {noise.map_m:.2g}"]
     return blocks

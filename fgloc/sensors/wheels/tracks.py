@@ -48,6 +48,10 @@ class TwistTimeline:
     def __init__(self) -> None:
         self._starts: list[int] = []
         self._pieces: list[Twist | None] = []  # None: unknown
+        self._bridged: dict[
+            int, tuple[float, float]
+        ] = {}  # by start: mean speed and turn rate where only the ends are known
+        self._known_s = self._way = self._turned = 0.0  # over all pieces: time [s], path [m], turn [rad]
         self._end = 0
         self._tail: Twist = (0.0, 0.0, 0.0)
         self._tail_end = 0
@@ -63,14 +67,28 @@ class TwistTimeline:
         """Forget all and start here."""
         self._starts.clear()
         self._pieces.clear()
+        self._bridged.clear()
         self._starts.append(stamp_ns)
         self._pieces.append(None)
         self._end = self._tail_end = stamp_ns
 
-    def extend(self, end_ns: int, twist: Twist | None) -> None:
-        """Add a piece from the last one's end to ``end_ns``; None: the twist is not known."""
+    def extend(self, end_ns: int, twist: Twist | None, bridged: bool = False) -> None:
+        """Add a piece from the last one's end to ``end_ns``.
+
+        Args:
+            end_ns: its end.
+            twist: constant over it; None: not known.
+            bridged: only its ends were measured: the way between is as noisy as that of a robot that went on as usual.
+        """
         if end_ns <= self._end:
             return
+        seconds = (end_ns - self._end) * 1e-9
+        if bridged and self._known_s > 0.0:
+            self._bridged[self._end] = self._way / self._known_s, self._turned / self._known_s
+        elif twist is not None:
+            self._known_s += seconds
+            self._way += math.hypot(twist[0], twist[1]) * seconds
+            self._turned += abs(twist[2]) * seconds
         if twist != self._pieces[-1]:
             self._starts.append(self._end)
             self._pieces.append(twist)
@@ -84,6 +102,7 @@ class TwistTimeline:
             if old > 0:
                 del self._starts[:old]
                 del self._pieces[:old]
+                self._bridged = {start: means for start, means in self._bridged.items() if start >= self._starts[0]}
 
     def hold(self, twist: Twist, end_ns: int) -> None:
         """What is taken to hold beyond the last piece, until ``end_ns``."""
@@ -117,10 +136,13 @@ class TwistTimeline:
                 continue
             vx, vy, w = twist
             speed, turn = math.hypot(vx, vy), abs(w)
+            if origin_ns in self._bridged:
+                usual = self._bridged[origin_ns]
+                speed, turn = max(speed, usual[0]), max(turn, usual[1])
             qx = x2m * speed + xy2r * turn + xy2s
             qy = y2m * speed + xy2r * turn + xy2s
             qt = t2m * speed + t2r * turn + t2s
-            cuts = int(turn * seconds / _MAX_TURN) + 1
+            cuts = int(abs(w) * seconds / _MAX_TURN) + 1
             h = seconds / cuts
             for _ in range(cuts):
                 along, left, p = _advance(p, twist, h, (qx, qy, qt))
@@ -261,7 +283,7 @@ class Track:
         if self._last_ns is None:
             self.timeline.begin(stamp_ns)
         elif twist is not None:
-            self.timeline.extend(stamp_ns, self._true(twist))
+            self.timeline.extend(stamp_ns, self._true(twist), stamp_ns - self._last_ns > self._hold_ns)
         else:
             if held is not None:
                 self.timeline.extend(min(stamp_ns, self._last_ns + self._hold_ns), self._true(held))
