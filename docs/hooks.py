@@ -1,4 +1,4 @@
-"""What the documentation's build adds: the command line's reference, maths as MathML, the list of decisions."""
+"""Steps of the documentation's build: the command line's reference, maths as MathML, links to files off the site."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typer.cli import get_docs_for_click
 from typer.main import get_command
 
 DOCS = Path(__file__).resolve().parent
+FOR_CONTRIBUTORS = (DOCS / "decisions", DOCS / "faults.md")  # not on the site
 
 
 def command_line() -> str:
@@ -24,38 +25,29 @@ def command_line() -> str:
     return get_docs_for_click(obj=command, ctx=context, name="fgloc", title="Command line")
 
 
-def decisions() -> str:
-    """A page that lists the decision records by their titles."""
-    lines = ["# Decisions", "", "A page each: the context, the options with their figures, the decision.", ""]
-    for path in sorted((DOCS / "decisions").glob("[0-9]*.md")):
-        title = path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
-        lines.append(f"- [{title}]({path.name})")
-    return "\n".join(lines) + "\n"
-
-
 def on_files(files, config):
-    """Add the pages that are generated."""
-    for name, content in (("reference/cli.md", command_line()), ("decisions/index.md", decisions())):
-        files.append(File.generated(config, name, content=content))
+    """Add the page that is generated."""
+    files.append(File.generated(config, "reference/cli.md", content=command_line()))
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Name files outside the documents by their paths: only the repository has them."""
+    """Replace links to files that only the repository has by their paths."""
     folder = (DOCS / page.file.src_uri).parent
 
     def plain(match):
         text, target = match[1], match[2].partition("#")[0]
-        outside = target and not target.startswith("http") and not (folder / target).resolve().is_relative_to(DOCS)
-        if not outside:
+        if not target or target.startswith("http"):
             return match[0]
-        path = (folder / target).resolve().relative_to(DOCS.parent).as_posix()
+        file = (folder / target).resolve()
+        if file.is_relative_to(DOCS) and not any(file.is_relative_to(part) for part in FOR_CONTRIBUTORS):
+            return match[0]
+        path = file.relative_to(DOCS.parent).as_posix()
         return f"`{path}`" if path in text or text in path else f"{text} (`{path}`)"
 
     if page.file.src_uri == "index.md":  # only the site has this page
         markdown = re.sub(r"command line \(`fgloc --help`[^)]*\)", "[command line](reference/cli.md)", markdown)
-    markdown = re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", plain, markdown)
-    return markdown.replace("](decisions/)", "](decisions/index.md)")
+    return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", plain, markdown)
 
 
 def on_page_content(html, page, config, files):
