@@ -147,11 +147,13 @@ def conventions(
     signals, path = _by_hand(found, signals, path, imu_up)
     gyro = _gyro(found, signals, path, imu_up)
     seen = signals.sightings()
-    if found.opposite and _opposite(found, signals, path, seen, T_base_sensor):
+    undecided = found.opposite and not _opposite(found, signals, path, seen, T_base_sensor)
+    if found.opposite and not undecided:
         path = signals.path(found.config) or path
     sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
     drifting = _drifts(found, signals, path, imu_up, T_base_sensor)
-    truth = _true_body(found, signals, path)
+    undecided &= not any(finding.code == "imu.sign" for finding in found.findings)
+    truth = None if undecided else _true_body(found, signals, path)  # wheels that may turn the wrong way judge no truth
     gyro, sensor = None if "imu" in drifting else gyro, None if "sightings" in drifting else sensor
     later_s = _clocks(found, signals, path, gyro, sensor, truth)
     _first_pose(found, path, seen, T_base_sensor, landmark_map)
@@ -900,8 +902,8 @@ def _clocks(
         return 0.0
     of_all = weighted(list(off.values()))
     same = len(off) > 1 and all(abs(lag.value - of_all.value) < 0.5 * _LATE_S + 3.0 * lag.sigma for lag in off.values())
-    if signals.source not in _WHEELS:
-        if of_all.value < 0.0 or not (same or len(late) == 1):
+    if signals.source not in _WHEELS and (same or len(late) == 1):
+        if of_all.value < 0.0:
             return 0.0
         delay_s = round(found.config.wheels.delay_s + of_all.value, 3)
         text = (
@@ -910,7 +912,7 @@ def _clocks(
         )
         found.add("commands.delay", text, {"wheels.delay_s": delay_s}, of_all, Severity.WARNING)
         return of_all.value
-    wheels = _WHEELS[signals.source]
+    wheels = _WHEELS.get(signals.source, "command")
     if same or (len(late) == 1 and "imu" in off and _unpunctual(signals, wheels, "imu")):
         lag = of_all if same else off["imu"]
         _late(found, wheels, Figure(-lag.value, lag.sigma), " and ".join(off), len(late) == 1)
