@@ -154,7 +154,9 @@ class LandmarksConfig(Section):
         le=3.2,
         description="of a marker pose's yaw; None: marker poses are used as range and bearing only",
     )
-    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
+    cauchy_k: float = Field(
+        3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
+    )
     min_sightings: int = Field(
         3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is used"
     )
@@ -178,7 +180,9 @@ class MarkersConfig(Section):
         le=0.1,
         description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
     )
-    cauchy_k: float = Field(3.0, ge=0.01, le=1e6, description="Cauchy constant in units of sigma")
+    cauchy_k: float = Field(
+        3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
+    )
     max_sightings: int = Field(12, gt=0, le=1000, description="the largest markers of an image that are used")
 
 
