@@ -1,7 +1,7 @@
 """Measurements to GTSAM factors: keys, linear factors, and the factors of motions and sightings.
 
-A known landmark enters as a unary factor; an unknown one is a variable. Factors are Gaussian, but for sightings of unknown
-landmarks, which have Cauchy's kernel.
+A known landmark enters as a unary factor; an unknown one is a variable. Factors are Gaussian, but for sightings of
+unknown landmarks, which have Cauchy's kernel.
 """
 
 from __future__ import annotations
