@@ -197,6 +197,20 @@ def test_every_option_that_a_page_names_is_one(page):
         assert named <= known[tuple(words[:depth])], f"{page.name}: fgloc {text}"
 
 
+def test_files_and_classes_that_the_architecture_names_exist():
+    """`sightings.py` beside `estimation/motion.py` is a file of some folder; `Localizer.update` is a method."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    sources = [path for folder in ("fgloc", "tests") for path in (ROOT / folder).rglob("*.py")]
+    files = re.findall(r"`((?:[a-z_]+/)*[a-z_]+\.py)`", text)
+    assert len(files) > 20
+    assert not [name for name in files if not any(path.as_posix().endswith(f"/{name}") for path in sources)]
+    code = "\n".join(path.read_text(encoding="utf-8") for path in sources if path.is_relative_to(ROOT / "fgloc"))
+    named = re.findall(r"`([A-Z][a-z]\w+)(?:\.(\w+))?`", text)
+    assert len(named) > 20
+    assert not [name for name, _ in named if not re.search(rf"^class {name}\b", code, re.M)]
+    assert not [method for _, method in named if method and not re.search(rf"^    def {method}\(", code, re.M)]
+
+
 @pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "decisions"], ids=page_id)
 def test_every_setting_that_a_page_names_is_one(page):
     """Decisions may name settings that are gone; codes of findings are written like settings."""
