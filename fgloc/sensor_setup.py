@@ -223,7 +223,8 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
-            "the map's origin; for long runs build the map once with `fgloc map`."
+            "the map's origin (online: until a loop closes, then poses already given stay as well as they can); "
+            "for long runs build the map once with `fgloc map`."
         )
     detector = configured_detector(config, landmark_map) if "image" in facts.roles else None
     imu_up = T_base_imu = None

@@ -15,7 +15,7 @@ from fgloc.estimation.motion import MotionJudge
 from fgloc.estimation.place import InitialPose
 from fgloc.estimation.sightings import SightingJudge
 from fgloc.estimation.tracking import Tracking
-from fgloc.graph.estimators import make_estimator
+from fgloc.graph.estimators import Estimator, make_estimator
 from fgloc.graph.ground import spatial
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.instrumentation import Stopwatch
@@ -34,6 +34,53 @@ from fgloc.types import (
 
 # --- Record -----------------------------------------------------------------------------------------------------------
 
+_COMPARED = 200  # poses, over the run
+_ARM_M = 0.1  # between the two points by which a pose is compared: a robot's length
+_MOVED_M, _MOVED_RAD = 0.001, 0.001  # by more than the newest pose moves without a loop
+
+
+class MapFrame:
+    """Frame of the map while it is being made: that in which the poses already given move least.
+
+    Without a map nothing fixes its frame. The graph's has its origin in the first pose: when the robot comes back to
+    where it was, the drift since then is taken from all later poses at once, and what was noted in the poses given
+    before (places to go to, a picture of the way) is off by it. Instead the whole map is moved.
+    """
+
+    def __init__(self) -> None:
+        """Begin with the graph's frame."""
+        self.T_map_graph = np.zeros(3)
+        self._given: dict[int, FloatArray] = {}  # poses in the map's frame, by keyframe, evenly thinned out
+        self._every, self._last = 1, (-1, np.zeros(3))
+
+    def place(self, k: int, pose: FloatArray, estimator: Estimator) -> FloatArray:
+        """Pose ``(3,)`` of the newest keyframe ``k`` in the map's frame."""
+        before = estimator.smoothed(self._last[0]) if self._given else None
+        if before is not None:
+            x, y, yaw = se2.between(self._last[1], before)
+            if np.hypot(x, y) > _MOVED_M or abs(yaw) > _MOVED_RAD:
+                self._move(estimator)
+        self._last = k, pose
+        placed = se2.compose(self.T_map_graph, pose)
+        if k % self._every == 0:
+            self._given[k] = placed
+            if len(self._given) > 2 * _COMPARED:
+                self._every *= 2
+                self._given = {i: p for i, p in self._given.items() if i % self._every == 0}
+        return placed
+
+    def _move(self, estimator: Estimator) -> None:
+        now = {k: pose for k in self._given if (pose := estimator.smoothed(k)) is not None}
+        if now:
+            given = np.array([self._given[k] for k in now])
+            self.T_map_graph = se2.rigid(_points(np.array(list(now.values()))), _points(given))
+
+
+def _points(poses: FloatArray) -> FloatArray:
+    """Two points ``(2 n, 2)`` of each pose ``(n, 3)``, by which it is compared with another."""
+    ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    return np.vstack([poses[:, :2], poses[:, :2] + _ARM_M * ahead])
+
 
 class Recorder:
     """Adds to the graph's covariance what the graph does not know: clock, kidnapping, the whole map where lost.
@@ -50,6 +97,8 @@ class Recorder:
         motion: MotionJudge,
         sightings: SightingJudge,
         compensation: MotionCompensation,
+        estimator: Estimator,
+        makes_map: bool,
     ) -> None:
         """Take the parts that know it."""
         self.counts: Counter[str] = Counter()
@@ -60,6 +109,13 @@ class Recorder:
         self._installation = tracking.installation
         self._last_ground: FloatArray | None = None
         self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
+        self._estimator = estimator
+        self._makes_map = makes_map and config.estimator.ground == "flat"
+        self._frame = MapFrame() if self._makes_map else None
+
+    def begin_segment(self) -> None:
+        """Nothing connects what comes with the poses given before."""
+        self._frame = MapFrame() if self._makes_map else None
 
     def count(self, frame: Keyframe) -> None:
         """Count the factors of a new keyframe."""
@@ -89,7 +145,11 @@ class Recorder:
         if ground is not None:
             frame.ground_clock_cov = self._ground_by_clock(step, ground)
             ground = replace(ground, cov=ground.cov + frame.ground_clock_cov)
-        return Estimate(step.stamp_ns, belief.pose, cov, frame.mode, (*before, *decisions, *modes), ground)
+        pose = belief.pose
+        if self._frame is not None:
+            pose = self._frame.place(frame.k, pose, self._estimator)
+            cov = se2.rotate_cov(cov, float(self._frame.T_map_graph[2]))
+        return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground)
 
     def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:
         """Covariance ``(6, 6)`` of height, roll and pitch for a clock that is off, as `record` has it of x, y, yaw."""
@@ -174,7 +234,15 @@ class Localizer:
         self.sightings = SightingJudge(config, self.estimator, self.tracking)
         self.stopwatch = Stopwatch()
         self._compensation = MotionCompensation(poses, motion, config.camera.time_jitter_s)
-        self._recorder = Recorder(config, self.tracking, self.motion, self.sightings, self._compensation)
+        self._recorder = Recorder(
+            config,
+            self.tracking,
+            self.motion,
+            self.sightings,
+            self._compensation,
+            self.estimator,
+            makes_map=landmark_map is None,
+        )
         self.counts = self._recorder.counts
         self._keep_all = keep_all
         self._segment = -1
@@ -265,6 +333,7 @@ class Localizer:
         if self._segment not in (-1, step.segment):
             self._recorder.clock_jumped(self.estimator.k + 1, step)
         self._segment = step.segment
+        self._recorder.begin_segment()
         self.motion.begin_segment(step)
         self.sightings.begin_segment()
         known, self._restart = self._restart, None

@@ -93,6 +93,10 @@ class Estimator(ABC):
         """The newest keyframe."""
         return self.log.keyframes[self._k]
 
+    def smoothed(self, k: int) -> FloatArray | None:
+        """Pose ``(3,)`` of a keyframe as it is estimated now; None: it has left the window."""
+        return self.log.keyframes[k].belief.pose if k in self.log.keyframes else None
+
     def start(
         self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LandmarkFactor] = ()
     ) -> PoseWithCovariance:
@@ -483,6 +487,9 @@ class IncrementalEstimator(Estimator):
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
+
+    def smoothed(self, k: int) -> FloatArray | None:  # noqa: D102
+        return self._backend.pose(k) if self._backend is not None and self._backend.holds(k) else None
 
     def _solve(self, frame: Keyframe) -> None:
         if self._backend is None or (frame.prior is not None and self._config.kind == "fixed_lag"):

@@ -1,0 +1,52 @@
+"""Frame of the map while it is being made: poses that were given stay where they are as well as they can."""
+
+import numpy as np
+import pytest
+
+from fgloc import se2
+from fgloc.estimation.localizer import MapFrame
+
+
+class Drifting:
+    """A graph whose poses turn by a drift until a loop corrects them all."""
+
+    def __init__(self, n, drift_rad):
+        self.true = [np.array([np.cos(a), np.sin(a), a + np.pi / 2]) for a in np.linspace(0.0, 2.0 * np.pi, n)]
+        first = self.true[0]
+        self.true = [se2.between(first, pose) for pose in self.true]
+        self.drifted = [se2.compose((0.0, 0.0, drift_rad * k / n), pose) for k, pose in enumerate(self.true)]
+        self.closed = False
+
+    def smoothed(self, k):
+        return (self.true if self.closed else self.drifted)[k]
+
+
+def test_without_a_loop_the_frame_is_that_of_the_first_pose():
+    graph, frame = Drifting(50, 0.1), MapFrame()
+    given = [frame.place(k, graph.smoothed(k), graph) for k in range(50)]
+    assert np.array(given) == pytest.approx(np.array(graph.drifted), abs=1e-12)
+
+
+def test_after_a_loop_poses_are_given_in_the_frame_in_which_those_before_move_least():
+    graph, frame = Drifting(50, 0.1), MapFrame()
+    given = [frame.place(k, graph.smoothed(k), graph) for k in range(40)]
+    graph.closed = True
+    given += [frame.place(k, graph.smoothed(k), graph) for k in range(40, 50)]
+    moved = np.array([se2.compose(frame.T_map_graph, pose) for pose in graph.true])
+    assert np.array(given[40:]) == pytest.approx(moved[40:], abs=1e-9)
+
+    def apart(poses):
+        return float(np.sqrt(np.mean(np.sum((np.array(given[:40]) - poses[:40])[:, :2] ** 2, axis=1))))
+
+    assert apart(moved) < 0.6 * apart(np.array(graph.true))
+
+
+def test_a_long_run_compares_a_bounded_number_of_poses():
+    graph, frame = Drifting(3000, 0.5), MapFrame()
+    for k in range(2990):
+        frame.place(k, graph.smoothed(k), graph)
+    asked = []
+    smoothed, graph.closed = graph.smoothed, True
+    graph.smoothed = lambda k: (asked.append(k), smoothed(k))[1]
+    frame.place(2990, smoothed(2990), graph)
+    assert 50 < len(asked) < 500
