@@ -276,7 +276,8 @@ def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, place
             times, ids = on_map.times, on_map.ids
         else:
             keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
-            times, ids, z = (part[keep][:: max(1, int(keep.sum()) // 3000)] for part in (seen.times, seen.ids, z))
+            some = np.flatnonzero(keep)[:: max(1, int(keep.sum()) // 3000)]
+            times, ids, z = seen.times[some], seen.ids[some], z[some]
             if len(z) < _FEWEST_ON_MAP:
                 return Figure(0.0, math.inf)
             part = _Places(path, times, z, _tracks(times, ids))
