@@ -19,7 +19,7 @@ help:
 	@echo "make test      the quick tests"
 	@echo "make test-all  all tests"
 	@echo "make check     ruff format, ruff, mypy"
-	@echo "make equal     whether the bundled samples' results are those of the committed file, bit by bit"
+	@echo "make equal     whether short runs of all kinds give the committed results, bit by bit"
 	@echo "make dist      sdist and wheel in dist/, checked in a fresh environment outside the repository"
 	@echo "make docs      the documentation as a site, in site/"
 	@echo "make docs-test run every command and piece of code in README and docs/, and the notebooks"
@@ -44,7 +44,7 @@ check: .venv/.dev
 	$(BIN)/mypy
 
 equal: .venv/.dev
-	$(BIN)/python -m benchmarks.equal
+	$(BIN)/python -m benchmarks.equal --workers $(JOBS)
 
 format: .venv/.dev
 	$(BIN)/ruff format .

@@ -191,20 +191,21 @@ MISTAKES: dict[str, Mistake] = {
 }
 
 
-def write(source: Path, folder: Path, mistake: Mistake | None) -> Path:
+def write(source: Path, folder: Path, mistake: Mistake | None, length_s: float = LENGTH_S) -> Path:
     """A recording with a mistake in ``folder``: bag, ``robot.yaml`` and ``map.yaml``; None: a sound one.
 
     Args:
         source: folder of a simulated recording.
         folder: to be made.
         mistake: what is wrong.
+        length_s: of it; the rest of the source is left out.
 
     Returns:
         The bag.
     """
     made = mistake or Mistake("")
     folder.mkdir(parents=True)
-    start = _copied(source / "bag", folder / "bag", made.messages)
+    start = _copied(source / "bag", folder / "bag", made.messages, length_s)
     robot = yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8"))
     landmarks = yaml.safe_load((source / "map.yaml").read_text(encoding="utf-8"))
     robot, landmarks = deepcopy(robot), deepcopy(landmarks)
@@ -215,13 +216,13 @@ def write(source: Path, folder: Path, mistake: Mistake | None) -> Path:
     return folder / "bag"
 
 
-def _copied(source: Path, target: Path, edits: Mapping[str, Edit]) -> tuple[float, float, float]:
-    """The first minute of a bag with these messages changed; the first pose of its truth."""
+def _copied(source: Path, target: Path, edits: Mapping[str, Edit], length_s: float) -> tuple[float, float, float]:
+    """The beginning of a bag with these messages changed; the first pose of its truth."""
     store = default_typestore()
     first: tuple[float, float, float] | None = None
     with AnyReader([source]) as reader, Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         made = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
-        end_ns = reader.start_time + round(LENGTH_S * 1e9)
+        end_ns = reader.start_time + round(length_s * 1e9)
         for connection, received_ns, raw in reader.messages(stop=end_ns):
             content = raw
             if connection.topic in edits or (first is None and connection.topic == "/truth"):

@@ -24,7 +24,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
-from benchmarks.equal import SAMPLES
+from benchmarks.equal_cases import SAMPLES
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
