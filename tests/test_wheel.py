@@ -3,6 +3,7 @@
 Its dependencies are those of the environment that runs the tests, by a path file; fgloc itself is that of the wheel.
 """
 
+import os
 import re
 import shutil
 import subprocess
@@ -51,7 +52,8 @@ def run(wheel, tmp_path_factory):
     python = place / "venv" / "bin" / "python"
     packages = sysconfig.get_path("purelib", "venv", {"base": str(place / "venv")})
     (Path(packages) / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", wheel], check=True)
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}  # else pip finds the source
+    subprocess.run([python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", wheel], check=True, env=alone)
     empty = place / "empty"
     empty.mkdir()
 

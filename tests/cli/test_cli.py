@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 import time
@@ -233,7 +234,8 @@ def test_pipe_gets_no_progress_bar_and_no_traceback(bag, tmp_path):
         )
 
     done = shell("smooth", bag, "--out", tmp_path / "out")
-    assert (done.returncode, done.stderr) == (0, "")
+    remarks = [line for line in done.stderr.split("\n") if not re.match(r"\w+: \d", line)]  # of runs over 10 s
+    assert (done.returncode, remarks) == (0, [""])
     assert f"fgloc smooth {bag} --out {tmp_path / 'out'}" in (tmp_path / "out" / "report.html").read_text()
     done = shell("smooth", tmp_path / "absent.bag", "--out", tmp_path / "out")
     assert done.returncode == 1

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_feed import PATIENCE_S
 from recording_bags import write_drive
 from typer.testing import CliRunner
 from wire import DOMAIN, wait_until
@@ -109,12 +110,12 @@ def test_poses_on_the_wire_are_those_of_an_online_run(tmp_path, monkeypatch):
     config, landmarks = load_config(SAMPLE / "robot.yaml"), load_map(SAMPLE / "map.yaml")
     config = with_values(config, "live", {"image_queue": 1000})  # however busy this machine is
     with Session(config, landmarks) as session, Participant(DOMAIN) as one, Player(bag, one) as player:
-        assert player.wait_for_readers(20.0)
+        assert player.wait_for_readers(PATIENCE_S)
         player.play(2.5)
         player.finish()
         drawn = []
         session.other.read("/fgloc/map", "visualization_msgs/msg/MarkerArray", drawn.append, latched=True)
-        assert session.node.live.wait(10.0)
+        assert session.node.live.wait(PATIENCE_S)
         assert wait_until(lambda: len(session.heard["/diagnostics"]) >= 4 and drawn)
     online = run(bag, SAMPLE / "map.yaml", config, "online").trajectory
     stamps, poses = session.planar("/fgloc/pose")
@@ -169,7 +170,7 @@ def test_a_pose_told_on_the_wire_moves_the_robot_and_its_odometry_frame(tmp_path
         assert wait_until(lambda: writer.readers)
         give("map", 1.0, 2.0, 0.0)
         player = Player(bag, one)
-        assert player.wait_for_readers(20.0)
+        assert player.wait_for_readers(PATIENCE_S)
         playing = threading.Thread(target=player.play, args=(3.0, stop))
         playing.start()
         assert wait_until(lambda: len(session.heard["/tf"]) > 20)
@@ -212,12 +213,12 @@ def test_two_publishers_of_one_topic_are_told_apart():
                 time.sleep(0.02)
 
         send(200, first=True)
-        assert session.node.live.wait(10.0)
+        assert session.node.live.wait(PATIENCE_S)
         status = session.node.live.status()
         moved = session.node.live.pose_at()
         assert wait_until(lambda: any("/odom: two publishers" in sentence for sentence in session.told))
         send(75, first=False)  # 1.5 s
-        assert session.node.live.wait(10.0)
+        assert session.node.live.wait(PATIENCE_S)
         dropped = session.node.live.status().dropped["odometry"] - status.dropped["odometry"]
     count = status.topics["/odom"].count
     assert count == status.dropped["odometry"] == pytest.approx(200, abs=2)
@@ -319,17 +320,20 @@ def test_two_commands_as_two_processes(tmp_path):
     live = subprocess.Popen(
         command("live", "--domain", DOMAIN, *files), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
+    poses = []
     try:
-        done = subprocess.run(
-            command("play", bag, "--domain", DOMAIN, "--rate", 4),
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        time.sleep(0.3)
+        with Participant(DOMAIN) as other:
+            other.read("/fgloc/pose", POSE, poses.append)
+            done = subprocess.run(
+                command("play", bag, "--domain", DOMAIN, "--rate", 4, "--wait", PATIENCE_S),
+                capture_output=True,
+                text=True,
+                timeout=3 * PATIENCE_S,
+                check=False,
+            )
+            assert wait_until(lambda: len(poses) >= 14), done.stdout
         live.send_signal(signal.SIGINT)
-        said, _ = live.communicate(timeout=20)
+        said, _ = live.communicate(timeout=PATIENCE_S)
     finally:
         live.kill()
     assert done.returncode == 0, done.stderr
