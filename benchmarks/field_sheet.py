@@ -8,13 +8,44 @@ ahead or behind as one looks at it). Patterns of sentences are alternatives of p
 # ruff: noqa: E501 (a table)
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
-if TYPE_CHECKING:
-    from benchmarks.field import Outcome
+Mode = Literal["batch", "online"]
+MODES: tuple[Mode, ...] = ("batch", "online")
+
+
+@dataclass(slots=True)
+class Outcome:
+    """Results of one recording.
+
+    Attributes:
+        said: what ``init``, ``info``, ``smooth`` and ``online`` printed.
+        codes: their exit codes; 124: longer than the limit.
+        metrics: ``metrics.json`` of the two modes; empty: none was written.
+        ate: of "odometry", "textbook.batch", "textbook.online", "batch", "online" [m].
+        error: why the recording could not be read for the comparison.
+    """
+
+    said: dict[str, str] = field(default_factory=dict)
+    codes: dict[str, int] = field(default_factory=dict)
+    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)
+    ate: dict[str, float] = field(default_factory=dict)
+    error: str = ""
+
+    def findings(self, mode: Mode) -> list[dict[str, Any]]:
+        """Findings of a run, the gravest first; its error, if it gave no result."""
+        if mode in self.metrics:
+            return list(self.metrics[mode].get("findings", []))
+        lines = [line for line in self.said.get(mode, "").splitlines() if line.startswith("error")]
+        return [{"code": "error", "severity": "error", "text": line} for line in lines[:1]]
+
+    def best(self, mode: Mode) -> float:
+        """Least ATE of odometry and textbook [m]; infinite: there is none."""
+        return min((self.ate[k] for k in ("odometry", f"textbook.{mode}") if k in self.ate), default=math.inf)
 
 
 @dataclass(frozen=True, slots=True)
