@@ -19,6 +19,9 @@ from fgloc.config import Config, config_type, load_config
 from fgloc.sensors.maps import load_map
 
 SAMPLE = ROOT / "datasets" / "samples" / "installed_run"
+LINKING = sorted(
+    {*PAGES, *ROOT.glob("*.md"), *(p for top in ("datasets", "fgloc", "training") for p in (ROOT / top).rglob("*.md"))}
+)
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
@@ -181,6 +184,27 @@ def options_of(command):
     for name, below in getattr(command, "commands", {}).items():
         found |= {(name, *words): options for words, options in options_of(below).items()}
     return found
+
+
+def prose(page):
+    return re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page):
+    """Names of a page's headings, as GitHub and the site make them, and of its places with an id."""
+    heads = (re.sub(r"\]\([^)]*\)", "", head).lower() for head in re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE))
+    ids = re.findall(r'\bid="([^"]+)"', prose(page))
+    return {re.sub(r"[^\w\- ]", "", head).strip().replace(" ", "-") for head in heads} | set(ids)
+
+
+@pytest.mark.parametrize("page", LINKING, ids=page_id)
+def test_every_link_to_a_file_leads_there(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not re.match(r"\w+:", link):
+            assert target.exists(), link
+            assert not anchor or anchor in anchors(target), link
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
