@@ -22,6 +22,7 @@ from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
     FOLLOWS,
+    TURN,
     BodyFit,
     Figure,
     Mounting,
@@ -46,6 +47,7 @@ from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _LATE_SIGMAS = 4.0  # of a lag that is corrected: its sigma is the larger of two jackknives
+_BOTH_SIGMAS = 2.5  # of each of two lags that are alike: one clock is late, and they are corrected by their mean
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
 _UNSURE = 0.1  # share of a scale by which it is not known
@@ -53,6 +55,7 @@ _VARIED = 0.05  # rad/s, m/s: standard deviation of a motion that tells one time
 _WHEELS_OFF = 0.2  # log scale of a truth: wheels may be off by less, and a truth that is no unit is seldom off by more
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _ASIDE = 0.1  # share of the way that is sideways: the lateral part of a turn about a sensor is less
+_GYRO_SCALE = 0.02  # by which an uncalibrated gyro may be off
 _RATE_SCALE = 0.1  # of a turn: no gyro and no careful track is off by more
 _TURNED_RAD = 0.05  # of a sensor: likewise
 _PLACED_M = 0.08
@@ -150,7 +153,8 @@ def conventions(
     undecided = found.opposite and not _opposite(found, signals, path, seen, T_base_sensor)
     if found.opposite and not undecided:
         path = signals.path(found.config) or path
-    sensor = None if seen is None else _sensor(found, path, seen, T_base_sensor, landmark_map)
+    by_gyro, turn_sigma = _turn_of(path, gyro)
+    sensor = None if seen is None else _sensor(found, by_gyro, seen, T_base_sensor, landmark_map, turn_sigma)
     drifting = _drifts(found, signals, path, imu_up, T_base_sensor)
     undecided &= not any(finding.code == "imu.sign" for finding in found.findings)
     truth = None if undecided else _true_body(found, signals, path)  # wheels that may turn the wrong way judge no truth
@@ -546,13 +550,26 @@ def _gyro_scale(found: Conventions, fit: RateFit, given: float) -> RateFit:
 # --- landmarks and the wheels -----------------------------------------------------------------------------------------
 
 
+def _turn_of(path: Path, gyro: RateFit | None) -> tuple[Path, float]:
+    """The path with the gyro's turn, where there is one, and by what share of itself its turn may be off."""
+    if gyro is None or gyro.share < _TELLS or abs(math.log(max(gyro.scale.value, 1e-9))) > _SKID:
+        return path, TURN
+    turns = 1.0 / gyro.scale.value
+    return path.turned(turns), min(math.hypot(_GYRO_SCALE, turns * gyro.scale.sigma), TURN)
+
+
 def _sensor(
-    found: Conventions, path: Path, seen: Sightings, T_base_sensor: FloatArray | None, landmark_map: LandmarkMap | None
+    found: Conventions,
+    path: Path,
+    seen: Sightings,
+    T_base_sensor: FloatArray | None,
+    landmark_map: LandmarkMap | None,
+    turn_sigma: float,
 ) -> Mounting | None:
     """Axes, mirror, scale and place of the sensor of landmarks; None: the wheels do not tell."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
-    fits = fit_sightings(path, as_given)
+    fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
     if not fits:
         return None
     best = _best(fits)
@@ -561,7 +578,7 @@ def _sensor(
         return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
     if _along_axis(found, path, seen, best, T_base_sensor, landmark_map):
         as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
-        fits = fit_sightings(path, as_given) or fits
+        fits = fit_sightings(path, as_given, turn_sigma=turn_sigma) or fits
         best = _best(fits)
     sound = fits.get("body")
     if best.axes == "body" or (
@@ -570,7 +587,9 @@ def _sensor(
         assert sound is not None
         return _constants(found, path, as_given, sound, T, landmark_map)
     raw = Sightings(seen.times, seen.ids, ranged, seen.spatial)
-    chosen = best if T_base_sensor is None else _best(fit_sightings(path, raw) or {best.axes: best})
+    chosen = (
+        best if T_base_sensor is None else _best(fit_sightings(path, raw, turn_sigma=turn_sigma) or {best.axes: best})
+    )
     pose = _pose_of(chosen, T)
     lines: dict[str, Any] = {}
     off_mm = 1e3 * chosen.scale.value * chosen.misfit
@@ -681,7 +700,7 @@ def _constants(
     if scaled or landmark_map is not None:
         _scale(found, path, seen, m, landmark_map)
     if len(found.findings) == before:
-        m, scaled = _by_map(found, path, seen, m, landmark_map), False
+        m, scaled = _by_map(found, path, seen, m, T, landmark_map), False
     place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], _PLACED_M) and f.sigma < 0.5 * _PLACED_M]
     turned = m.yaw.off(0.0, _TURNED_RAD)
     if (place or turned) and _varied(path):
@@ -720,7 +739,9 @@ def _lines_of(found: Conventions) -> set[str]:
     return {key for finding in found.findings for key in finding.lines}
 
 
-def _by_map(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmark_map: LandmarkMap | None) -> Mounting:
+def _by_map(
+    found: Conventions, path: Path, seen: Sightings, m: Mounting, T: FloatArray, landmark_map: LandmarkMap | None
+) -> Mounting:
     """Name ranges that the map refutes, and note the noise; the mounting as wheels and map determine it best."""
     section = found.config.landmarks
     known = {} if landmark_map is None else {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
@@ -742,9 +763,10 @@ def _by_map(found: Conventions, path: Path, seen: Sightings, m: Mounting, landma
             Severity.ERROR,
         )
     better = {}
-    for name in ("yaw", "x", "y", "late_s"):
+    for name, configured in (("yaw", 0.0), ("x", float(T[0, 3])), ("y", float(T[1, 3])), ("late_s", 0.0)):
         wheels, on_map = getattr(m, name), getattr(by_map, name)
-        better[name] = on_map if on_map.sigma < wheels.sigma else wheels
+        refuted = abs(on_map.value - configured) + on_map.sigma < abs(on_map.value - wheels.value)
+        better[name] = on_map if refuted or on_map.sigma < wheels.sigma else wheels
     return replace(m, **better)
 
 
@@ -895,13 +917,17 @@ def _clocks(
     ):
         late["truth"] = truth.late_s
     off = {role: lag for role, lag in late.items() if _surely_late(lag)}
+    perhaps = {role: lag for role, lag in late.items() if role in off or lag.off(0.0, _LATE_S, _BOTH_SIGMAS)}
+    mean = weighted(list(perhaps.values())) if perhaps else Figure(0.0, math.inf)
+    if _surely_late(mean) and all(_alike(lag, mean) for lag in perhaps.values()):
+        off = perhaps  # two that are late alike are surer than each
     sensors = [role for role in late if role != "truth"]
     if not off.keys() & set(sensors):
         found.compared += [f"{r}: {late[r].value:+.3f} ± {late[r].sigma:.3f} s late" for r in sensors]
     if not off:
         return 0.0
     of_all = weighted(list(off.values()))
-    same = len(off) > 1 and all(abs(lag.value - of_all.value) < 0.5 * _LATE_S + 3.0 * lag.sigma for lag in off.values())
+    same = len(off) > 1 and all(_alike(lag, of_all) for lag in off.values())
     if signals.source not in _WHEELS and (same or len(late) == 1):
         if of_all.value < 0.0:
             return 0.0
@@ -922,6 +948,10 @@ def _clocks(
             others = [wheels, *(other for other in sensors if other not in off)]
             _late(found, role, lag, " and ".join(others), len(others) == 1)
     return 0.0
+
+
+def _alike(lag: Figure, other: Figure) -> bool:
+    return abs(lag.value - other.value) < 0.5 * _LATE_S + 3.0 * lag.sigma
 
 
 def _surely_late(lag: Figure) -> bool:

@@ -41,7 +41,9 @@ _MAD = 1.4826  # standard deviation of a normal distribution over its median abs
 _CLIPPED = 4.0  # standard deviations beyond which a rate counts as this much: spikes of a driver
 _REWEIGHTED = 6  # times
 _SITS = 1e-2  # information on a place on the robot, over that of a row: it is small where the robot does not turn
+TURN = 0.1  # prior of the share by which a robot turns more or less than its wheels say
 FOLLOWS = 0.5  # share of a motion that another explains: enough for a lag with its sigma
+_STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _CAUCHY = 2.385  # tuning constant of 95 % efficiency
 
 
@@ -108,6 +110,7 @@ class Mounting:
         x: place of the sensor in the base frame [m].
         y: likewise.
         late_s: how much later the sensor's stamps are than the wheels'.
+        turns: the robot's turn over the wheels': a path that turns too much looks like a sensor further back, or late.
         misfit: robust standard deviation of a landmark's place between two sightings, in the sensor's unit of length.
         pairs: number of pairs of sightings.
     """
@@ -118,6 +121,7 @@ class Mounting:
     x: Figure
     y: Figure
     late_s: Figure
+    turns: Figure
     misfit: float
     pairs: int
 
@@ -143,13 +147,16 @@ def _wander(heights: FloatArray, tracks: IntArray) -> float:
     return _MAD * float(np.median(np.abs(heights - mean[number])))
 
 
-def fit_sightings(path: Path, seen: Sightings, names: Sequence[str] | None = None) -> dict[str, Mounting]:
+def fit_sightings(
+    path: Path, seen: Sightings, names: Sequence[str] | None = None, turn_sigma: float = TURN
+) -> dict[str, Mounting]:
     """Mounting for each hypothesis of the sensor's axes that the sightings determine, by name.
 
     Args:
         path: motion of the wheels.
         seen: landmarks in the sensor's axes.
         names: of the hypotheses; None: all that such a sensor can have.
+        turn_sigma: prior of the share by which the robot turns more or less than the wheels say.
     """
     first, last = _pairs(seen, path)
     if len(first) < 60:
@@ -166,7 +173,7 @@ def fit_sightings(path: Path, seen: Sightings, names: Sequence[str] | None = Non
             found[name] = (misfit, float(lags[best]), alpha, beta, z)
     least = min((f[0] for f in found.values()), default=math.inf)
     return {
-        name: _refined(path, seen, name, z, late, alpha, beta, len(first))
+        name: _refined(path, seen, name, z, late, alpha, beta, len(first), turn_sigma)
         for name, (misfit, late, alpha, beta, z) in found.items()
         if misfit < 5.0 * least or name == "body"
     }
@@ -211,7 +218,15 @@ def _similarity(
 
 
 def _refined(
-    path: Path, seen: Sightings, name: str, z: ComplexArray, late: float, alpha: complex, beta: complex, pairs: int
+    path: Path,
+    seen: Sightings,
+    name: str,
+    z: ComplexArray,
+    late: float,
+    alpha: complex,
+    beta: complex,
+    pairs: int,
+    turn_sigma: float,
 ) -> Mounting:
     """Least squares in what the sensor reports, so that its noise does not shorten the scale; sigmas by a jackknife."""
     keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
@@ -219,24 +234,24 @@ def _refined(
     every = max(1, len(z) // 3000)
     times, ids, z = times[::every], ids[::every], z[::every]
     tracks = _tracks(times, ids)
-    start = np.array([math.log(abs(alpha)), math.atan2(alpha.imag, alpha.real), beta.real, beta.imag, late])
+    start = np.array([math.log(abs(alpha)), math.atan2(alpha.imag, alpha.real), beta.real, beta.imag, late, 0.0])
     start[2:4] = np.clip(start[2:4], -2.0, 2.0)
-    start[4] += _NUDGE_S  # a step of derivatives is a share of the value: at 0 there is none
+    start[4:] += _NUDGE_S  # a step of derivatives is a share of the value: at 0 there is none
 
-    def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float]:
-        part = _Places(path, times[use], z[use], tracks[use])
+    def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+        part = _Places(path, times[use], z[use], tracks[use], turn_sigma)
         fit = least_squares(part.residuals, x0, loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
-        return fit.x, part.misfit(fit.x)
+        return fit.x, part.misfit(fit.x), part.by_priors(fit.jac)
 
     everything = np.ones(len(z), dtype=bool)
-    x, typical = solve(everything, start)
+    x, typical, by_priors = solve(everything, start)
     blocks = np.minimum(((times - times[0]) / max(times[-1] - times[0], 1e-9) * _BLOCKS).astype(int), _BLOCKS - 1)
-    sigmas = np.full(5, np.inf)
+    sigmas = np.full(len(x), np.inf)
     if len(np.unique(tracks)) >= _FEWEST_TRACKS:
-        sigmas = _jackknifed(lambda use: solve(use, x)[0], blocks, _by_landmark(ids))
-    scale, yaw, bx, by, late = x.tolist()
+        sigmas = np.hypot(_jackknifed(lambda use: solve(use, x)[0], blocks, _by_landmark(ids)), by_priors)
+    scale, yaw, bx, by, late, turn = x.tolist()
     if abs(late) >= MOST_LAG_S or abs(scale) > _MOST_LOG_SCALE:  # it ran to where nothing tells
-        sigmas = np.full(5, np.inf)
+        sigmas = np.full(len(x), np.inf)
         late, scale = min(max(late, -MOST_LAG_S), MOST_LAG_S), min(max(scale, -_MOST_LOG_SCALE), _MOST_LOG_SCALE)
     height = _wander(up_of(seen.points[keep][::every], name), tracks) if seen.spatial else 0.0
     return Mounting(
@@ -246,6 +261,7 @@ def _refined(
         Figure(bx, float(sigmas[2])),
         Figure(by, float(sigmas[3])),
         Figure(late, float(sigmas[4])),
+        Figure(1.0 + turn, float(sigmas[5])),
         math.hypot(typical, height),
         pairs,
     )
@@ -298,7 +314,7 @@ def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, place
 def _start(m: Mounting) -> FloatArray:
     """Start of `_OnMap.solve`."""
     place = np.clip([m.x.value, m.y.value], -1.0, 1.0)
-    return np.array([0.0, 0.0, m.yaw.value, *place, m.late_s.value + _NUDGE_S])
+    return np.array([0.0, 0.0, m.yaw.value, *place, m.late_s.value + _NUDGE_S, m.turns.value - 1.0 + _NUDGE_S])
 
 
 def jackknife(left_out: FloatArray) -> FloatArray:
@@ -342,16 +358,24 @@ class _Places:
     SIGMA = 0.03  # of a range over its length, and of a bearing [rad]
     PLACE_M = 0.3  # prior of the sensor's place: it sits on the robot
 
-    def __init__(self, path: Path, times: FloatArray, z: ComplexArray, tracks: IntArray) -> None:
+    def __init__(
+        self, path: Path, times: FloatArray, z: ComplexArray, tracks: IntArray, turn_sigma: float = TURN
+    ) -> None:
+        self._turn_sigma = turn_sigma
         _, self._tracks = np.unique(tracks, return_inverse=True)
         self._path, self._times, self._z = path, times, z
+        self._turned = (0.0, path)
         self._counts = np.bincount(self._tracks)
+        # sightings of one landmark within a second count as one; to the fit they are many
+        self._repeated = len(times) / len(np.unique(np.column_stack([self._tracks, times.astype(np.int64)]), axis=0))
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """``(2 n + 2,)``: along and across the line of sight, over the range, in units of `SIGMA`; and the prior."""
-        scale, yaw, bx, by, late = x.tolist()
+        """``(2 n + 3,)``: along and across the line of sight, over the range, in units of `SIGMA`; and the priors."""
+        scale, yaw, bx, by, late, turn = x.tolist()
         alpha, beta = math.exp(min(scale, 50.0)) * np.exp(1j * yaw), complex(bx, by)
-        p, r = _complex_poses(self._path, self._times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
+        if turn != self._turned[0]:
+            self._turned = (turn, self._path.turned(1.0 + turn))
+        p, r = _complex_poses(self._turned[1], self._times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
         q = p + r * (alpha * self._z + beta)
         real, imaginary = (np.bincount(self._tracks, part) / self._counts for part in (q.real, q.imag))
         place = (real + 1j * imaginary)[self._tracks]
@@ -359,7 +383,16 @@ class _Places:
         ratio = ((place - p) / r - beta) / (alpha * self._z)
         off = (ratio - 1.0) / self.SIGMA
         off = np.where(np.isfinite(off), off, 1e3)
-        return np.concatenate([off.real, off.imag, [bx / self.PLACE_M, by / self.PLACE_M]])
+        prior = self._repeated * np.square([bx / self.PLACE_M, by / self.PLACE_M, turn / self._turn_sigma])
+        # a prior is no outlier: such that the robust loss of it is its square
+        steep = np.sqrt(np.expm1(np.minimum(prior, _STEEPEST))) * np.maximum(prior / _STEEPEST, 1.0)
+        return np.concatenate([off.real, off.imag, steep])
+
+    def by_priors(self, jacobian: FloatArray) -> FloatArray:
+        """Standard deviations ``(6,)`` of the unknowns by what the priors may be off by, at a fit's Jacobian."""
+        covariance = np.linalg.pinv(jacobian.T @ jacobian)
+        means = self._repeated * covariance[:, [2, 3, 5]] / np.array([self.PLACE_M, self.PLACE_M, self._turn_sigma])
+        return np.asarray(np.linalg.norm(means, axis=1))
 
     def misfit(self, x: FloatArray) -> float:
         """Robust standard deviation of a landmark's place in the sensor's plane [m]."""
@@ -705,6 +738,7 @@ class Calibration:
         x: place of the sensor in the base frame [m].
         y: likewise.
         late_s: how much later its stamps are than the wheels'.
+        turns: the robot's turn over the wheels'.
         too_long_m: reported less true range at the median distance, which is known better than scale and bias.
         distance_m: that distance.
     """
@@ -715,6 +749,7 @@ class Calibration:
     x: Figure
     y: Figure
     late_s: Figure
+    turns: Figure
     too_long_m: Figure
     distance_m: float
 
@@ -748,8 +783,8 @@ _LONGEST_CORRELATION_S = 2.0
 class _OnMap:
     """Residuals of sightings of known landmarks, each window of the wheels' path laid on the map by itself."""
 
-    # sigmas of log scale, bias [m], yaw [rad], place [m, m] and lag [s]: what a careless installation is off by
-    PRIOR = np.array([0.05, 0.1, 0.2, _Places.PLACE_M, _Places.PLACE_M, 0.2])
+    # sigmas of log scale, bias [m], yaw [rad], place [m, m], lag [s] and turn: what a careless installation is off by
+    PRIOR = np.array([0.05, 0.1, 0.2, _Places.PLACE_M, _Places.PLACE_M, 0.2, TURN])
 
     def __init__(self, path: Path, seen: Sightings, z: ComplexArray, places: dict[int, FloatArray]) -> None:
         known = np.array([int(i) in places for i in seen.ids])
@@ -776,9 +811,9 @@ class _OnMap:
 
     def errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray, ComplexArray]:
         """Range [m] and bearing [rad] reported less predicted ``(n,)``, and the latter's direction on the map."""
-        scale, bias, yaw, bx, by, late = x.tolist()
+        scale, bias, yaw, bx, by, late, turn = x.tolist()
         r, bearing = np.abs(self.z), np.angle(self.z)
-        p, turned = _complex_poses(self._path, self.times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
+        p, turned = _complex_poses(self._path.turned(1.0 + turn), self.times - min(max(late, -MOST_LAG_S), MOST_LAG_S))
         seen = math.exp(np.clip(scale, -3.0, 3.0)) * (r - bias) * np.exp(1j * (bearing + yaw))
         q = p + turned * (seen + complex(bx, by))
         weights = 1.0 / (self.sigma_m**2 + (self.sigma_rad * r) ** 2)
@@ -841,15 +876,13 @@ def fit_on_map(
     on_map = _OnMap(path, seen, planar(seen.points, "body"), places)
     if len(on_map) < _FEWEST_ON_MAP or on_map.window.max() < 2:
         return None
-    x = np.array([0.0, 0.0, mounting.yaw.value, mounting.x.value, mounting.y.value, mounting.late_s.value])
-    x[3:5] = np.clip(x[3:5], -1.0, 1.0)
-    x = on_map.adapted(x)
+    x = on_map.adapted(_start(mounting))
     blocks = (on_map.window * _BLOCKS) // (int(on_map.window.max()) + 1)
     typical = float(np.median(np.abs(on_map.z)))
 
     def values(x: FloatArray) -> FloatArray:
         scale = math.exp(x[0])
-        return np.array([scale, *x[1:], typical - scale * (typical - x[1])])
+        return np.array([scale, *x[1:6], 1.0 + x[6], typical - scale * (typical - x[1])])
 
     def sigmas(groups: IntArray) -> FloatArray:
         return _jackknifed(lambda use: values(on_map.take(use).solve(x)), groups)
@@ -860,10 +893,10 @@ def fit_on_map(
     s = np.maximum(by_time, sigmas(_by_landmark(on_map.ids)))
     # of the one figure that every landmark tells by itself, their errors are known: they average out
     s[-1] = math.hypot(by_time[-1], (noise.map_m or 0.0) / math.sqrt(len(np.unique(on_map.ids))))
-    scale, bias, yaw, at_x, at_y, late, too_long = (
+    scale, bias, yaw, at_x, at_y, late, turns, too_long = (
         Figure(float(v), float(sigma)) for v, sigma in zip(values(x), s, strict=True)
     )
-    return Calibration(scale, bias, yaw, at_x, at_y, late, too_long, typical), noise
+    return Calibration(scale, bias, yaw, at_x, at_y, late, turns, too_long, typical), noise
 
 
 def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray) -> Noise:
@@ -891,7 +924,7 @@ def track_noise(path: Path, seen: Sightings, m: Mounting) -> Noise:
     keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
     times, ids, z = seen.times[keep], seen.ids[keep], z[keep]
     part = _Places(path, times, z, _tracks(times, ids))
-    x = np.array([math.log(max(m.scale.value, 1e-9)), m.yaw.value, m.x.value, m.y.value, m.late_s.value])
+    x = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
     n = len(z)
     off = part.residuals(x)[: 2 * n] * part.SIGMA
     along, across = off[:n] * np.abs(z) * m.scale.value, off[n:]
