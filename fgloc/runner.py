@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
@@ -174,6 +174,7 @@ def run(
         *note("clock.back", _left_out(len(all_estimates) - len(estimates))),
         *of_constants,
         *sane.findings,
+        *_meaningless(outcome.roles, parts, estimates),
     ]
     estimates = sane.simpler or estimates
     return RunResult(
@@ -198,6 +199,19 @@ def run(
         odometry=sane.odometry,
         wall_s=time.perf_counter() - began,
     )
+
+
+def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    """Findings of a run whose figures mean nothing: of one pose, or of positions that nothing measures."""
+    if len(estimates) < 2:
+        yield Finding("run.short", "The recording gives a single pose: there is no trajectory.", Severity.ERROR)
+    elif not parts.sensors and {"odometry", "joints", "command", "image", "sightings"}.isdisjoint(roles):
+        yield Finding(
+            "motion.unmeasured",
+            "Nothing in the recording measures how far the robot goes (no odometry, joint states or commands, and no "
+            "landmarks): its positions mean nothing, only its turn is measured. Record the robot's odometry too.",
+            Severity.ERROR,
+        )
 
 
 def _contradiction(parts: Assembly) -> Contradiction | None:

@@ -16,7 +16,7 @@ from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.runner import run
-from fgloc.types import Estimate, Mode, MotionMeasurement, Step
+from fgloc.types import Estimate, Mode, MotionMeasurement, Severity, Step
 from fgloc_datasets.bag import BagWriter
 
 SECOND = 1_000_000_000
@@ -222,6 +222,8 @@ def bag(folder, n=300, topics=("odometry", "sightings", "truth"), moving=True, h
             if "odometry" in topics:
                 covs = (np.eye(6) * 1e-3, np.eye(6) * 1e-3)
                 out.odometry("/odom", stamp, pose, (speed, turn), stamp, covs)
+            if "imu" in topics:
+                out.imu("/imu", stamp, (0.0, 0.0, turn), (0.0, 0.0, 9.81), stamp)
             if "truth" in topics:
                 quaternion = (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
                 out.truth("/truth", stamp, (x, y, 0.0), quaternion, received_ns=stamp)
@@ -314,6 +316,24 @@ def test_bad_input_ends_with_a_sentence_or_with_poses_that_mean_something(tmp_pa
     seconds = asked["n"] / 10.0
     assert np.hypot(*poses[:, :2].T).max() < (0.1 if asked.get("moving") is False else 0.3 * seconds + 0.5)
     compute_metrics(result, config)
+
+
+@pytest.mark.parametrize("mode", ["batch", "online"])
+@pytest.mark.parametrize(
+    ("asked", "code"),
+    [({"n": 1, "topics": ("odometry",)}, "run.short"), ({"n": 100, "topics": ("imu",)}, "motion.unmeasured")],
+    ids=["one pose", "imu"],
+)
+def test_figures_that_mean_nothing_are_an_error(tmp_path, mode, asked, code):
+    result = run(bag(tmp_path, **asked), None, Config(), mode)
+    assert result.findings[0].code == code
+    assert result.findings[0].severity is Severity.ERROR
+
+
+@pytest.mark.parametrize("topics", [("imu", "sightings"), ("imu", "odometry")])
+def test_an_imu_beside_a_sensor_of_position_or_way_is_enough(tmp_path, topics):
+    result = run(bag(tmp_path, n=100, topics=topics), None, Config(), "online")
+    assert "motion.unmeasured" not in [finding.code for finding in result.findings]
 
 
 def test_twenty_hours_at_a_low_rate(tmp_path):
