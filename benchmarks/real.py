@@ -24,8 +24,8 @@ from fgloc.recording.storage import find_beside
 from fgloc.runner import RunResult, run
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map
+from fgloc.sensors.measurements import PointMeasurement
 from fgloc.sensors.range_bearing import RangeBearingEvent
-from fgloc.types import PointMeasurement
 from fgloc_datasets import mrclam, pioneer, turtlebot3
 
 _ROOT = Path(__file__).resolve().parent.parent

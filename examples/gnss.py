@@ -25,7 +25,8 @@ from pydantic import Field
 from fgloc.config import GateConfig, Section
 from fgloc.sensors.base import Context, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
-from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
+from fgloc.sensors.measurements import PoseMeasurement
+from fgloc.types import Event, FloatArray, SensorEvent
 
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)

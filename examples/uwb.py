@@ -30,7 +30,8 @@ from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import Context, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
-from fgloc.types import Event, FloatArray, PoseMeasurement, SensorEvent
+from fgloc.sensors.measurements import PoseMeasurement
+from fgloc.types import Event, FloatArray, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")
 _LEAST_ANCHORS = 3  # that tell a place in the plane

@@ -42,15 +42,8 @@ if TYPE_CHECKING:
     from fgloc.runner import RunResult, run
     from fgloc.sensors.base import Context, Sensor, Stream
     from fgloc.sensors.maps import load_map
-    from fgloc.types import (
-        Decision,
-        Estimate,
-        LandmarkMap,
-        Mode,
-        PoseMeasurement,
-        SensorEvent,
-        Trajectory,
-    )
+    from fgloc.sensors.measurements import PoseMeasurement
+from fgloc.types import Decision, Estimate, LandmarkMap, Mode, SensorEvent, Trajectory
 
 __all__ = [
     "CameraError",
@@ -101,7 +94,7 @@ _IMPORTED_LATE = {
     "Estimate": "fgloc.types",
     "LandmarkMap": "fgloc.types",
     "Mode": "fgloc.types",
-    "PoseMeasurement": "fgloc.types",
+    "PoseMeasurement": "fgloc.sensors.measurements",
     "RunResult": "fgloc.runner",
     "SensorEvent": "fgloc.types",
     "Trajectory": "fgloc.types",

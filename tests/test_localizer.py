@@ -31,8 +31,9 @@ from fgloc.estimation.pose_fit import fit_pose
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.measurements import PixelMeasurement
 from fgloc.sensors.settings import MotionConfig
-from fgloc.types import LandmarkMap, Mode, PixelMeasurement
+from fgloc.types import LandmarkMap, Mode
 
 MAPS = {"corners": room, "beacons": beacons}
 

@@ -31,8 +31,9 @@ from fgloc.replay import Progress, smooth_run
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors
 from fgloc.sensors.markers.detector import detect_stream, fitting_dictionary
+from fgloc.sensors.measurements import PixelMeasurement, corners_of
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, PixelMeasurement, RawEvent, SightingsEvent
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, RawEvent, SightingsEvent
 
 # --- Drives, replayed without a map -----------------------------------------------------------------------------------
 
@@ -76,7 +77,7 @@ class Drive:
             found = []
             if frame.step is not None:
                 wheels.measure(frame.step)
-                found = [m for m in moved.measure(frame.step, offset_s) if isinstance(m, PixelMeasurement)]
+                found = corners_of(moved.measure(frame.step, offset_s))
             seen.append([replace(m, sigma_px=m.sigma_px * _coarseness(m.corners_px)) for m in found])
         return seen
 
@@ -581,9 +582,8 @@ class SurveyGraph:
         """Markers that fit better the other way round; of those that fit both ways about alike, note the ids."""
         seen: dict[int, list[tuple[PixelMeasurement, FloatArray]]] = {}
         for frame, pose in zip(solver.frames, self._poses, strict=True):
-            for s in (*frame.sightings, *frame.rejected):
-                if isinstance(s.measurement, PixelMeasurement):
-                    seen.setdefault(s.measurement.landmark_id, []).append((s.measurement, pose))
+            for m in corners_of(s.measurement for s in (*frame.sightings, *frame.rejected)):
+                seen.setdefault(m.landmark_id, []).append((m, pose))
         better = {}
         self.undecided = set()
         for i, views in seen.items():

@@ -26,6 +26,7 @@ from fgloc.frames import rotation_of
 from fgloc.sensors.cameras import up_in_base
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.gyro import Attitude, Gyro
+from fgloc.sensors.measurements import corners_of
 from fgloc.sensors.wheels.motion import WheelMotion, commanded_to_move, is_standing
 from fgloc.types import (
     FloatArray,
@@ -33,7 +34,6 @@ from fgloc.types import (
     LandmarkMap,
     MotionMeasurement,
     MotionReadings,
-    PixelMeasurement,
     Step,
     by_class,
 )
@@ -277,7 +277,7 @@ class FloorWatch:
         for event in step.sightings:
             if event.stamp_ns < self._looked_ns + _EVERY_NS or not event.in_pixels:
                 continue
-            seen = [m for m in self._landmarks.measure(event) if isinstance(m, PixelMeasurement)]
+            seen = corners_of(self._landmarks.measure(event))
             known = [(m.corners_px, landmark_map.landmarks[m.landmark_id]) for m in seen]
             up = up_in_base(seen[0].camera, known) if len(known) > 1 else None
             if up is not None:

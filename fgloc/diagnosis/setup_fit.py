@@ -25,6 +25,7 @@ from fgloc.recording.reader import Recording
 from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
 from fgloc.sensors.markers.detector import Detector
 from fgloc.sensors.markers.images import ImageError
+from fgloc.sensors.measurements import PixelMeasurement
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
@@ -33,7 +34,6 @@ from fgloc.types import (
     IntArray,
     Landmark,
     LandmarkMap,
-    PixelMeasurement,
     RawEvent,
     SightingsEvent,
     Step,

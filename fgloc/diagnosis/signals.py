@@ -17,18 +17,15 @@ from fgloc.config import Config, Role
 from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
-from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Event,
     FloatArray,
-    FrameMeasurement,
     InertialEvent,
     IntArray,
     LandmarkMap,
     MotionEvent,
-    PixelMeasurement,
     SightingsEvent,
     Step,
     TruthEvent,
@@ -334,32 +331,13 @@ class SightingCollector:
         if event.in_pixels and self._map is None and self._config.markers.default_size_m is None:
             return
         for m in self._sensor.measure(event):
-            if isinstance(m, PixelMeasurement):
-                assert self._map is not None
-                landmark = self._map.landmarks[m.landmark_id]
-                found = marker_pose_candidates(m.camera, m.corners_px, landmark.size_m)
-                if not found:
-                    continue
-                T = found[0][0]
-                point = T[:3, 3]
-                sigma_rad = m.sigma_px / float(m.camera.K[0, 0])
-                side_px = float(np.linalg.norm(m.corners_px - np.roll(m.corners_px, 1, axis=0), axis=1).max())
-                sigma_m = float(np.linalg.norm(point)) * m.sigma_px / side_px
-            elif isinstance(m, FrameMeasurement):
-                x, y = m.pose[:2]
-                point = self._in_sensor(x, y)
-                sigma_m = math.sqrt(max(m.cov[0, 0], m.cov[1, 1]))
-                sigma_rad = sigma_m / max(math.hypot(x, y), 0.1)
-            else:
-                point = self._in_sensor(m.range_m * math.cos(m.bearing_rad), m.range_m * math.sin(m.bearing_rad))
-                sigma_rad, sigma_m = np.sqrt(np.diag(m.cov)).tolist()
+            landmark = None if self._map is None else self._map.landmarks[m.landmark_id]
+            found = m.relative(landmark, self._place)
+            if found is None:
+                continue
+            point, sigma_rad, sigma_m = found
             distance = float(np.linalg.norm(point))
             floor_m = _FLOOR_M + _FLOOR_SHARE * distance
             yield RelativeSighting(
                 at_s, m.landmark_id, point, math.hypot(sigma_rad, _FLOOR_RAD), math.hypot(sigma_m, floor_m)
             )
-
-    def _in_sensor(self, x: float, y: float) -> FloatArray:
-        """A place given in the base's plane, taken to be at the sensor's own height."""
-        arm = np.array([x - self._place[0, 3], y - self._place[1, 3], 0.0])
-        return np.asarray(self._place[:3, :3].T @ arm)

@@ -29,8 +29,9 @@ from fgloc.estimation.pose_fit import MAX_SIGMA
 from fgloc.graph.joint import FAR_M2, LINEAR_M, LINEAR_RAD, MOST_JOINT, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import repetition
+from fgloc.sensors.measurements import LandmarkMeasurement, PointMeasurement, points_of
 from fgloc.stats import GATE, chi2_bound
-from fgloc.types import FloatArray, LandmarkMap, LandmarkMeasurement, MotionMeasurement, PointMeasurement
+from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement
 
 # --- Geometry of ranges and bearings ----------------------------------------------------------------------------------
 
@@ -216,7 +217,7 @@ class GaussianSum:
         """
         if motions and len(self.poses):
             self._predict(*fuse(motions))
-        beacons = [m for m in sightings if isinstance(m, PointMeasurement) and m.landmark_id in self._index]
+        beacons = [m for m in points_of(sightings) if m.landmark_id in self._index]
         if beacons and tracked is not None and not self.has_seen:
             self.poses, self.covs, self._log_prior = tracked.pose[None].copy(), tracked.cov[None].copy(), np.zeros(1)
             self._in_place, self._log_elsewhere = np.zeros((1, 0)), math.log(CARRIED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -282,19 +282,19 @@ class InnovationBias:
         on; one of half a sigma, as a survey leaves it, passes however long it lasts.
         """
         self._probability, self._window_ns = probability, round(window_s * 1e9)
-        self._windows: dict[tuple[str, int], _Window] = {}
+        self._windows: dict[Hashable, _Window] = {}
 
     def forget(self) -> None:
         """The pose was set anew."""
         self._windows.clear()
 
-    def is_biased(self, key: tuple[str, int], stamp_ns: int, one: Linearized, pose_cov: FloatArray) -> bool:
+    def is_biased(self, key: Hashable, stamp_ns: int, one: Linearized, pose_cov: FloatArray) -> bool:
         """Add an innovation that passed the gate; whether the newest ones together do not.
 
         Their own noise is white. What is not known of the pose is taken to be the same in all of them.
 
         Args:
-            key: of the source and its target.
+            key: `LandmarkMeasurement.bias_key`.
             stamp_ns: of the measurement; asked again of the same one, it counts once.
             one: the measurement at the predicted pose.
             pose_cov: ``(3, 3)`` of the prediction.

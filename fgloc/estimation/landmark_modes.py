@@ -26,8 +26,9 @@ from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
 from fgloc.graph.observation import Linearized, Observations
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import chi2_bound, evidence_bound
-from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
+from fgloc.types import FloatArray, MotionMeasurement
 
 # --- How a displacement explains a sighting ---------------------------------------------------------------------------
 

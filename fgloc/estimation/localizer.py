@@ -20,17 +20,8 @@ from fgloc.graph.ground import spatial
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.instrumentation import Stopwatch
 from fgloc.sensors.equipment import MotionCompensation, MotionSensors, PoseSensors
-from fgloc.types import (
-    Decision,
-    Estimate,
-    FloatArray,
-    Ground,
-    LandmarkMap,
-    LandmarkMeasurement,
-    Mode,
-    MotionReadings,
-    Step,
-)
+from fgloc.sensors.measurements import LandmarkMeasurement
+from fgloc.types import Decision, Estimate, FloatArray, Ground, LandmarkMap, Mode, MotionReadings, Step
 
 # --- Record -----------------------------------------------------------------------------------------------------------
 

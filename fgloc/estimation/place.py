@@ -11,34 +11,22 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.estimation.beacons import RING, Displacement, GaussianSum
+from fgloc.estimation.beacons import Displacement, GaussianSum
 from fgloc.estimation.pose_fit import WHOLE_SHARE, Fit, PoseConsensus, PoseFit, apart, fit_pose
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import FAR_M2, MOST_JOINT, MOST_STEPS, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR
-from fgloc.sensors.cameras import planar_base_candidates
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import ROUNDING
-from fgloc.types import (
-    FloatArray,
-    FrameMeasurement,
-    LandmarkMap,
-    LandmarkMeasurement,
-    MotionMeasurement,
-    MotionReadings,
-    PixelMeasurement,
-    PointMeasurement,
-    PoseMeasurement,
-    Step,
-)
+from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement, MotionReadings, Step
 
 # --- Candidates, rough fits, a consensus ------------------------------------------------------------------------------
 
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
-_POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried ...
-_YAWS = np.linspace(-np.pi, np.pi, RING, endpoint=False)  # ... with these yaws
+_POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried
 
 
 class PlaceSearch:
@@ -109,18 +97,11 @@ class PlaceSearch:
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:
         if self._map is None:
             return
-        by_pose = [m for m in sightings if isinstance(m, PoseMeasurement)]
-        for seed in by_pose[:: -(-len(by_pose) // _POSE_SEEDS) or 1]:
-            yield from (np.array([*place, yaw]) for place in seed.places() for yaw in _YAWS)
-        sightings = [m for m in sightings if not isinstance(m, PoseMeasurement)]
-        whole = [m for m in sightings if not isinstance(m, PointMeasurement)]  # that give a place each
+        others = [m for m in sightings if not m.of_landmark]
+        whole = [m for m in sightings if m.gives_pose]
         seeds = whole[:_KNOWN_SEEDS] if known else _spread(whole, _MAX_SEEDS)
-        for m in seeds:
-            landmark = self._map.landmarks[m.landmark_id]
-            if isinstance(m, PixelMeasurement):
-                yield from (pose for pose, _ in planar_base_candidates(m.camera, m.corners_px, landmark))
-            elif isinstance(m, FrameMeasurement):
-                yield se2.compose(landmark.planar, se2.inverse(m.pose))
+        for m in (*others[:: -(-len(others) // _POSE_SEEDS) or 1], *seeds):
+            yield from m.poses(self._map.landmarks)
 
 
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:
@@ -245,7 +226,7 @@ class GlobalSearch:
         place = self.hypotheses.confirmed(tracked)
         if place is not None:
             return self._start(place, gathered=True, displaced=self.hypotheses.displaced())
-        if self.hypotheses.has_seen and all(isinstance(m, PointMeasurement) for c in self._steps for m in c.sightings):
+        if self.hypotheses.has_seen and all(m.is_point for c in self._steps for m in c.sightings):
             return None
         if sightings and self._since_ns is None:
             self._since_ns = step.stamp_ns

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_STEPS
-from fgloc.graph.observation import CornerBatch, PlanarBatch, PoseBatch, Stacked
+from fgloc.graph.observation import Batch, Stacked
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import ROUNDING, chi2_bound
-from fgloc.types import FloatArray, IntArray, LandmarkMeasurement
+from fgloc.types import FloatArray, IntArray
 
 # --- The fit ----------------------------------------------------------------------------------------------------------
 
@@ -62,7 +63,7 @@ class PoseFit:
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
-        self._k = np.array([cauchy_k(m) for m in sightings])
+        self._k = np.array([m.cauchy_k for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray) -> Fit | None:
@@ -95,7 +96,7 @@ class PoseFit:
             dofs[rows] = d
         return costs, dofs
 
-    def _whiten(self, batch: CornerBatch | PlanarBatch | PoseBatch, stack: Stacked) -> FloatArray:
+    def _whiten(self, batch: Batch, stack: Stacked) -> FloatArray:
         """What is not known of the installation, of the stamps and of the motion in between counts as noise."""
         n, d = stack.residual.shape
         cov = np.broadcast_to(np.eye(d), (n, d, d))
@@ -120,11 +121,6 @@ class PoseFit:
             W = self._whitening[i]
             r = np.einsum("nij,nj->ni", W, stack.residual)
             yield r, W @ stack.J, stack.behind, np.array(batch.rows), self._k[rows]
-
-
-def cauchy_k(m: LandmarkMeasurement) -> float:
-    """Cauchy constant of a sighting in a fit, in units of its sigma."""
-    return m.cauchy_k
 
 
 def _robust_costs(square: FloatArray, dof: IntArray, k: FloatArray) -> FloatArray:

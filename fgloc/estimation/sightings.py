@@ -28,8 +28,9 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import chi2_bound
-from fgloc.types import Decision, LandmarkMeasurement, PixelMeasurement, PointMeasurement, PoseMeasurement, Step
+from fgloc.types import Decision, Step
 
 # --- Rows of a measurement in steps.csv -------------------------------------------------------------------------------
 
@@ -105,32 +106,30 @@ class Association:
     def _revise(
         self, measurements: Sequence[LandmarkMeasurement], judged: Judged, predicted: PoseWithCovariance
     ) -> tuple[Sequence[LandmarkMeasurement], Judged]:
-        """The measurements to be used and the verdict on each; registered sensors may be biased, or mean another.
+        """The measurements to be used and the verdict on each; some may be biased, or mean something else.
 
         Args:
             measurements: of one step.
             judged: what the gate makes of them.
             predicted: the pose.
         """
-        if not any(isinstance(m, PoseMeasurement) for m in measurements):
-            return measurements, judged
         taken, verdicts = list(measurements), list(judged)
         for i, (m, verdict) in enumerate(zip(measurements, judged, strict=True)):
-            if not isinstance(m, PoseMeasurement):
-                continue
             if not verdict[2] and self._config.weights.adaptive and self._is_biased(m, predicted):
                 verdicts[i] = verdict[0], verdict[1], "biased"
             if verdicts[i][2]:
                 taken[i], verdicts[i] = self._explained_otherwise(m, verdicts[i], predicted)
         return taken, verdicts
 
-    def _is_biased(self, m: PoseMeasurement, predicted: PoseWithCovariance) -> bool:
+    def _is_biased(self, m: LandmarkMeasurement, predicted: PoseWithCovariance) -> bool:
+        if m.bias_key is None:
+            return False
         (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
-        return self._bias.is_biased((m.source, m.target), m.stamp_ns, one, predicted.cov)
+        return self._bias.is_biased(m.bias_key, m.stamp_ns, one, predicted.cov)
 
     def _explained_otherwise(
-        self, m: PoseMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance
-    ) -> tuple[PoseMeasurement, tuple[float, int, str]]:
+        self, m: LandmarkMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance
+    ) -> tuple[LandmarkMeasurement, tuple[float, int, str]]:
         """The first alternative of a rejected measurement that the gate accepts; else the measurement itself.
 
         Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping": the most probable
@@ -163,13 +162,12 @@ class Association:
         rows = [i for i, d in enumerate(decisions) if d.reason]
         for i, misread in zip(rows, rejected, strict=True):
             m = misread.measurement
-            if decisions[i].reason not in ("gate", "behind_camera") or not isinstance(m, PixelMeasurement):
+            if decisions[i].reason not in ("gate", "behind_camera"):
                 continue
             fits = []
-            for other in self._factors.lookalikes(m, predicted.pose):
-                if other in seen or self.modes.excludes(other):
+            for again in self._factors.lookalikes(m, predicted.pose):
+                if again.landmark_id in seen or self.modes.excludes(again.landmark_id):
                     continue
-                again = dataclasses.replace(m, landmark_id=other)
                 sighting = self._factors.sighting(k, again, misread.cauchy_k)
                 nis, dof, reason = self._judge([again], predicted)[0]
                 if not reason:
@@ -318,11 +316,11 @@ class Association:
 
     def _share_information(self, m: LandmarkMeasurement) -> tuple[LandmarkMeasurement, float]:
         """Inflate a sighting that follows the last of its landmark within the correlation time of the errors."""
-        if isinstance(m, PixelMeasurement | PoseMeasurement):  # whose errors do not repeat
+        if not m.errors_repeat:
             return m, 1.0
         last = self._last_used_ns.get(m.landmark_id)
         scale = repetition(self._config.landmarks.repeat_s, last, m.stamp_ns)
-        return (m, 1.0) if scale == 1.0 else (dataclasses.replace(m, cov=m.cov * scale), 1.0 / scale)
+        return (m, 1.0) if scale == 1.0 else (m.scaled(scale), 1.0 / scale)
 
     @property
     def contradicting(self) -> int:
@@ -442,7 +440,7 @@ class SightingJudge:
 
     def _may_tell_place(self, m: LandmarkMeasurement) -> bool:
         """Whether the search may know of a rejected sighting: it judges by itself whether a beacon was moved."""
-        return isinstance(m, PointMeasurement) or not self.modes.excludes(m.landmark_id)
+        return m.is_point or not self.modes.excludes(m.landmark_id)
 
     def associate(
         self, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance

@@ -14,16 +14,8 @@ from fgloc.estimation.place import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
-from fgloc.types import (
-    Decision,
-    FloatArray,
-    LandmarkMap,
-    LandmarkMeasurement,
-    Mode,
-    MotionMeasurement,
-    MotionReadings,
-    Step,
-)
+from fgloc.sensors.measurements import LandmarkMeasurement
+from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, MotionMeasurement, MotionReadings, Step
 
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"

@@ -23,7 +23,7 @@ from fgloc.graph.joint import MOST_STEPS, fuse
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.noise import whitening_of
 from fgloc.stats import ROUNDING, chi2_bound
-from fgloc.types import FloatArray, FrameMeasurement, IntArray, Landmark, PointMeasurement
+from fgloc.types import FloatArray, IntArray, Landmark
 
 # --- Initial values, order of elimination, covariances ----------------------------------------------------------------
 
@@ -85,11 +85,9 @@ def values_at(
     for frame, pose in zip(frames, poses, strict=True):
         for sighting in accepted[frame.k]:
             m = sighting.measurement
-            if isinstance(m, FrameMeasurement):
-                seen.setdefault(m.landmark_id, []).append(se2.compose(pose, m.pose))
-            elif isinstance(m, PointMeasurement):
-                local = [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), 0.0]
-                seen.setdefault(m.landmark_id, []).append(se2.compose(pose, local)[:2])
+            place = m.landmark_from(pose)
+            if place is not None:
+                seen.setdefault(m.landmark_id, []).append(place)
     for landmark_id, places in seen.items():
         middle = places[int(np.argsort([p[0] for p in places])[len(places) // 2])]  # one of them: yaw has no median
         value = middle if len(middle) == 2 else gtsam.Pose2(*middle)
@@ -185,7 +183,7 @@ def estimated_landmarks(
         if m.landmark_id in landmarks:
             continue
         cov = np.asarray(marginals.marginalCovariance(key))
-        if isinstance(m, FrameMeasurement):
+        if m.variable_dof == 3:
             pose = values.atPose2(key)
             place, yaw = np.array([pose.x(), pose.y(), 0.0]), pose.theta()
             c, s = np.cos(yaw), np.sin(yaw)
@@ -366,7 +364,7 @@ class BatchSmoother:
             bounds = np.array([chi2_bound(self._probability, d) for d in rows.tolist()])
             total += 0.5 * float(np.minimum(squares, bounds).sum())
         seen = [s for frame in self.frames for s in _seen(frame)]
-        covs = [s.alone.cov for s in seen if not s.measurement.in_pixels]  # type: ignore[union-attr]
+        covs = [s.alone.cov for s in seen if s.alone.cov is not None]
         for size in {len(cov) for cov in covs}:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total

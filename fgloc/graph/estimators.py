@@ -33,13 +33,11 @@ from fgloc.graph.installation import GROUND, Installation, InstallationEstimate,
 from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.types import (
     FloatArray,
-    FrameMeasurement,
     LandmarkMap,
-    LandmarkMeasurement,
     MotionMeasurement,
-    PointMeasurement,
 )
 
 # --- What all estimators share ----------------------------------------------------------------------------------------
@@ -483,7 +481,7 @@ class IncrementalEstimator(Estimator):
     def __init__(self, config: EstimatorConfig, factors: LandmarkFactors, keep_all: bool = False) -> None:
         super().__init__(config, factors, keep_all)
         self._backend: Backend | None = None
-        self._landmarks: dict[int, FloatArray] = {}  # initial values of the variables in the graph
+        self._landmarks: set[int] = set()  # variables in the graph
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
@@ -690,17 +688,11 @@ class IncrementalEstimator(Estimator):
         if self.factors.known or m.landmark_id in self._landmarks:
             return
         key = landmark_key(m.landmark_id)
-        if isinstance(m, PointMeasurement):
-            initial = se2.compose(
-                pose, [m.range_m * np.cos(m.bearing_rad), m.range_m * np.sin(m.bearing_rad), m.bearing_rad]
-            )
-            values.insert(key, initial[:2])
-        elif isinstance(m, FrameMeasurement):
-            initial = se2.compose(pose, m.pose)
-            values.insert(key, gtsam.Pose2(*initial))
-        else:
+        initial = m.landmark_from(pose)
+        if initial is None:
             return
-        self._landmarks[m.landmark_id] = initial
+        values.insert(key, initial if len(initial) == 2 else gtsam.Pose2(*initial))
+        self._landmarks.add(m.landmark_id)
 
     def _rebuild(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
         """Build the window again from the log, without the sightings of the offending step."""

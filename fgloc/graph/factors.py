@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import is_not
 from typing import Any
 
@@ -21,16 +21,13 @@ from fgloc.frames import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
-from fgloc.graph.observation import MIN_DEPTH_M, Linearized, Observations, stacked
+from fgloc.graph.observation import Linearized, Observations, stacked
+from fgloc.sensors.measurements import FrameMeasurement, LandmarkMeasurement, PointMeasurement
 from fgloc.types import (
     FloatArray,
-    FrameMeasurement,
     Landmark,
     LandmarkMap,
-    LandmarkMeasurement,
     MotionMeasurement,
-    PixelMeasurement,
-    PointMeasurement,
 )
 
 # --- Linear factors, and the keys of the installation in them ---------------------------------------------------------
@@ -82,7 +79,6 @@ _KERNELS = {
     "dcs": gtsam.noiseModel.mEstimator.DCS.Create(1.0),
 }
 _MOST_LOOKALIKES = 10
-_LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
 
 
 def pose_key(k: int) -> int:
@@ -189,6 +185,25 @@ def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFa
     return gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), gaussian(cov))
 
 
+def point_factor(k: int, m: PointMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
+    """Sighting of a landmark that is a variable, a point."""
+    bearing, noise = gtsam.Rot2(m.bearing_rad), robust(gaussian(m.cov), cauchy_k)
+    return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
+
+
+def frame_factor(k: int, m: FrameMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
+    """Sighting of a landmark that is a variable, a pose."""
+    noise = robust(gaussian(m.cov), cauchy_k)
+    return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), gtsam.Pose2(*m.pose), noise)
+
+
+_OF_VARIABLE: Mapping[int, Callable[[int, Any, float | None], gtsam.NonlinearFactor]] = {
+    2: point_factor,
+    3: frame_factor,
+}
+"""Factor of a sighting by `LandmarkMeasurement.variable_dof`."""
+
+
 class LandmarkFactors:
     """Residuals of sightings: of a known map as residuals by pose and installation, of an unknown one as factors.
 
@@ -198,7 +213,6 @@ class LandmarkFactors:
 
     def __init__(self, landmark_map: LandmarkMap | None, installation: Installation | None = None) -> None:
         self._known: Mapping[int, Landmark] | None = None if landmark_map is None else landmark_map.landmarks
-        self._corners: dict[int, FloatArray] = {}
         self.installation = Installation({}) if installation is None else installation
         self._estimated = self.installation.prior()
         self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
@@ -253,7 +267,7 @@ class LandmarkFactors:
             return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
         if m.of_landmark and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
-        if not isinstance(m, PixelMeasurement) and (problem := covariance_problem(m.cov)):
+        if m.cov is not None and (problem := covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
@@ -286,42 +300,26 @@ class LandmarkFactors:
         cov = one.noise() + one.H @ self.estimated.cov[np.ix_(one.columns, one.columns)] @ one.H.T
         return sighting_whitening(cov)
 
-    def depth(self, m: PixelMeasurement, pose: FloatArray) -> float:
-        """Smallest depth [m] of the marker's corners in front of the camera, for the base at this pose."""
-        if self._known is None:
-            raise EstimatorError("the depth of a marker needs a known map")
-        x, y, yaw = pose
-        c, s = math.cos(yaw), math.sin(yaw)
-        corners = self._landmark_corners(self._known[m.landmark_id])
-        dx, dy = corners[:, 0] - x, corners[:, 1] - y
-        base = self._tilted(np.column_stack([c * dx + s * dy, -s * dx + c * dy, corners[:, 2]]))
-        T = m.camera.T_base_cam
-        return float(((base - T[:3, 3]) @ T[:3, 2]).min())
+    def lookalikes(self, m: LandmarkMeasurement, pose: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """The sighting as one of another marker of the same size, seen from this pose about where this one was seen.
 
-    def lookalikes(self, m: PixelMeasurement, pose: FloatArray) -> list[int]:
-        """Other markers of the same size that the base at this pose sees about where this one was seen.
-
-        None of them where they hang so densely that the place does not tell.
+        None where they hang so densely that the place does not tell, and of what is not told apart by a code.
         """
         if self._known is None:
             raise EstimatorError("what else a marker may be needs a known map")
+        if not m.in_pixels:
+            return ()
         size = self._known[m.landmark_id].size_m
         others = [x for i, x in self._known.items() if i != m.landmark_id and x.size_m == size]
         x, y, yaw = pose
         c, s = math.cos(yaw), math.sin(yaw)
-        T, K = m.camera.T_base_cam, m.camera.K
-        u, v = m.corners_px.mean(axis=0)
-        found = []
+        places = []
         for other in others:
             dx, dy = other.position[0] - x, other.position[1] - y
             base = self._tilted(np.array([[c * dx + s * dy, -s * dx + c * dy, other.position[2]]]))[0]
-            right, down, depth = T[:3, :3].T @ (base - T[:3, 3])
-            if depth < MIN_DEPTH_M:
-                continue
-            across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
-            if across < _LOOKALIKE:
-                found.append(other.landmark_id)
-        return found if len(found) <= _MOST_LOOKALIKES else []
+            places.append((other.landmark_id, base))
+        found = m.misread(places)
+        return found if len(found) <= _MOST_LOOKALIKES else ()
 
     def _tilted(self, level: FloatArray) -> FloatArray:
         """Points ``(m, 3)`` in the base's axes, from those of a level base on the floor."""
@@ -331,17 +329,6 @@ class LandmarkFactors:
         return np.asarray((level - [0.0, 0.0, z]) @ rotations(np.array([angles]))[0])
 
     def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-        if isinstance(m, PointMeasurement):
-            noise = robust(gaussian(m.cov), cauchy_k)
-            bearing = gtsam.Rot2(m.bearing_rad)
-            return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
-        if isinstance(m, FrameMeasurement):
-            noise = robust(gaussian(m.cov), cauchy_k)
-            measured = gtsam.Pose2(*m.pose)
-            return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), measured, noise)
-        raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
-
-    def _landmark_corners(self, landmark: Landmark) -> FloatArray:
-        if landmark.landmark_id not in self._corners:
-            self._corners[landmark.landmark_id] = landmark.corners()
-        return self._corners[landmark.landmark_id]
+        if m.variable_dof not in _OF_VARIABLE:
+            raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
+        return _OF_VARIABLE[m.variable_dof](k, m, cauchy_k)

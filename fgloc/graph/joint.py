@@ -19,8 +19,9 @@ from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import sighting_whitening
 from fgloc.graph.observation import Linearized, stacked
+from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import ROUNDING
-from fgloc.types import FloatArray, LandmarkMeasurement, MotionMeasurement
+from fgloc.types import FloatArray, MotionMeasurement
 
 FAR_M2 = 1e2  # m²: variance of a position that nothing tells
 # Sightings of one step that are weighed together, of which the work grows with the square: more than an image shows

@@ -10,7 +10,8 @@ import numpy as np
 
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.noise import NoiseBudget
-from fgloc.types import FloatArray, LandmarkMeasurement, Mode, MotionMeasurement, MotionReadings, Step
+from fgloc.sensors.measurements import LandmarkMeasurement
+from fgloc.types import FloatArray, Mode, MotionMeasurement, MotionReadings, Step
 
 
 @dataclass(slots=True, eq=False)

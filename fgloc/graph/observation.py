@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +12,16 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.frames import rotations
 from fgloc.graph.installation import Installation
-from fgloc.types import (
-    FloatArray,
+from fgloc.sensors.measurements import (
+    MIN_DEPTH_M,
     FrameMeasurement,
-    IntArray,
-    Landmark,
     LandmarkMeasurement,
+    Model,
     PixelMeasurement,
     PointMeasurement,
     PoseMeasurement,
 )
+from fgloc.types import FloatArray, IntArray, Landmark
 
 # --- Residuals and Jacobians ------------------------------------------------------------------------------------------
 
@@ -70,6 +71,30 @@ class Stacked:
     behind: NDArray[np.bool_]
 
 
+class Batch(Protocol):
+    """Measurements of one `Model`, prepared for being evaluated at poses and installations.
+
+    Attributes:
+        rows: length of the residual of each.
+        spatial: whether poses on uneven ground are ``(m, 6)``, with height, roll and pitch; else ``(m, 3)``.
+    """
+
+    rows: list[int]
+    spatial: ClassVar[bool]
+
+    def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
+        """Residuals and Jacobians of all, each at its own pose ``(m, 3)``; without those by the installation faster."""
+        ...
+
+    def shared_all(self, stack: Stacked) -> FloatArray | None:
+        """`Linearized.shared` of all ``(m, d, s)``, with columns of 0 where one has fewer; None: only one by one."""
+        ...
+
+    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+        """`Linearized.shared` of one."""
+        ...
+
+
 def landmark_block(installation: Installation, landmark_id: int, rows: int) -> int:
     """Where the state of a landmark begins, if it has as many rows; else -1."""
     first, count = installation.landmarks.get(landmark_id, (-1, 0))
@@ -95,7 +120,6 @@ def stacked(lines: Sequence[Linearized], n: int) -> tuple[FloatArray, FloatArray
 
 _BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
 _MOST_BLURRED = 2.0
-MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 
 
 class CornerBatch:
@@ -103,6 +127,8 @@ class CornerBatch:
 
     Source: pinhole camera with the distortion of Brown 1966 as OpenCV has it; perturbations on the right.
     """
+
+    spatial: ClassVar[bool] = True
 
     def __init__(
         self, seen: Sequence[PixelMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
@@ -371,28 +397,24 @@ _MOST_LOG_SCALE = 3.0  # of ranges: an estimate that diverges goes on to be refu
 class PlanarBatch:
     """Ranges with bearings, as points in the base frame, and marker poses."""
 
+    spatial: ClassVar[bool] = False
+
     def __init__(
         self,
         seen: Sequence[PointMeasurement | FrameMeasurement],
         landmarks: Mapping[int, Landmark],
         installation: Installation,
     ) -> None:
-        poses = [m.pose if isinstance(m, FrameMeasurement) else None for m in seen]
-        self.rows = [2 if pose is None else 3 for pose in poses]
-        self._whole = np.array([pose is not None for pose in poses])
-        self._yaw = np.array([0.0 if pose is None else pose[2] for pose in poses])
+        self.rows = [m.dof for m in seen]
+        self._whole = np.array([d == 3 for d in self.rows])
+        self._yaw = np.zeros(len(seen))
         self._place = np.array([landmarks[m.landmark_id].planar for m in seen])
         self._point = np.zeros((len(seen), 2))
         self._whitening = np.zeros((len(seen), 3, 3))  # of the residual in the base frame
         for i, m in enumerate(seen):
-            if isinstance(m, FrameMeasurement):
-                self._point[i] = m.pose[:2]
-                c, s = np.cos(m.pose[2]), np.sin(m.pose[2])
-                turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-                self._whitening[i] = np.linalg.inv(np.linalg.cholesky(m.cov)) @ turn
-            else:
-                self._point[i], cov = cartesian(m)
-                self._whitening[i, :2, :2] = np.linalg.inv(np.linalg.cholesky(cov))
+            place, whitening = m.in_base()
+            self._point[i], self._yaw[i] = place[:2], place[2] if m.dof == 3 else 0.0
+            self._whitening[i, : m.dof, : m.dof] = whitening
         self._twist = np.array([m.twist for m in seen])
         self._offset = np.array([m.offset_s for m in seen])
         first = installation.blocks.get("sightings")
@@ -450,27 +472,17 @@ class PlanarBatch:
         return np.zeros((len(J), 0))
 
 
-def cartesian(m: PointMeasurement) -> tuple[FloatArray, FloatArray]:
-    """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
-
-    The frame turned by the bearing has range along its first axis and range times bearing across; first order in the
-    bearing's sigma, which is exact enough below 0.2 rad. The true range, which may be off by its sigma, makes the
-    sigma across: it does not vanish right at a landmark.
-    """
-    c, s = np.cos(m.bearing_rad), np.sin(m.bearing_rad)
-    r, lever = m.range_m, np.sqrt(m.range_m**2 + m.cov[1, 1])
-    J = np.array([[-lever * s, c], [lever * c, s]])  # columns: bearing, range
-    cov = J @ m.cov @ J.T
-    return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
-
-
 # --- Measurements of registered sensors -------------------------------------------------------------------------------
 
 
 class PoseBatch:
     """Measurements of any dimensions; see `PoseMeasurement`."""
 
-    def __init__(self, seen: Sequence[PoseMeasurement]) -> None:
+    spatial: ClassVar[bool] = False
+
+    def __init__(
+        self, seen: Sequence[PoseMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
+    ) -> None:
         self._seen = seen
         self.rows = [len(m.cov) for m in seen]
         self._whitening = [np.asarray(np.linalg.inv(np.linalg.cholesky(m.cov))) for m in seen]
@@ -499,6 +511,12 @@ class PoseBatch:
 
 # --- Sightings of any kind --------------------------------------------------------------------------------------------
 
+_BATCHES: Mapping[Model, Callable[[Sequence[Any], Mapping[int, Landmark], Installation], Batch]] = {
+    Model.CORNERS: CornerBatch,
+    Model.PLANAR: PlanarBatch,
+    Model.POSE: PoseBatch,
+}
+
 
 class Observations:
     """Sightings prepared for being linearized, once or often."""
@@ -514,18 +532,11 @@ class Observations:
             installation: the parameters.
         """
         self._count = len(measurements)
-        corners = [i for i, m in enumerate(measurements) if isinstance(m, PixelMeasurement)]
-        planar = [i for i, m in enumerate(measurements) if not isinstance(m, PixelMeasurement | PoseMeasurement)]
-        by_pose = [i for i, m in enumerate(measurements) if isinstance(m, PoseMeasurement)]
-        self.batches: list[tuple[list[int], CornerBatch | PlanarBatch | PoseBatch]] = []
-        if corners:
-            seen = [m for m in measurements if isinstance(m, PixelMeasurement)]
-            self.batches.append((corners, CornerBatch(seen, landmarks, installation)))
-        if planar:
-            rest = [m for m in measurements if not isinstance(m, PixelMeasurement | PoseMeasurement)]
-            self.batches.append((planar, PlanarBatch(rest, landmarks, installation)))
-        if by_pose:
-            self.batches.append((by_pose, PoseBatch([m for m in measurements if isinstance(m, PoseMeasurement)])))
+        self.batches: list[tuple[list[int], Batch]] = []
+        for model, batch in _BATCHES.items():
+            members = [i for i, m in enumerate(measurements) if m.model is model]
+            if members:
+                self.batches.append((members, batch([measurements[i] for i in members], landmarks, installation)))
 
     def __len__(self) -> int:
         return self._count
@@ -539,7 +550,7 @@ class Observations:
         """
         found, rows = np.zeros(self._count), np.zeros(self._count, dtype=np.int64)
         for members, batch in self.batches:
-            own = poses[members] if isinstance(batch, CornerBatch) else poses[members, :3]
+            own = poses[members] if batch.spatial else poses[members, :3]
             stack = batch.evaluate(own, theta, by_installation=False)
             found[members] = np.where(stack.behind, np.inf, (stack.residual**2).sum(axis=1))
             rows[members] = batch.rows

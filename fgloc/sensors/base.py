@@ -19,7 +19,8 @@ from pydantic import Field, FiniteFloat
 
 from fgloc.files.settings import Section
 from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
-from fgloc.types import Event, FloatArray, LandmarkMap, LandmarkSighting, MotionEvent, PoseMeasurement, Setting
+from fgloc.sensors.measurements import LandmarkSighting, PoseMeasurement
+from fgloc.types import Event, FloatArray, LandmarkMap, MotionEvent, Setting
 
 if TYPE_CHECKING:
     from fgloc.config import Config, GateConfig

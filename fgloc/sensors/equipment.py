@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,14 +17,12 @@ from fgloc.sensors.gyro import Attitude, Gyro
 from fgloc.sensors.landmarks import SightingContext
 from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion
+from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
     FloatArray,
     LandmarkMap,
-    LandmarkMeasurement,
-    LandmarkSighting,
-    PixelMeasurement,
     SightingsEvent,
     Step,
 )
@@ -113,17 +110,11 @@ class PoseSensors:
 _SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the exposure
 
 
-def _tilted(seen: Sequence[LandmarkMeasurement], rates: FloatArray, seconds: float) -> list[LandmarkMeasurement]:
-    """Corners as the base sees them that has not yet tilted, or has tilted, by the rates ``(2,)`` about x and y."""
+def _tilt(rates: FloatArray, seconds: float) -> FloatArray:
+    """Tilt ``(4, 4)`` of the base in a time, by its roll and pitch rates ``(2,)``; none over a long one."""
     T = np.eye(4)
     T[:3, :3] = rotation_of((*(rates * (seconds if abs(seconds) < 1e-9 * _SHORT_NS else 0.0)).tolist(), 0.0))
-    moved: list[LandmarkMeasurement] = []
-    for m in seen:
-        if isinstance(m, PixelMeasurement):
-            camera = dataclasses.replace(m.camera, T_base_cam=T @ m.camera.T_base_cam)
-            m = dataclasses.replace(m, camera=camera, tilting=rates)
-        moved.append(m)
-    return moved
+    return T
 
 
 class MotionCompensation:
@@ -150,13 +141,11 @@ class MotionCompensation:
                 continue
             exposure_ns = event.stamp_ns - round(offset_s * 1e9)
             twist = self.twist(step, exposure_ns)
-            late: list[LandmarkMeasurement] = [dataclasses.replace(m, twist=twist, offset_s=offset_s) for m in found]
-            late = [
-                dataclasses.replace(m, jitter_s=self._jitter_s) if isinstance(m, PixelMeasurement) else m for m in late
-            ]
+            late = [m.exposed(twist, offset_s, self._jitter_s) for m in found]
             if self._attitude is not None and step.inertial:
                 rates = self._attitude.rates_at(step.inertial, exposure_ns)[:2]
-                late = _tilted(late, rates, (exposure_ns - step.stamp_ns) * 1e-9)
+                tilt = _tilt(rates, (exposure_ns - step.stamp_ns) * 1e-9)
+                late = [m.tilted(tilt, rates) for m in late]
             if exposure_ns != step.stamp_ns:
                 motion, cov = self._wheels.motion_between(step, step.stamp_ns, exposure_ns)
                 if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:

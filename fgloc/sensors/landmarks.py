@@ -12,7 +12,8 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.types import Camera, FloatArray, FrameMeasurement, Landmark, LandmarkMap, PointMeasurement, Sighting
+from fgloc.sensors.measurements import FrameMeasurement, PointMeasurement
+from fgloc.types import Camera, FloatArray, Landmark, LandmarkMap, Sighting
 
 
 def planar_yaw(R_base_marker: FloatArray, landmark: Landmark | None) -> float:

@@ -14,7 +14,8 @@ from fgloc.frames import quaternion_matrix
 from fgloc.sensors.base import BuiltIn, Stream, When, matrix, xyz, xyzw
 from fgloc.sensors.checks import Changes, FieldChecks, SightingsChecks
 from fgloc.sensors.landmarks import planar_yaw
-from fgloc.types import Event, FloatArray, FrameMeasurement, LandmarkSighting, Sighting, SightingsEvent
+from fgloc.sensors.measurements import FrameMeasurement, LandmarkSighting
+from fgloc.types import Event, FloatArray, Sighting, SightingsEvent
 
 if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext

@@ -11,7 +11,8 @@ import numpy as np
 
 from fgloc.sensors.base import BASE, BuiltIn, EventInput, Stream, When
 from fgloc.sensors.checks import FieldChecks, SightingsChecks
-from fgloc.types import Event, PointMeasurement, Sighting, SightingsEvent
+from fgloc.sensors.measurements import PointMeasurement
+from fgloc.types import Event, Sighting, SightingsEvent
 
 if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext

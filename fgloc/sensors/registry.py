@@ -28,11 +28,12 @@ from fgloc.sensors.learned import sensor as learned
 from fgloc.sensors.learned.sensor import LEARNED
 from fgloc.sensors.marker_pose import MARKER_POSE
 from fgloc.sensors.markers.sensor import MARKERS, MarkersInput
+from fgloc.sensors.measurements import LandmarkSighting
 from fgloc.sensors.range_bearing import RANGE_BEARING, RangeBearingInput
 from fgloc.sensors.wheels import motion as wheels
 from fgloc.sensors.wheels.events import WheelsInput
 from fgloc.sensors.wheels.sensor import WHEELS
-from fgloc.types import Event, LandmarkSighting, RawEvent
+from fgloc.types import Event, RawEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config

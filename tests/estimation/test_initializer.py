@@ -12,15 +12,8 @@ from fgloc import se2
 from fgloc.estimation.place import GlobalSearch, InitialPose
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.types import (
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    MotionMeasurement,
-    PixelMeasurement,
-    PointMeasurement,
-    Step,
-)
+from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
+from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, Step
 
 TRUTH = np.array([0.4, -0.3, 0.35])
 MOTION = np.array([0.08, 0.0, 0.04])

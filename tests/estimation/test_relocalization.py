@@ -12,18 +12,10 @@ from fgloc.config import Config
 from fgloc.estimation.localizer import Localizer
 from fgloc.estimation.pose_fit import fit_pose
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
+from fgloc.sensors.measurements import FrameMeasurement, PointMeasurement
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import (
-    Estimate,
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    Mode,
-    MotionMeasurement,
-    PointMeasurement,
-    Step,
-)
+from fgloc.types import Estimate, Landmark, LandmarkMap, Mode, MotionMeasurement, Step
 
 STEP_NS = 100_000_000
 PLACES = ((4.0, 3.0), (-3.0, 4.0), (-4.0, -2.0), (3.0, -4.0), (9.0, 2.0))

@@ -10,7 +10,8 @@ from fgloc.config import EstimatorConfig
 from fgloc.graph.estimators import Estimator, ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.types import Landmark, LandmarkMap, MotionMeasurement, PointMeasurement
+from fgloc.sensors.measurements import PointMeasurement
+from fgloc.types import Landmark, LandmarkMap, MotionMeasurement
 
 KINDS = ("fixed_lag", "isam2", "ekf")
 Q, R = np.diag([0.01, 0.005, 0.01]) ** 2, np.diag([0.02, 0.08]) ** 2

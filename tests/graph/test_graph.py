@@ -21,16 +21,8 @@ from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 from fgloc.graph.noise import gaussian
-from fgloc.graph.observation import cartesian
-from fgloc.types import (
-    Camera,
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    MotionMeasurement,
-    PixelMeasurement,
-    PointMeasurement,
-)
+from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
+from fgloc.types import Camera, Landmark, LandmarkMap, MotionMeasurement
 
 WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker on a wall, facing -x
 T_BASE_CAM = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]])
@@ -156,7 +148,7 @@ def test_marker_pose_prior_carries_the_lever_arm():
 def test_cartesian_covariance_matches_samples():
     rng = np.random.default_rng(1)
     m = PointMeasurement(0, 9, 3.0, 0.7, np.diag([0.02, 0.1]) ** 2)
-    point, cov = cartesian(m)
+    point, cov = m.cartesian()
     bearing, r = 0.7 + rng.normal(0, 0.02, 50000), 3.0 + rng.normal(0, 0.1, 50000)
     samples = np.column_stack([r * np.cos(bearing), r * np.sin(bearing)])
     assert np.allclose(samples.mean(axis=0), point, atol=2e-3)
@@ -376,7 +368,7 @@ def test_a_marker_right_in_front_of_the_camera_is_no_reason_to_fail(depth):
 
 def test_a_landmark_under_the_robot_tells_its_place_no_better_than_its_range():
     m = PointMeasurement(0, 9, 0.0, 0.3, np.diag([0.01, 0.05]) ** 2)
-    _, cov = cartesian(m)
+    _, cov = m.cartesian()
     assert np.sqrt(np.linalg.eigvalsh(cov)) == pytest.approx((0.01 * 0.05, 0.05))
 
 

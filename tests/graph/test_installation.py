@@ -36,10 +36,11 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.measurements import PointMeasurement
 from fgloc.sensors.settings import GyroConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, PointMeasurement, Step, by_class
+from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, Step, by_class
 
 # --- names and priors -------------------------------------------------------------------------------------------------
 

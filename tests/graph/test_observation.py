@@ -15,14 +15,8 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import CAMERA, MARKER, SENSOR, Installation, installation_of
 from fgloc.graph.noise import sighting_whitening
 from fgloc.graph.observation import MIN_DEPTH_M, Observations
-from fgloc.types import (
-    Camera,
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    PixelMeasurement,
-    PointMeasurement,
-)
+from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
+from fgloc.types import Camera, Landmark, LandmarkMap
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 D = np.array([0.05, -0.02, 0.001, -0.002])

@@ -18,15 +18,9 @@ from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.marker_pose import MarkerPose, MarkerPosesEvent
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
+from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
-from fgloc.types import (
-    FloatArray,
-    FrameMeasurement,
-    Landmark,
-    LandmarkMap,
-    PixelMeasurement,
-    PointMeasurement,
-)
+from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 CAMERA = forward_camera()
 FISHEYE = replace(forward_camera(D=(-0.013, 0.009, 0.012, -0.004)), model="equidistant")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgloc import se2
-from fgloc.types import FrameMeasurement, PointMeasurement
+from fgloc.sensors.measurements import FrameMeasurement, PointMeasurement
 
 MOTION = np.array([-0.3, 0.1, 0.4])
 MOTION_COV = np.diag([0.02, 0.01, 0.03]) ** 2

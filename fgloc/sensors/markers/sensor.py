@@ -29,16 +29,8 @@ from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.landmarks import planar_yaw
 from fgloc.sensors.markers.detector import fitting_dictionary
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners, decode
-from fgloc.types import (
-    Camera,
-    Event,
-    FloatArray,
-    Landmark,
-    LandmarkSighting,
-    PixelMeasurement,
-    RawEvent,
-    SightingsEvent,
-)
+from fgloc.sensors.measurements import LandmarkSighting, PixelMeasurement
+from fgloc.types import Camera, Event, FloatArray, Landmark, RawEvent, SightingsEvent
 
 if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext

@@ -1,0 +1,644 @@
+"""Measurements of where the robot is: one interface for those of built-in sensors and of other packages.
+
+`LandmarkMeasurement` is what gate, association, landmark modes, search, estimators and batch know of a measurement.
+Sightings of the map's landmarks are of three kinds: corners in an image, range and bearing, pose of a marker. A sensor
+of another package yields these too, or a `PoseMeasurement`: any function of the robot's pose. Everything here is numpy;
+factors are made in `fgloc.graph`.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import ClassVar, Protocol, Self
+
+import numpy as np
+
+from fgloc import se2
+from fgloc.sensors.cameras import marker_pose_candidates, planar_base_candidates
+from fgloc.types import Camera, FloatArray, Landmark
+
+MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
+YAWS = 24  # that the search for the first pose tries at a place without one
+_LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
+_AT_REST = np.zeros(3)
+_LEVEL = np.zeros(2)
+
+
+# --- The interface ----------------------------------------------------------------------------------------------------
+
+
+class Model(Enum):
+    """How residual and Jacobians of many measurements are computed in one call; see `fgloc.graph.observation`."""
+
+    CORNERS = "corners"  # of markers in an image
+    PLANAR = "planar"  # of landmarks in the base's plane: points, or poses of markers
+    POSE = "pose"  # `PoseMeasurement.residual_at`, one by one
+
+
+class LandmarkMeasurement(Protocol):
+    """Measurement of where the robot is: of a landmark of the map, or of a place that its sensor knows."""
+
+    @property
+    def model(self) -> Model:
+        """How it is evaluated."""
+        ...
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time at which it was made."""
+        ...
+
+    @property
+    def landmark_id(self) -> int:
+        """Landmark of the map; a negative number of the sensor's own if it is of none."""
+        ...
+
+    @property
+    def cov(self) -> FloatArray | None:
+        """Covariance ``(d, d)`` of the residual; None: corners, all with the noise of the image."""
+        ...
+
+    @property
+    def cauchy_k(self) -> float:
+        """Cauchy constant of the search for the first pose and of unknown landmarks, in units of sigma."""
+        ...
+
+    @property
+    def row_kind(self) -> str:
+        """Kind of its row in ``steps.csv``."""
+        ...
+
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``; -1: none."""
+        ...
+
+    @property
+    def counted_as(self) -> str:
+        """Under which name it is counted where it is rejected."""
+        ...
+
+    @property
+    def of_landmark(self) -> bool:
+        """Whether it is of a landmark of the map; else of a place that only its sensor knows."""
+        ...
+
+    @property
+    def is_point(self) -> bool:
+        """Whether it is range and bearing of a point (`PointMeasurement`): explained by the poses on a ring."""
+        ...
+
+    @property
+    def gives_pose(self) -> bool:
+        """Whether it gives the pose of the base by itself, if the landmark is known."""
+        ...
+
+    @property
+    def in_pixels(self) -> bool:
+        """Whether its noise is that of an image."""
+        ...
+
+    @property
+    def errors_repeat(self) -> bool:
+        """Whether the next sighting of the landmark has much the same error."""
+        ...
+
+    @property
+    def observes_yaw(self) -> bool:
+        """Whether it determines the yaw by itself."""
+        ...
+
+    @property
+    def variable_dof(self) -> int:
+        """Numbers of its landmark as a variable, where no map is known: 2 of a point, 3 of a pose; 0: never one."""
+        ...
+
+    @property
+    def bias_key(self) -> Hashable | None:
+        """Measurements of one key are tested for a common bias; None: there is no such test."""
+        ...
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        ...
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        ...
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
+        """The measurement, moved to the keyframe.
+
+        Args:
+            motion: ``T_keyframe_then`` ``(3,)``: the base at the measurement's time, seen from the keyframe.
+            cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the measurement itself has.
+        """
+        ...
+
+    def scaled(self, factor: float) -> Self:
+        """With the covariance of the residual times a factor."""
+        ...
+
+    def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
+        """Poses ``(3,)`` of the base in the map from which the search for its place begins; none of a point.
+
+        Args:
+            landmarks: of the map, by id; that of the measurement is among them.
+        """
+        ...
+
+    def landmark_from(self, pose: FloatArray) -> FloatArray | None:
+        """Landmark as seen from a pose ``(3,)``: point ``(2,)`` or pose ``(3,)``; None: it is never a variable."""
+        ...
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """Other interpretations, most probable first, tried where the chi-square gate rejects the measurement.
+
+        Args:
+            predicted: pose ``(3,)`` at the keyframe.
+        """
+        ...
+
+    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+        """The measurement as one of other landmarks, of each that lies about where it was seen.
+
+        Args:
+            others: ids, and places ``(3,)`` in the axes of the base.
+        """
+        ...
+
+
+class LandmarkSighting(LandmarkMeasurement, Protocol):
+    """Measurement of a landmark of the map."""
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
+        """With the motion at the exposure, by which the residual depends on the clock.
+
+        Args:
+            twist: ``(3,)`` of the base [m/s, m/s, rad/s].
+            offset_s: how late the stamp was taken to be.
+            jitter_s: sigma of each stamp on its own; used for corners.
+        """
+        ...
+
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
+        """As seen from a base that is tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)``; of corners only."""
+        ...
+
+    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
+        """Place ``(3,)`` in the sensor's axes, noise of bearing [rad] and range [m]; None: no place explains it.
+
+        Args:
+            landmark: of the map; corners need it.
+            T_base_sensor: ``(4, 4)`` of what was measured in the plane; its height is taken to be the sensor's.
+        """
+        ...
+
+
+# --- Corners of a marker ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelMeasurement:
+    """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
+
+    model: ClassVar[Model] = Model.CORNERS
+    cov: ClassVar[None] = None
+    row_kind: ClassVar[str] = "corners"
+    counted_as: ClassVar[str] = "sightings"
+    of_landmark: ClassVar[bool] = True
+    is_point: ClassVar[bool] = False
+    gives_pose: ClassVar[bool] = True
+    in_pixels: ClassVar[bool] = True
+    errors_repeat: ClassVar[bool] = False
+    observes_yaw: ClassVar[bool] = True
+    variable_dof: ClassVar[int] = 0
+    bias_key: ClassVar[None] = None
+    dof: ClassVar[int] = 8
+
+    stamp_ns: int
+    landmark_id: int
+    corners_px: FloatArray  # (4, 2)
+    sigma_px: float
+    camera: Camera  # plumb_bob, whose D explains corners_px
+    twist: FloatArray = field(
+        default_factory=lambda: _AT_REST
+    )  # (3,) of the base at the exposure: m/s, m/s, rad/s, in the keyframe's axes
+    offset_s: float = 0.0  # how late the stamp was taken to be when the sighting was moved to its keyframe
+    blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
+    jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
+    motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
+    cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
+    tilting: FloatArray = field(default_factory=lambda: _LEVEL)  # (2,) rad/s: roll and pitch rate of the base
+
+    @property
+    def row_id(self) -> int:
+        """The landmark."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind [1/px²]."""
+        return 1.0 / self.sigma_px**2
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> PixelMeasurement:
+        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        return replace(self, twist=twist, offset_s=offset_s, jitter_s=jitter_s)
+
+    def tilted(self, T: FloatArray, rates: FloatArray) -> PixelMeasurement:
+        """As seen from a tilted base; see `LandmarkSighting.tilted`."""
+        camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
+        return replace(self, camera=camera, tilting=rates)
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> PixelMeasurement:
+        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        ad = se2.adjoint(motion)
+        x, y, yaw = motion
+        T = np.eye(4)
+        T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        T[:2, 3] = x, y
+        camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
+        spread = cov if self.motion_cov is None else cov + self.motion_cov
+        return replace(self, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ self.twist)
+
+    def scaled(self, factor: float) -> PixelMeasurement:
+        """With the variance of the corners times a factor."""
+        return replace(self, sigma_px=math.sqrt(factor) * self.sigma_px)
+
+    def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
+        """Poses of the base on the floor that explain the corners, the better one first."""
+        landmark = landmarks[self.landmark_id]
+        return (pose for pose, _ in planar_base_candidates(self.camera, self.corners_px, landmark))
+
+    def landmark_from(self, pose: FloatArray) -> None:
+        """None: markers need a known map to be seen by their corners."""
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """None but other ids; see `misread`."""
+        return ()
+
+    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> list[PixelMeasurement]:
+        """The same corners with other ids, of markers whose middle lies in about the same direction."""
+        T, K = self.camera.T_base_cam, self.camera.K
+        u, v = self.corners_px.mean(axis=0)
+        found = []
+        for landmark_id, place in others:
+            right, down, depth = T[:3, :3].T @ (place - T[:3, 3])
+            if depth < MIN_DEPTH_M:
+                continue
+            across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
+            if across < _LOOKALIKE:
+                found.append(replace(self, landmark_id=landmark_id))
+        return found
+
+    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
+        """Place of the marker in the camera, by the better of its two poses; see `LandmarkSighting.relative`."""
+        assert landmark is not None
+        found = marker_pose_candidates(self.camera, self.corners_px, landmark.size_m)
+        if not found:
+            return None
+        T = found[0][0]
+        point = T[:3, 3]
+        sigma_rad = self.sigma_px / float(self.camera.K[0, 0])
+        side_px = float(np.linalg.norm(self.corners_px - np.roll(self.corners_px, 1, axis=0), axis=1).max())
+        return point, sigma_rad, float(np.linalg.norm(point)) * self.sigma_px / side_px
+
+
+# --- Range and bearing ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointMeasurement:
+    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
+
+    model: ClassVar[Model] = Model.PLANAR
+    row_kind: ClassVar[str] = "range_bearing"
+    counted_as: ClassVar[str] = "sightings"
+    of_landmark: ClassVar[bool] = True
+    is_point: ClassVar[bool] = True
+    gives_pose: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = True
+    observes_yaw: ClassVar[bool] = True
+    variable_dof: ClassVar[int] = 2
+    bias_key: ClassVar[None] = None
+    dof: ClassVar[int] = 2
+
+    stamp_ns: int
+    landmark_id: int
+    range_m: float
+    bearing_rad: float
+    cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
+    offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def point(self) -> FloatArray:
+        """Position in the base frame ``(2,)`` [m]."""
+        return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
+
+    @property
+    def row_id(self) -> int:
+        """The landmark."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> PointMeasurement:
+        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        return replace(self, twist=twist, offset_s=offset_s)
+
+    def tilted(self, T: FloatArray, rates: FloatArray) -> PointMeasurement:
+        """The same: ranges are taken to be in the plane."""
+        return self
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> PointMeasurement:
+        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        ad = se2.adjoint(motion)
+        x, y = self.point
+        px, py, _ = se2.compose(motion, (x, y, 0.0))
+        r, bearing = math.hypot(px, py), math.atan2(py, px)
+        added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
+        return replace(self, range_m=r, bearing_rad=bearing, cov=self.cov + added, twist=ad @ self.twist)
+
+    def scaled(self, factor: float) -> PointMeasurement:
+        """With the covariance times a factor."""
+        return replace(self, cov=self.cov * factor)
+
+    def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
+        """None: the poses on a ring are searched among hypotheses, see `fgloc.estimation.beacons`."""
+        return ()
+
+    def landmark_from(self, pose: FloatArray) -> FloatArray:
+        """Point ``(2,)`` as seen from a pose."""
+        local = [self.range_m * np.cos(self.bearing_rad), self.range_m * np.sin(self.bearing_rad), 0.0]
+        return se2.compose(pose, local)[:2]
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """None."""
+        return ()
+
+    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+        """None: the sensor's own association is taken as it is."""
+        return ()
+
+    def in_base(self) -> tuple[FloatArray, FloatArray]:
+        """Point ``(2,)`` in the base frame, and the matrix ``(2, 2)`` that makes its error white."""
+        point, cov = self.cartesian()
+        return point, np.linalg.inv(np.linalg.cholesky(cov))
+
+    def cartesian(self) -> tuple[FloatArray, FloatArray]:
+        """The sighting as a point ``(2,)`` in the base frame with covariance ``(2, 2)``.
+
+        The frame turned by the bearing has range along its first axis and range times bearing across; first order in
+        the bearing's sigma, which is exact enough below 0.2 rad. The true range, which may be off by its sigma, makes
+        the sigma across: it does not vanish right at a landmark.
+        """
+        c, s = np.cos(self.bearing_rad), np.sin(self.bearing_rad)
+        r, lever = self.range_m, np.sqrt(self.range_m**2 + self.cov[1, 1])
+        J = np.array([[-lever * s, c], [lever * c, s]])  # columns: bearing, range
+        cov = J @ self.cov @ J.T
+        return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
+
+    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
+        """Place in the sensor's axes with the noise of bearing and range; see `LandmarkSighting.relative`."""
+        x, y = self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)
+        sigma_rad, sigma_m = np.sqrt(np.diag(self.cov)).tolist()
+        return _in_sensor(x, y, T_base_sensor), sigma_rad, sigma_m
+
+
+def _bearing_range_cov(cov: FloatArray, motion: FloatArray, point: FloatArray, r: float, bearing: float) -> FloatArray:
+    """Covariance ``(2, 2)`` (bearing, range) that an uncertain motion adds to a sighted point."""
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    R = np.array([[c, -s], [s, c]])
+    J_point = np.column_stack([R, R @ np.array([-point[1], point[0]])])  # of motion ∘ point, by right perturbation
+    cb, sb = math.cos(bearing), math.sin(bearing)
+    J_polar = np.array([[-sb / r, cb / r], [cb, sb]])
+    J = J_polar @ J_point
+    return np.asarray(J @ cov @ J.T)
+
+
+def _in_sensor(x: float, y: float, T_base_sensor: FloatArray) -> FloatArray:
+    """A place given in the base's plane in the sensor's axes ``(3,)``, taken to be at the sensor's own height."""
+    arm = np.array([x - T_base_sensor[0, 3], y - T_base_sensor[1, 3], 0.0])
+    return np.asarray(T_base_sensor[:3, :3].T @ arm)
+
+
+# --- Pose of a marker -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMeasurement:
+    """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
+
+    model: ClassVar[Model] = Model.PLANAR
+    row_kind: ClassVar[str] = "marker_pose"
+    counted_as: ClassVar[str] = "sightings"
+    of_landmark: ClassVar[bool] = True
+    is_point: ClassVar[bool] = False
+    gives_pose: ClassVar[bool] = True
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = True
+    observes_yaw: ClassVar[bool] = True
+    variable_dof: ClassVar[int] = 3
+    bias_key: ClassVar[None] = None
+    dof: ClassVar[int] = 3
+
+    stamp_ns: int
+    landmark_id: int
+    pose: FloatArray  # (3,)
+    cov: FloatArray  # (3, 3)
+    twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
+    offset_s: float = 0.0
+    cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    @property
+    def row_id(self) -> int:
+        """The landmark."""
+        return self.landmark_id
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> FrameMeasurement:
+        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        return replace(self, twist=twist, offset_s=offset_s)
+
+    def tilted(self, T: FloatArray, rates: FloatArray) -> FrameMeasurement:
+        """The same: poses are taken to be in the plane."""
+        return self
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> FrameMeasurement:
+        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        pose = se2.compose(motion, self.pose)
+        moved = se2.compose_cov(cov, self.pose, self.cov)
+        return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
+
+    def scaled(self, factor: float) -> FrameMeasurement:
+        """With the covariance times a factor."""
+        return replace(self, cov=self.cov * factor)
+
+    def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
+        """The pose of the base that explains it."""
+        return (se2.compose(landmarks[self.landmark_id].planar, se2.inverse(self.pose)),)
+
+    def landmark_from(self, pose: FloatArray) -> FloatArray:
+        """Pose ``(3,)`` of the marker as seen from a pose of the base."""
+        return se2.compose(pose, self.pose)
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """None."""
+        return ()
+
+    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+        """None: the detector's association is taken as it is."""
+        return ()
+
+    def in_base(self) -> tuple[FloatArray, FloatArray]:
+        """Pose ``(3,)``, and the matrix ``(3, 3)`` that makes its error in the base's axes white."""
+        c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return self.pose, np.linalg.inv(np.linalg.cholesky(self.cov)) @ turn
+
+    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
+        """Place in the sensor's axes, with the larger sigma of the position; see `LandmarkSighting.relative`."""
+        x, y = self.pose[:2]
+        sigma_m = math.sqrt(max(self.cov[0, 0], self.cov[1, 1]))
+        return _in_sensor(x, y, T_base_sensor), sigma_m / max(math.hypot(x, y), 0.1), sigma_m
+
+
+# --- Any function of the pose -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseMeasurement(ABC):
+    """Measurement of a registered sensor, as a function of the robot's pose; each kind is a subclass.
+
+    A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
+    the first pose are made of that.
+    """
+
+    model: ClassVar[Model] = Model.POSE
+    of_landmark: ClassVar[bool] = False
+    is_point: ClassVar[bool] = False
+    gives_pose: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = False
+    variable_dof: ClassVar[int] = 0
+
+    source: str  # in steps.csv and in the counts
+    stamp_ns: int
+    cov: FloatArray  # (d, d) of the residual
+    target: int = -1  # which anchor or beacon was measured, in the sensor's own numbering; -1: none
+    observes_yaw: bool = False  # whether one reading determines the yaw, as a compass does
+    cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
+    T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
+    motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
+
+    @abstractmethod
+    def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted minus measured ``(d,)`` for ``T_map_base`` ``(3,)`` at the stamp, with its Jacobian.
+
+        Returns:
+            The residual, in the units of `cov`, and its derivative ``(d, 3)`` by the right perturbation of the pose.
+        """
+
+    def places(self) -> Iterable[FloatArray]:
+        """Rough positions ``(2,)`` [m] of the robot in the map, from which the search for its first pose begins."""
+        return ()
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """Other interpretations of the reading, most probable first, tried where the chi-square gate refuses it.
+
+        Args:
+            predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.
+        """
+        return ()
+
+    @property
+    def dof(self) -> int:
+        """Length of the residual."""
+        return len(self.cov)
+
+    @property
+    def landmark_id(self) -> int:
+        """A number that no landmark of the map has."""
+        return -2 - self.target
+
+    @property
+    def row_kind(self) -> str:
+        """Kind of its row in ``steps.csv``: the source, with the number of what was measured."""
+        return self.source if self.target < 0 else f"{self.source}.{self.target}"
+
+    @property
+    def row_id(self) -> int:
+        """Landmark of its row in ``steps.csv``: none."""
+        return -1
+
+    @property
+    def counted_as(self) -> str:
+        """Source under which it is counted where it is rejected."""
+        return self.source
+
+    @property
+    def bias_key(self) -> Hashable | None:
+        """Source and target."""
+        return self.source, self.target
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
+        """The measurement, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        known = np.zeros((3, 3)) if self.motion_cov is None else self.motion_cov
+        moved = se2.compose_cov(cov, self.T_keyframe_then, known)
+        return replace(self, T_keyframe_then=se2.compose(motion, self.T_keyframe_then), motion_cov=moved)
+
+    def scaled(self, factor: float) -> Self:
+        """With the covariance times a factor."""
+        return replace(self, cov=self.cov * factor)
+
+    def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
+        """Each of `places` with `YAWS` yaws."""
+        yaws = np.linspace(-np.pi, np.pi, YAWS, endpoint=False)
+        return (np.array([*place, yaw]) for place in self.places() for yaw in yaws)
+
+    def landmark_from(self, pose: FloatArray) -> FloatArray | None:
+        """None: it is of no landmark."""
+        return None
+
+    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+        """None; see `alternatives`."""
+        return ()
+
+    def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residual and Jacobian of `residual_at`, by the pose at the keyframe."""
+        residual, J = self.residual_at(se2.compose(pose, self.T_keyframe_then))
+        return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
+
+
+# --- Those of one kind ------------------------------------------------------------------------------------------------
+
+
+def corners_of(measurements: Iterable[LandmarkMeasurement]) -> list[PixelMeasurement]:
+    """Those that are corners, for surveys of markers and checks of the floor."""
+    return [m for m in measurements if isinstance(m, PixelMeasurement)]
+
+
+def points_of(measurements: Iterable[LandmarkMeasurement]) -> list[PointMeasurement]:
+    """Those that are range and bearing, for hypotheses on rings."""
+    return [m for m in measurements if isinstance(m, PointMeasurement)]
