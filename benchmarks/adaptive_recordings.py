@@ -23,7 +23,7 @@ import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from fgloc.config import Config
+from fgloc.config import Config, MarkersConfig
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
@@ -31,7 +31,6 @@ from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
 from fgloc_datasets.sim.record import BUNDLED, Job, describe, is_recorded, load_suite, record_suite, robot_settings
 from fgloc_datasets.sim.scenario import Scenario

@@ -25,7 +25,7 @@ import torch
 
 from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
-from fgloc.calibration.multi_run import calibrate
+from fgloc.calibrate import calibrate
 from fgloc.config import load_config
 from fgloc.recording.storage import find_beside
 from fgloc.runner import run

@@ -38,7 +38,7 @@ from benchmarks.installed_runs import floor, kept, processor_times
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
 from fgloc.ablation.failures import corrupt, generators
-from fgloc.config import load_config
+from fgloc.config import WheelsConfig, load_config
 from fgloc.evaluation.metrics import match, nees
 from fgloc.files.outputs import read_tum
 from fgloc.frames import quaternion_yaw
@@ -47,7 +47,6 @@ from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, Event, Step, Trajectory, TruthEvent

@@ -16,9 +16,9 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
+from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.sim.camera import RenderError, frames, pose_at

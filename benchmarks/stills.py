@@ -25,13 +25,12 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Row, main, not_run
 from benchmarks.equal_cases import SAMPLES
-from fgloc.config import load_config
+from fgloc.config import MarkersConfig, load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector, TrackingDetector, use_one_thread
 from fgloc.sensors.markers.edges import refine_all
 from fgloc.sensors.markers.images import GrayImage, ImageEvent, decode
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 
 _ID = "stills.missed_ids"

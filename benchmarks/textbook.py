@@ -27,9 +27,9 @@ import gtsam
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import WheelsConfig
 from fgloc.sensors.cameras import marker_pose_candidates, pinhole, undistort_points
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, Estimate, FloatArray, LandmarkMap, Step
 

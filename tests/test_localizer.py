@@ -27,12 +27,12 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
+from fgloc.config import MotionConfig
 from fgloc.estimation.pose_fit import fit_pose
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.measurements import PixelMeasurement
-from fgloc.sensors.settings import MotionConfig
 from fgloc.types import LandmarkMap, Mode
 
 MAPS = {"corners": room, "beacons": beacons}

@@ -211,8 +211,8 @@ def calibrate(
     config: ConfigOption = None,
 ) -> None:
     """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
+    from fgloc.calibrate import calibrate as calibrated
     from fgloc.calibration.installation import found_text, given_text, setting_unit
-    from fgloc.calibration.multi_run import calibrate as calibrated
     from fgloc.config import yaml_of
     from fgloc.files.outputs import write_text
 

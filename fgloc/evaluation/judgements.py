@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from fgloc.calibration.installation import contradicted
+from fgloc.config import MOTION_SOURCES
 from fgloc.results import RunData
-from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.stats import SURE_SIGMAS
 from fgloc.types import Decision, IntArray, Trajectory
 

@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d import Axes3D
 
+from fgloc.config import MOTION_SOURCES
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.style import (
     BLUE,
@@ -46,7 +47,6 @@ from fgloc.evaluation.style import (
     tidy,
 )
 from fgloc.results import RunData
-from fgloc.sensors.settings import MOTION_SOURCES
 from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, Trajectory
 
 # --- Trajectory: the map, the way with its times, and below it how large sigma and error are --------------------------

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import CameraConfig
 from fgloc.errors import CameraError
 from fgloc.files.documents import Item, read_document
-from fgloc.sensors.settings import CameraConfig
 from fgloc.types import Camera, CameraInfoEvent, FloatArray, Landmark
 
 # What ROS, OpenCV and Kalibr call the models. The number of coefficients tells plumb_bob and rational_polynomial apart.

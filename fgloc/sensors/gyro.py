@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, GyroConfig
 from fgloc.frames import rotation_of, rpy_matrix
 from fgloc.sensors.base import (
     BASE,
@@ -36,7 +36,6 @@ from fgloc.sensors.base import (
 )
 from fgloc.sensors.checks import Changes, FieldChecks, Table, count, finite_rows, spikes
 from fgloc.sensors.failures import Carriage, Change, EventFailure, Scene
-from fgloc.sensors.settings import GyroConfig
 from fgloc.sensors.wheels.motion import Standing
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setting, Step

@@ -12,13 +12,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from fgloc import se2
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
-from fgloc.config import Config
+from fgloc.config import Config, WheelsConfig
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import decode
 from fgloc.sensors.range_bearing import RangeBearingEvent
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, Landmark, LandmarkMap, TruthEvent
 

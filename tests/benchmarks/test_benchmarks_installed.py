@@ -27,11 +27,10 @@ from benchmarks.installed_scores import (
     truth_values,
 )
 from benchmarks.textbook import PIPELINES, Textbook
-from fgloc.config import Config
+from fgloc.config import Config, WheelsConfig
 from fgloc.runner import RunResult
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Camera, Decision, Landmark, LandmarkMap, Mode, Step, Trajectory, by_class
 

@@ -10,12 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
+from fgloc.calibrate import calibrate
 from fgloc.calibration.installation import found_text, given_text, setting_unit
-from fgloc.calibration.multi_run import calibrate
-from fgloc.config import Config, load_config, yaml_of
+from fgloc.config import Config, load_config, model_path, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
-from fgloc.sensors.settings import model_path
 from fgloc.types import Setting
 from fgloc_datasets.bag import BagWriter
 

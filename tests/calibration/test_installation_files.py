@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from fgloc import cli
+from fgloc.calibrate import pooled
 from fgloc.calibration.installation import contradicted, contradictions, settings_found, with_settings
-from fgloc.calibration.multi_run import pooled
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map

@@ -15,10 +15,9 @@ from test_cli import write_circle
 from fgloc import instrumentation as progress
 from fgloc.cli import options
 from fgloc.cli.terminal import LINE_S, Lines
-from fgloc.config import Config, load_config
+from fgloc.config import Config, WheelsConfig, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
 from fgloc.runner import run
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.types import Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
 from fgloc_datasets.sim.physics import Log, Scene, make_scene, simulate

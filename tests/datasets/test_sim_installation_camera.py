@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from sim_bags import messages
 
+from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, Landmark
 from fgloc_datasets.sim.camera import Renderer, RenderError, frames, pose_at
 from fgloc_datasets.sim.installed import MountedCamera, load_installed

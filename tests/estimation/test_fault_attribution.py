@@ -9,8 +9,8 @@ import pytest
 from motion_models import make_card, make_tensors
 from robot_world import START_NS, Chain, World, config, position_error, room
 
+from fgloc.config import MotionConfig
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
-from fgloc.sensors.settings import MotionConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
 

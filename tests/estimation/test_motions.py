@@ -13,7 +13,7 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, GyroConfig, MotionConfig
 from fgloc.estimation.faults import FaultVerdict
 from fgloc.estimation.log import motion_decisions
 from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, source_difference
@@ -27,7 +27,6 @@ from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
-from fgloc.sensors.settings import GyroConfig, MotionConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import ControlEvent, MotionMeasurement, MotionReadings, Step, by_class

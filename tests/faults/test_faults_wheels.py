@@ -10,12 +10,11 @@ import pytest
 from motion_models import make_card, make_tensors
 from robot_world import SPEED, START_NS, TURN, Chain, World, config, nees, position_error, room
 
-from fgloc.config import BatchConfig
+from fgloc.config import BatchConfig, GyroConfig, MotionConfig
 from fgloc.graph.batch import BatchSmoother
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.card import Kinematics
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
-from fgloc.sensors.settings import GyroConfig, MotionConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 
 TRACK = 0.3

@@ -65,7 +65,7 @@ def fgloc(*arguments: object, seconds: float = 20.0) -> Done:
 
 def load() -> None:
     """Import what the commands import late, so that no case pays for it."""
-    import fgloc.calibration.multi_run
+    import fgloc.calibrate
     import fgloc.diagnosis.mistakes
     import fgloc.evaluation.report
     import fgloc.recording.info

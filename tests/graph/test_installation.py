@@ -24,7 +24,7 @@ from robot_world import (
 )
 
 from fgloc import se2
-from fgloc.config import BatchConfig, Config, EstimatorConfig
+from fgloc.config import BatchConfig, Config, EstimatorConfig, GyroConfig
 from fgloc.estimation.motion import MotionSources
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
@@ -37,7 +37,6 @@ from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.measurements import PointMeasurement
-from fgloc.sensors.settings import GyroConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, Step, by_class

@@ -21,10 +21,9 @@ from event_makers import (
 )
 
 from fgloc import se2
-from fgloc.config import GateConfig
+from fgloc.config import GateConfig, WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgloc.config import GyroConfig
 from fgloc.frames import rpy_matrix
 from fgloc.graph.ground import GRAVITY
 from fgloc.sensors.gyro import Attitude, ImuEvent
-from fgloc.sensors.settings import GyroConfig
 from fgloc.types import Step, by_class
 
 START = 10**18

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from fgloc.config import GyroConfig
 from fgloc.sensors.gyro import Gyro, ImuEvent
-from fgloc.sensors.settings import GyroConfig
 from fgloc.types import Step, by_class
 
 START = 10**18

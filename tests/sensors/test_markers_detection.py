@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from marker_scenes import forward_camera, image_event, project, render, standing, texture
 
+from fgloc.config import MarkersConfig
 from fgloc.errors import ConfigError
 from fgloc.sensors.markers.detector import (
     MarkerDetector,
@@ -20,7 +21,6 @@ from fgloc.sensors.markers.detector import (
     suggest_dictionary,
 )
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import ControlEvent, Event
 
 CAMERA = forward_camera()

@@ -8,9 +8,9 @@ import pytest
 from marker_scenes import forward_camera, project, render, standing
 from numpy.typing import NDArray
 
+from fgloc.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.edges import refine_corners
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray
 
 CAMERA = forward_camera()

@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fgloc.config import load_config
+from fgloc.config import MarkersConfig, load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.markers.detector import MarkerDetector, TrackingDetector, load_dictionary
 from fgloc.sensors.markers.edges import CoarseSearch, Codes
 from fgloc.sensors.markers.images import ImageEvent, decode
-from fgloc.sensors.settings import MarkersConfig
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
 

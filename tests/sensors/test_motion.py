@@ -11,6 +11,7 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
+from fgloc.config import MotionConfig, NoiseDensity
 from fgloc.errors import ModelError
 from fgloc.sensors.learned.card import Kind
 from fgloc.sensors.learned.network import (
@@ -22,7 +23,6 @@ from fgloc.sensors.learned.network import (
     noise_density,
 )
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
-from fgloc.sensors.settings import MotionConfig, NoiseDensity
 from fgloc.types import ControlEvent, Step, by_class
 
 SECOND = 1_000_000_000

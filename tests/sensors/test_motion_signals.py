@@ -10,12 +10,12 @@ import pytest
 from motion_models import make_card, make_tensors
 
 from fgloc import se2
+from fgloc.config import MotionConfig
 from fgloc.errors import ConfigError, ModelError
 from fgloc.sensors.base import Signal
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.learned.card import SignalReader, Signals
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
-from fgloc.sensors.settings import MotionConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, InertialEvent, MotionEvent, Step, by_class
 

@@ -9,9 +9,9 @@ from marker_scenes import forward_camera, render, standing
 
 from fgloc.ablation.jobs import execute, make_jobs, read_record
 from fgloc.ablation.suite import Suite, expand
+from fgloc.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector, RememberedDetections
 from fgloc.sensors.markers.images import ImageError
-from fgloc.sensors.settings import MarkersConfig
 from fgloc_datasets import SAMPLE
 
 DICTIONARY = "DICT_4X4_50"

@@ -8,8 +8,8 @@ import pytest
 from event_makers import command, corners, in_order_of_receipt, joints, ns, odometry, range_bearing, run, stepper, times
 
 from fgloc import se2
+from fgloc.config import NoiseDensity, WheelsConfig
 from fgloc.errors import ConfigError
-from fgloc.sensors.settings import NoiseDensity, WheelsConfig
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.sensors.wheels.tracks import TwistTimeline
 

@@ -6,12 +6,11 @@ from event_makers import check_steps
 from real_data import real_data
 
 from fgloc import se2
-from fgloc.config import GateConfig, KeyframesConfig, RecordingConfig
+from fgloc.config import GateConfig, KeyframesConfig, RecordingConfig, WheelsConfig
 from fgloc.frames import quaternion_yaw
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 

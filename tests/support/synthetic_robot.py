@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, WheelsConfig
 from fgloc.sensors.gyro import ImuEvent
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, Event, FloatArray
 from fgloc_datasets.bag import BagWriter

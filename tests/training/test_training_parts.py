@@ -12,10 +12,10 @@ from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from fgloc import se2
+from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.files.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
-from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import ControlEvent, Trajectory
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs

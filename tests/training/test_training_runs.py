@@ -10,11 +10,10 @@ import yaml
 from command_line import fgloc
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
-from fgloc.config import Config
+from fgloc.config import Config, WheelsConfig
 from fgloc.errors import RecordingError
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.learned.sensor import load_model
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Event
 from fgloc_datasets.bag import BagWriter

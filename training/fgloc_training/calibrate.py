@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
+from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, ModelCard, Row
 from fgloc.sensors.learned.network import calibrated
 from fgloc.sensors.learned.sensor import Tensors, model_of
-from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import FloatArray
 from fgloc_training.config import AdaptationConfig, CalibrationConfig
 from fgloc_training.data import Run

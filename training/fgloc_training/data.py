@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import savgol_filter
 
-from fgloc.config import Config, load_config
+from fgloc.config import Config, GyroConfig, WheelsConfig, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.files.outputs import read_tum
 from fgloc.frames import rotations
@@ -30,7 +30,6 @@ from fgloc.sensors.base import Mounting, WheelJoints
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.card import Signals, signals_of
 from fgloc.sensors.learned.network import CommandHistory
-from fgloc.sensors.settings import GyroConfig, WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, MotionEvent, Step, TruthEvent

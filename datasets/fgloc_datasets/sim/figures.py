@@ -18,11 +18,11 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
+from fgloc.config import MarkersConfig
 from fgloc.errors import RecordingError
 from fgloc.frames import quaternion_yaw
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import FloatArray, LandmarkMap
 from fgloc_datasets.sim.scenario import Scenario
 from fgloc_datasets.sim.scene import make_ground, outline

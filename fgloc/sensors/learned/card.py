@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
-from fgloc.config import Section
+from fgloc.config import NoiseDensity, Section
 from fgloc.sensors.base import Mounting, Signal, WheelJoints
 from fgloc.sensors.gyro import CHANNELS as _GYRO_CHANNELS
-from fgloc.sensors.settings import NoiseDensity
 from fgloc.sensors.wheels.sensor import CHANNELS as _WHEEL_CHANNELS
 from fgloc.types import MotionEvent, Step
 

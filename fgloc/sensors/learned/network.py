@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fgloc import se2
+from fgloc.config import NoiseDensity
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Signals
-from fgloc.sensors.settings import NoiseDensity
 from fgloc.types import ControlEvent, FloatArray, MotionMeasurement
 
 Float32Array = NDArray[np.float32]

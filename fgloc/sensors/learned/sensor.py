@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from fgloc import se2
+from fgloc.config import MotionConfig
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.files.atomic import atomic_file
 from fgloc.sensors.base import (
@@ -40,7 +41,6 @@ from fgloc.sensors.learned.network import (
     RecurrentNetwork,
     VelocityModel,
 )
-from fgloc.sensors.settings import MotionConfig
 from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Setting, Step
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from fgloc.config import Config
+from fgloc.config import Config, MarkersConfig
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
@@ -33,7 +33,6 @@ from fgloc.sensors.markers.edges import (
     subpixel,
 )
 from fgloc.sensors.markers.images import CornersEvent, GrayImage, ImageError, ImageEvent, MarkerCorners, decode
-from fgloc.sensors.settings import MarkersConfig
 from fgloc.types import Event, FloatArray, LandmarkMap, RawEvent, SightingsEvent
 
 _LOOKAHEAD = 4  # images that may be detected before the consumer asks for them

@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from fgloc import se2
+from fgloc.config import WheelsConfig
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.sensors.failures import Carriage, Change, EventFailure, Failure, Scene
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import Event, FloatArray
 

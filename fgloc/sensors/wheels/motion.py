@@ -11,8 +11,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import WheelsConfig
 from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, Parameter, Rank
-from fgloc.sensors.settings import WheelsConfig
 from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, TicksTrack, Track, TwistTimeline
 from fgloc.types import FloatArray, MotionMeasurement, Setting, Step
 

@@ -42,7 +42,7 @@ from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
-    from fgloc.sensors.settings import WheelsConfig
+    from fgloc.config import WheelsConfig
 
 
 def _effort(events: Sequence[JointsEvent], origin_ns: int, mounting: Mounting) -> Signal | None:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import NoiseDensity, WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.frames import quaternion_yaw
 from fgloc.se2 import wrap
-from fgloc.sensors.settings import NoiseDensity, WheelsConfig
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, FloatArray, MotionEvent, Step
 
