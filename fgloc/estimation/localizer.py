@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -43,6 +44,11 @@ class MapFrame:
         self.T_map_graph = np.zeros(3)
         self._given: dict[int, FloatArray] = {}  # poses in the map's frame, by keyframe, evenly thinned out
         self._every, self._last = 1, (-1, np.zeros(3))
+        self._loose = math.inf  # first keyframe that nothing connects yet with those before it
+
+    def begin_segment(self) -> None:
+        """Let the poses to come fix no frame until the graph moves them to those before: nothing else connects them."""
+        self._loose = min(self._loose, self._last[0] + 1)
 
     def place(self, k: int, pose: FloatArray, estimator: Estimator) -> FloatArray:
         """Pose ``(3,)`` of the newest keyframe ``k`` in the map's frame."""
@@ -62,6 +68,9 @@ class MapFrame:
 
     def _move(self, estimator: Estimator) -> None:
         now = {k: pose for k in self._given if (pose := estimator.smoothed(k)) is not None}
+        if settled := {k: pose for k, pose in now.items() if k < self._loose}:
+            now, self._given = settled, {k: pose for k, pose in self._given.items() if k < self._loose}
+        self._loose = math.inf
         if now:
             given = np.array([self._given[k] for k in now])
             self.T_map_graph = se2.rigid(_points(np.array(list(now.values()))), _points(given))
@@ -104,9 +113,12 @@ class Recorder:
         self._makes_map = makes_map and config.estimator.ground == "flat"
         self._frame = MapFrame() if self._makes_map else None
 
-    def begin_segment(self) -> None:
-        """Nothing connects what comes with the poses given before."""
-        self._frame = MapFrame() if self._makes_map else None
+    def begin_segment(self, told: bool) -> None:
+        """Connect nothing with the poses given before until the graph does; a pose that is told is in the graph's frame."""
+        if self._frame is not None and not told:
+            self._frame.begin_segment()
+        elif self._makes_map:
+            self._frame = MapFrame()
 
     def count(self, frame: Keyframe) -> None:
         """Count the factors of a new keyframe."""
@@ -324,10 +336,10 @@ class Localizer:
         if self._segment not in (-1, step.segment):
             self._recorder.clock_jumped(self.estimator.k + 1, step)
         self._segment = step.segment
-        self._recorder.begin_segment()
+        known, self._restart = self._restart, None
+        self._recorder.begin_segment(told=known is not None)
         self.motion.begin_segment(step)
         self.sightings.begin_segment()
-        known, self._restart = self._restart, None
         self._prior = self.tracking.begin_segment(self.estimator.belief, known)
 
     def _begin(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:

@@ -41,6 +41,17 @@ def test_after_a_loop_poses_are_given_in_the_frame_in_which_those_before_move_le
     assert apart(moved) < 0.6 * apart(np.array(graph.true))
 
 
+def test_poses_after_a_gap_fix_no_frame_until_the_graph_connects_them_with_those_before():
+    graph, frame = Drifting(50, 0.0), MapFrame()
+    given = [frame.place(k, graph.smoothed(k), graph) for k in range(40)]
+    frame.begin_segment()
+    graph.drifted[40:] = [se2.compose((0.7, -0.3, 0.2), pose) for pose in graph.drifted[40:]]  # a guess
+    given += [frame.place(k, graph.smoothed(k), graph) for k in range(40, 45)]
+    graph.closed = True
+    given += [frame.place(k, graph.smoothed(k), graph) for k in range(45, 50)]
+    assert np.array(given[:40] + given[45:]) == pytest.approx(np.array(graph.true[:40] + graph.true[45:]), abs=1e-9)
+
+
 def test_a_long_run_compares_a_bounded_number_of_poses():
     graph, frame = Drifting(3000, 0.5), MapFrame()
     for k in range(2990):
