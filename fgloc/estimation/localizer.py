@@ -114,7 +114,7 @@ class Recorder:
         self._frame = MapFrame() if self._makes_map else None
 
     def begin_segment(self, told: bool) -> None:
-        """Connect nothing with the poses given before until the graph does; a pose that is told is in the graph's frame."""
+        """Connect what comes with the poses given before only by the graph; a told pose is in the graph's frame."""
         if self._frame is not None and not told:
             self._frame.begin_segment()
         elif self._makes_map:
