@@ -171,6 +171,8 @@ SHEET: tuple[Trap, ...] = (
             Trap(name, "ticks for angles", r"wheels\.ticks|joints\.unit", r"ticks|not (angles|radians|rad)"),
             Trap(name, "moves sideways", r"wheels\.sideways|odometry\.sideways", r"sideways|mecanum|omnidirectional"),
             Trap(name, "wheels 7 % short", r"(wheels|truth)\.scale", rf"{_NUMBER} times", 1.073, 0.02),
+            *((Trap(name, "turns 10 % more (wheels, and 0.358 m for 0.369)", r"wheels\.turn", rf"turns {_NUMBER}", 1.10, 0.02),)
+              if name == "mecanum_bag2" else ()),
             Trap(name, "truth freezes", r"truth\.(frozen|repeated)", r"truth.*(frozen|freez|repeat)|pose.*repeat"),
             Trap(name, "truth's plane tilted by 3.2°", r"truth\.(tilt|plane)", r"truth.*tilt"),
         )

@@ -20,6 +20,7 @@ from fgloc.errors import EstimatorError
 from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation import one_blas_thread
+from fgloc.recording.info import unread_map
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
@@ -54,9 +55,13 @@ class Outcome:
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
         unused = unused_sightings(rejections, recording.roles, seen)
         known = {finding.code for finding in wrong.findings}
+        unread = unread_map(recording) if parts.landmark_map is not None and not recording.problems else None
         # All but images was compared before the run
         seen_in_images = parts.diagnosis.findings() if wrong.checked and parts.camera is not None else ()
         findings = [
+            *note(
+                "map.unused", () if unread is None or parts.config.estimator.initial_pose else (unread,), Severity.ERROR
+            ),
             *wrong.findings,
             *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),

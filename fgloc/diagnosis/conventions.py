@@ -53,6 +53,7 @@ _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or m
 _UNSURE = 0.1  # share of a scale by which it is not known
 _VARIED = 0.05  # rad/s, m/s: standard deviation of a motion that tells one time from another
 _WHEELS_OFF = 0.2  # log scale of a truth: wheels may be off by less, and a truth that is no unit is seldom off by more
+_PRIOR_SIGMAS = 4.0  # of the wheels, by which a truth may find them off: what is further off no run estimates
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _ASIDE = 0.1  # share of the way that is sideways: the lateral part of a turn about a sensor is less
 _GYRO_SCALE = 0.02  # by which an uncalibrated gyro may be off
@@ -68,6 +69,7 @@ _TELLS = 0.7  # share of a turn that another explains: two that tell the same
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
+_TWIST_LATE_S, _SILENT_S = 0.1, 0.6  # of a twist against its pose; without a message motion is not known
 _SAME_YAW = 1e-3  # share of a turn by which a truth's yaw differs from the odometry's that it is
 _WIDE_M, _IN_PLANE, _LEVEL_DEG = 0.3, 0.5, 1.0  # of a truth's places: spread, share off their plane, tilt of it
 _PLANES = 8  # blocks of time of a plane's jackknife
@@ -165,7 +167,9 @@ def conventions(
         late_s = replace(truth.late_s, value=truth.late_s.value - later_s)
         truth = replace(truth, late_s=late_s if _varied(path) else Figure(0.0, math.inf))
         for code, text, lines, figure in _truth_lines(found, truth):
-            found.add(code, text, lines, figure, Severity.WARNING)
+            of_wheels = code == "wheels.scale" and figure is not None
+            sigma = found.config.wheels.scale_sigma if of_wheels else math.inf
+            found.add(code, text, lines, figure, _refuted(figure or Figure(1.0, 0.0), sigma))
     return found
 
 
@@ -213,6 +217,7 @@ def _odometry(found: Conventions, signals: Signals) -> None:
     grave = Severity.ERROR if source == "twist" else Severity.WARNING if source == "auto" else Severity.NOTE
     _twist_speed(found, (moved / dt)[whole], middle[whole], (twists[0] + 1j * twists[1])[whole], grave)
     _twist_rate(found, (turned / dt)[whole], twists[2][whole], moved[whole], middle[whole], grave)
+    _twist_late(found, rows, yaw)
     body = (moved * np.exp(-1j * middle) / dt)[whole]
     aside, most = float(np.abs(body.imag).sum()), float(np.abs(body).sum())
     if aside > _ASIDE * most and np.ptp(twists[1]) > 0.0 and np.corrcoef(body.imag, twists[1][whole])[0, 1] > _TELLS:
@@ -292,6 +297,24 @@ def _twist_rate(
         lines = _of_twist(found, {"wheels.scale_omega": round(math.pi / 180.0 * found.config.wheels.scale_omega, 7)})
         text = f"The odometry's yaw rate is in degrees: it is {c:.3g} times the change of its pose's yaw"
         found.add("odometry.yaw_unit", text, lines, Figure(1.0 / c, 0.0), grave)
+
+
+def _twist_late(found: Conventions, rows: FloatArray, yaw: FloatArray) -> None:
+    """Name a twist that follows its own pose late: it is smoothed, or computed from older poses."""
+    times = rows[:, 0]
+    gaps = np.cumsum(np.append(0.0, np.diff(times)) > _SILENT_S, dtype=np.int64)
+    fit = fit_rate(Path(times, np.column_stack([rows[:, 1:3], yaw]), gaps), times, turn_by(times, rows[:, 6]))
+    interval_s = float(np.median(np.diff(times)))  # a mean twist of the last interval is half of it late
+    if fit is None or fit.share < _TELLS or not fit.late_s.off(0.0, _TWIST_LATE_S + 0.5 * interval_s):
+        return
+    late, used = fit.late_s, found.config.wheels.source == "twist"
+    text = (
+        f"The odometry's twist is {abs(late.value):.2f} ± {late.sigma:.2f} s {'late' if late.value > 0 else 'early'} "
+        "against its own pose: it is smoothed or delayed"
+    )
+    lines = {"wheels.source": "pose"} if used else {}
+    severity = Severity.WARNING if used else Severity.NOTE
+    found.add("odometry.twist_late", text if used else f"{text}; the pose is used", lines, late, severity)
 
 
 def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
@@ -1044,11 +1067,17 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
             scale_omega = round(found.config.wheels.scale_omega * turns.value, 4)
             text = (
                 f"By the truth the robot turns {turns.value:.3f} ± {turns.sigma:.2g} times as much as its wheels say "
-                f"(a track or a geometry that is not the robot's); if so, wheels.scale_omega is {scale_omega:g}"
+                f"(a track or a geometry that is not the robot's); if so, set wheels.scale_omega: {scale_omega:g}"
             )
-            found.add("wheels.turn", text, {}, turns, Severity.WARNING)
+            sigma = math.hypot(found.config.wheels.turn_scale_sigma, found.config.wheels.scale_sigma)
+            found.add("wheels.turn", text, {}, turns, _refuted(turns, sigma))
         fit = fit_body(path.turned(turns.value), own)
     return None if fit is None or fit.misfit > 0.25 else fit
+
+
+def _refuted(by_truth: Figure, prior_sigma: float) -> Severity:
+    """Severity of a scale of the wheels by the truth, which is never written: only evaluation reads a truth."""
+    return Severity.ERROR if abs(math.log(by_truth.value)) > _PRIOR_SIGMAS * prior_sigma else Severity.WARNING
 
 
 def _shared_yaw(found: Conventions, signals: Signals, truth: FloatArray) -> None:
@@ -1127,7 +1156,7 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
             scale_v = round(found.config.wheels.scale_v * fit.scale.value, 4)
             text = (
                 f"By the truth the robot moves {fit.scale.value:.3f} ± {fit.scale.sigma:.2g} times as far as its "
-                f"wheels say; if the truth's metres are right, wheels.scale_v is {scale_v:g}"
+                f"wheels say; if the truth's metres are right, set wheels.scale_v: {scale_v:g}"
             )
             yield "wheels.scale", text, {}, fit.scale
     elif fit.scale.off(1.0, 0.08):

@@ -390,8 +390,10 @@ class _Places:
 
     def by_priors(self, jacobian: FloatArray) -> FloatArray:
         """Standard deviations ``(6,)`` of the unknowns by what the priors may be off by, at a fit's Jacobian."""
-        covariance = np.linalg.pinv(jacobian.T @ jacobian)
-        means = self._repeated * covariance[:, [2, 3, 5]] / np.array([self.PLACE_M, self.PLACE_M, self._turn_sigma])
+        priors = np.array([self.PLACE_M, self.PLACE_M, self._turn_sigma])
+        J, information = jacobian[: 2 * len(self._z)], np.zeros(6)
+        information[[2, 3, 5]] = self._repeated * priors**-2.0
+        means = np.linalg.pinv(J.T @ J + np.diag(information))[:, [2, 3, 5]] * (self._repeated / priors)
         return np.asarray(np.linalg.norm(means, axis=1))
 
     def misfit(self, x: FloatArray) -> float:

@@ -204,6 +204,8 @@ _SETTINGS = {  # of a sensor whose messages are dropped
     "sightings": "markers.sigma_px, map.position_sigma_m, gate.max_range",
 }
 
+_MOTION = ("odometry", "joints", "command")  # of which one is used
+
 
 def all_findings(
     result: RunData, nees_over_3: float | None, rejections: Mapping[str, int], keyframes: int
@@ -246,10 +248,12 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
             reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
             unit = " Angles that change so fast are ticks or degrees, not radians." if 2 * too_fast > count else ""
+            used = sensor not in _MOTION or result.found is None or result.found.wheels in ("", sensor)
+            remedy = f"look at {_SETTINGS[sensor]}" if used else "the run's motion is of another source"
             yield Finding(
                 f"{sensor}.dropped",
-                f"{count} messages of {sensor} were dropped ({reasons}); look at {_SETTINGS[sensor]}.{unit}",
-                Severity.WARNING,
+                f"{count} messages of {sensor} were dropped ({reasons}); {remedy}.{unit}",
+                Severity.WARNING if used else Severity.NOTE,
                 value=float(count),
             )
 

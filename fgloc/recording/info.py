@@ -400,6 +400,22 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     return found
 
 
+def unread_map(recording: Recording) -> str | None:
+    """Sentence on a map that is given while nothing of the recording is read that sees landmarks; None: something is.
+
+    Args:
+        recording: whose roles and topics are known.
+    """
+    if recording.roles.keys() - _NO_PLACE:
+        return None
+    unread = " ".join(_unused(recording))
+    return (
+        "A map is given, but the recording has no images and no sightings that are read: the run is dead reckoning, "
+        f"and where on the map it takes place is not known.{' ' + unread if unread else ''} Run it without the map, or "
+        "give estimator.initial_pose."
+    )
+
+
 def _unused(recording: Recording) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing here reads."""
     return [

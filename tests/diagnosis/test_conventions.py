@@ -13,6 +13,7 @@ import yaml
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of
 from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.types import Finding, Landmark, LandmarkMap, Severity, ordered
 from fgloc_datasets.bag import BagWriter
@@ -44,6 +45,7 @@ class Broken:
     yaw_rate: float = 1.0
     turn: float = 1.0
     world_twist: bool = False
+    twist_late: float = 0.0
     truth: str = ""
     truth_late: float = 0.0
     truth_yaw: float = 0.0
@@ -67,6 +69,8 @@ def record(folder: Path, wrong: Broken) -> Path:
             v, turned = wrong.speed * SPEED[k], YAW[k] if wrong.world_twist else 0.0
             twist = (v * math.cos(turned), v * math.sin(turned), wrong.yaw_rate * RATE[k])
             pose = (X[k], Y[k], YAW[k])
+            if wrong.twist_late:
+                twist = (SPEED[k], 0.0, RATE[max(k - round(wrong.twist_late / STEP_S), 0)])
             if wrong.turn != 1.0:
                 heading = wrong.turn * YAW
                 pose = (*(float(STEP_S * SPEED[:k] @ f(heading[:k])) for f in (np.cos, np.sin)), heading[k])
@@ -204,6 +208,35 @@ def test_a_truth_tells_how_much_wheels_turn(tmp_path):
     assert [f.code for f in found] == ["wheels.turn"]
     assert found[0].value == pytest.approx(2.0, abs=0.05)
     assert not found[0].lines  # a truth judges the wheels in sentences only
+    assert found[0].severity is Severity.ERROR  # beyond what a run estimates
+
+    wide = config_of(
+        {"recording": {"topics": {"imu": "none", "sightings": "none"}}, "wheels": {"turn_scale_sigma": 0.5}}
+    )
+    assert [f.severity for f in conventions_of(tmp_path / "bag", wide) if f.code == "wheels.turn"] == [Severity.WARNING]
+
+
+def test_wheels_that_turn_too_much_are_no_mounting_and_no_clock(tmp_path):
+    bag = record(tmp_path, Broken(turn=1.15))
+    config = config_of({"recording": {"topics": {"imu": "none", "truth": "none"}}})
+    for map_path in (bag.parent / "map.yaml", None):
+        codes = {f.code for f in inspect_all(bag, map_path, config).found}
+        assert not codes & {"sightings.mounting", "clock.sightings", "clock.odometry"}
+
+
+def test_a_twist_that_follows_its_pose_late_is_named(tmp_path):
+    found = {f.code: f for f in inspect_all(record(tmp_path, Broken(twist_late=0.4)), None, Config()).found}
+    assert found["odometry.twist_late"].value == pytest.approx(0.4, abs=0.05)
+    assert found["odometry.twist_late"].severity is Severity.NOTE  # the pose is used
+
+
+def test_a_map_that_nothing_in_the_recording_sees_is_named_first(tmp_path):
+    bag = record(tmp_path, Broken())
+    config = config_of({"recording": {"topics": {"imu": "none", "sightings": "none"}}})
+    found = run(bag, tmp_path / "map.yaml", config, "online").findings
+    assert (found[0].code, found[0].severity) == ("map.unused", Severity.ERROR)
+    assert "map.unused" not in {f.code for f in run(bag, None, config, "online").findings}
+    assert "map.unused" not in {f.code for f in run(bag, tmp_path / "map.yaml", Config(), "online").findings}
 
 
 def test_remarks_are_not_named_before_what_was_compared():
