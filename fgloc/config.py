@@ -155,6 +155,9 @@ class LandmarksConfig(Section):
     bearing_bias_sigma_rad: float = Field(
         0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
     )
+    position_sigma_m: float = Field(
+        0.0, ge=0, le=1.0, description="m: how far off the sensor is mounted, ahead and to the left; estimated"
+    )
     time_offset_sigma_s: float = Field(
         0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
     )

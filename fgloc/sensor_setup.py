@@ -137,7 +137,7 @@ def first_size(events: Iterable[Event]) -> tuple[int, int] | None:
 # --- Sensors, by the facts --------------------------------------------------------------------------------------------
 
 _ESTIMATED = {  # uncertainties of what is estimated of a sensor of landmarks on a known map
-    "landmarks": ("range_scale_sigma", "bearing_bias_sigma_rad", "time_offset_sigma_s"),
+    "landmarks": ("range_scale_sigma", "bearing_bias_sigma_rad", "position_sigma_m", "time_offset_sigma_s"),
     "camera": (
         "position_sigma_m",
         "rotation_sigma_rad",

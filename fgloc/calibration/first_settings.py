@@ -23,7 +23,12 @@ from fgloc.sensors import registry
 from fgloc.sensors.base import FirstLook, FirstSection
 from fgloc.types import Event, Finding, ordered
 
-_UNCALIBRATED = {"range_scale_sigma": 0.03, "bearing_bias_sigma_rad": 0.02, "time_offset_sigma_s": 0.05}
+_UNCALIBRATED = {
+    "range_scale_sigma": 0.03,
+    "bearing_bias_sigma_rad": 0.02,
+    "position_sigma_m": 0.05,
+    "time_offset_sigma_s": 0.05,
+}
 _WHEELS = (
     "  # Nobody has calibrated this odometry: radii and track may be off by more than those of measured wheels.",
     "  scale_sigma: 0.02",

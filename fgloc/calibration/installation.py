@@ -81,6 +81,8 @@ def _sighting_rows() -> list[_Row]:
         ("sightings.range_scale", "sightings.range_scale", 1.0, 1.0),
         ("sightings.bearing_offset_rad", "sightings.bearing_offset_rad", 0.0, 1.0),
         ("sightings.time_offset_s", "sightings.time_offset_s", 0.0, 1.0),
+        ("sightings.x_m", "sightings.x_m", 0.0, 1.0),
+        ("sightings.y_m", "sightings.y_m", 0.0, 1.0),
     ]
 
 

@@ -375,7 +375,13 @@ class GaussianSum:
     def _cov(self, m: PointMeasurement) -> FloatArray:
         """Of the sighting: with the errors that it shares with the last one of its landmark, and with all others."""
         config = self._config
-        cov = m.cov + np.diag([config.bearing_bias_sigma_rad**2, (config.range_scale_sigma * m.range_m) ** 2])
+        placed = config.position_sigma_m
+        cov = m.cov + np.diag(
+            [
+                config.bearing_bias_sigma_rad**2 + (placed / max(m.range_m, placed, 1e-9)) ** 2,
+                (config.range_scale_sigma * m.range_m) ** 2 + placed**2,
+            ]
+        )
         return cov * repetition(config.repeat_s, self._last_ns.get(m.landmark_id), m.stamp_ns)
 
     def _prune(self) -> None:

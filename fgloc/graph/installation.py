@@ -21,6 +21,7 @@ from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
 SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
+PLACE = ("x_m", "y_m")  # of that sensor in the base frame, where it may be off: behind the others in its block
 MARKER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 POINT = ("x_m", "y_m")
 GROUND = ("ground.z_m", "ground.roll_rad", "ground.pitch_rad")
@@ -240,6 +241,8 @@ def installation_of(
     else:
         sensor = (rb.range_scale_sigma, rb.bearing_bias_sigma_rad, rb.time_offset_sigma_s)
         sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}
+        if rb.position_sigma_m > 0.0:
+            sigmas |= {f"sightings.{name}": rb.position_sigma_m for name in PLACE}
     if len(landmark_map) <= most:
         for i, landmark in sorted(landmark_map.landmarks.items()):
             sigmas |= _landmark_sigmas(i, landmark, config, corners)

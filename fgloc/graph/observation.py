@@ -418,23 +418,23 @@ class PlanarBatch:
         self._twist = np.array([m.twist for m in seen])
         self._offset = np.array([m.offset_s for m in seen])
         first = installation.blocks.get("sightings")
-        self._sensor = None if first is None else np.arange(first[0], first[0] + 3)
+        sensor = [] if first is None else [first[0] + i for i in range(first[1])]
+        self._sensor = np.array(sensor + [-1] * (5 - len(sensor)))
         self._up = np.array([landmarks[m.landmark_id].rotation[2] for m in seen])
         place = np.array([landmark_block(installation, m.landmark_id, 2) for m in seen])
         turn = np.array([landmark_block(installation, m.landmark_id, 6) for m in seen])
-        self._columns = np.full((len(seen), 8), -1)  # sensor, place, rotation of the landmark
-        if self._sensor is not None:
-            self._columns[:, :3] = self._sensor
-        self._columns[:, 3:5] = np.where(place[:, None] >= 0, place[:, None] + np.arange(2), -1)
-        self._columns[:, 5:] = np.where(turn[:, None] >= 0, turn[:, None] + np.arange(3, 6), -1)
+        self._columns = np.full((len(seen), 10), -1)  # sensor, place, rotation of the landmark
+        self._columns[:, :5] = self._sensor
+        self._columns[:, 5:7] = np.where(place[:, None] >= 0, place[:, None] + np.arange(2), -1)
+        self._columns[:, 7:] = np.where(turn[:, None] >= 0, turn[:, None] + np.arange(3, 6), -1)
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
         """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
         n = len(poses)
         held = np.append(theta, 0.0)
-        sensor = np.zeros(3) if self._sensor is None else theta[self._sensor]
-        place = self._place[:, :2] + held[self._columns[:, 3:5]]
-        facing = self._place[:, 2] + np.einsum("ni,ni->n", self._up, held[self._columns[:, 5:]])
+        sensor = held[self._sensor]
+        place = self._place[:, :2] + held[self._columns[:, 5:7]]
+        facing = self._place[:, 2] + np.einsum("ni,ni->n", self._up, held[self._columns[:, 7:]])
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         R = np.stack([np.stack([c, s], 1), np.stack([-s, c], 1)], 1)  # R_base_map
         q = np.einsum("nij,nj->ni", R, place - poses[:, :2])
@@ -446,6 +446,7 @@ class PlanarBatch:
         seen = scale * self._point @ np.array([[co, so], [-so, co]]).T
         residual = np.zeros((n, 3))
         predicted = q + late[:, None] * flow[:, :2]
+        predicted = predicted - sensor[3:]  # from the base as it is configured
         residual[:, :2] = predicted - seen
         turn = np.zeros((n, 2, 2))  # of the point by a later stamp
         turn[:, 0, 0] = turn[:, 1, 1] = 1.0
@@ -456,9 +457,12 @@ class PlanarBatch:
         J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
         J[:, 0, 2], J[:, 1, 2] = q[:, 1], -q[:, 0]
         J[:, :2] = turn @ J[:, :2]
-        H = np.zeros((n, 3, 8))  # by scale and bearing of the predicted point: the noise of the measured one would bias
+        H = np.zeros(
+            (n, 3, 10)
+        )  # by scale and bearing of the predicted point: the noise of the measured one would bias
         H[:, :2, 0], H[:, 0, 1], H[:, 1, 1], H[:, 2, 1] = -predicted, -predicted[:, 1], predicted[:, 0], 1.0
-        H[:, :, 2], H[:, :2, 3:5], H[:, 2, 5:] = flow, turn @ R, self._up
+        H[:, 0, 3], H[:, 1, 4] = -1.0, -1.0
+        H[:, :, 2], H[:, :2, 5:7], H[:, 2, 7:] = flow, turn @ R, self._up
         H = np.where(self._columns[:, None] >= 0, H, 0.0)
         W = self._whitening
         return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))

@@ -37,6 +37,7 @@ from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.measurements import PointMeasurement
+from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent, Landmark, LandmarkMap, MotionMeasurement, Step, by_class
@@ -427,6 +428,31 @@ def test_scale_and_offset_of_ranges_and_bearings_are_found_with_an_honest_sigma(
         poses = np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates[50:]]) / 3
         assert 0.2 < poses < 3.0
     assert np.mean(sizes) < 5.0  # 2 on average
+
+
+def displaced(event, ahead: float, left: float):
+    """Ranges and bearings as a sensor sees them that sits elsewhere on the robot."""
+    if not isinstance(event, RangeBearingEvent):
+        return event
+    seen = []
+    for s in event.sightings:
+        x, y = s.range_m * math.cos(s.bearing_rad) - ahead, s.range_m * math.sin(s.bearing_rad) - left
+        seen.append(replace(s, range_m=math.hypot(x, y), bearing_rad=math.atan2(y, x)))
+    return replace(event, sightings=tuple(seen))
+
+
+def test_the_place_of_a_sensor_of_ranges_and_bearings_is_found_with_an_honest_sigma():
+    there = np.array([0.08, -0.05])
+    settings = exact(landmarks={"position_sigma_m": 0.1})
+    for seed in range(3):
+        world = World(beacons(), seed=seed)
+        chain = Chain(settings, world.map)
+        chain.run([displaced(event, *there) for event in world.events()])
+        known, index = chain.localizer.factors.estimated, chain.localizer.factors.installation.index
+        rows = [index["sightings.x_m"], index["sightings.y_m"]]
+        error = known.mean[rows] - there
+        assert abs(error[0]) < 0.03  # to the left it is hardly told from the bearing on a circle
+        assert error @ np.linalg.solve(known.cov[np.ix_(rows, rows)], error) < 14.0  # 1 in 1000 is larger
 
 
 def test_poses_are_over_confident_where_a_wrong_range_is_taken_as_exact():

@@ -12,7 +12,7 @@ from robot_world import config, standing
 
 from fgloc import se2
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import CAMERA, MARKER, SENSOR, Installation, installation_of
+from fgloc.graph.installation import CAMERA, MARKER, PLACE, SENSOR, Installation, installation_of
 from fgloc.graph.noise import sighting_whitening
 from fgloc.graph.observation import MIN_DEPTH_M, Observations
 from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
@@ -134,11 +134,13 @@ def test_derivatives_of_corners_away_from_the_prior_are_those_of_finite_differen
             assert np.abs(dense[:, column] - H[:, column]).max() < (0.05 if of_marker else 1e-5) * scale + 1e-4
 
 
+@pytest.mark.parametrize("placed", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(3))
-def test_derivatives_of_planar_sightings_are_those_of_finite_differences(seed):
+def test_derivatives_of_planar_sightings_are_those_of_finite_differences(seed, placed):
     poses, landmark_map, seen = planar_scene(seed)
-    installation = installation_of(config(), landmark_map, False)
+    installation = installation_of(config(landmarks={"position_sigma_m": placed}), landmark_map, False)
     assert {f"sightings.{name}" for name in SENSOR} <= set(installation.names)
+    assert ({f"sightings.{name}" for name in PLACE} <= set(installation.names)) == (placed > 0.0)
     observed = Observations(seen, landmark_map.landmarks, installation)
     rng = np.random.default_rng(seed)
     check(observed, poses, np.zeros(len(installation)), 1e-4, noisy(installation))
