@@ -167,9 +167,10 @@ def conventions(
         late_s = replace(truth.late_s, value=truth.late_s.value - later_s)
         truth = replace(truth, late_s=late_s if _varied(path) else Figure(0.0, math.inf))
         for code, text, lines, figure in _truth_lines(found, truth):
-            of_wheels = code == "wheels.scale" and figure is not None
-            sigma = found.config.wheels.scale_sigma if of_wheels else math.inf
-            found.add(code, text, lines, figure, _refuted(figure or Figure(1.0, 0.0), sigma))
+            severity = Severity.WARNING
+            if code == "wheels.scale" and figure is not None:
+                severity = _refuted(figure, found.config.wheels.scale_sigma)
+            found.add(code, text, lines, figure, severity)
     return found
 
 
@@ -930,8 +931,11 @@ def _clocks(
     late: dict[str, Figure] = {}
     if gyro is not None and gyro.share > _TELLS:
         late["imu"] = gyro.late_s
-    if sensor is not None and (sensor.late_s.sigma < _LATE_S or _surely_late(sensor.late_s)) and _varied(path):
-        late["sightings"] = sensor.late_s
+    if sensor is not None and _varied(path):
+        lag, true = sensor.late_s, None if truth is None or truth.share < _TELLS else truth.late_s.value
+        refuting = true is not None and lag.off(true, _LATE_S, _LATE_SIGMAS)  # a truth that is late all by itself
+        if lag.sigma < _LATE_S or refuting or _surely_late(lag):
+            late["sightings"] = lag
     if (
         truth is not None
         and truth.share > _TELLS

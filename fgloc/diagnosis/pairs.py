@@ -556,6 +556,8 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
         late = speeds
     fits = {m: _body(path, poses, start, window_s, late, m) for m in (False, True)}
     mirrored = fits[True][1] < 0.5 * fits[False][1]
+    if fits[False][0][2] < 0.0 and fits[True][1] < 2.0 * fits[False][1]:  # it went so straight that both fit
+        mirrored = _course_turns(path, poses, start, window_s, late) < 0.0
     (alpha, lever, turns), misfit, travelled = fits[mirrored]
     if travelled < 0.1:
         return None
@@ -578,6 +580,14 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
         misfit,
         0.0 if rate is None else rate.share,
     )
+
+
+def _course_turns(path: Path, poses: FloatArray, start: FloatArray, window_s: float, late: float) -> float:
+    """Turn of a body's course from half a window to the next, times that of the wheels: negative for a mirror image."""
+    places = [_at(poses, start + late + share * window_s)[0] for share in (0.0, 0.5, 1.0)]
+    bend = ((places[2] - places[1]) * (places[1] - places[0]).conj()).imag
+    yaw = [np.interp(start + share * window_s, path.times, path.poses[:, 2]) for share in (0.25, 0.75)]
+    return float(bend @ (yaw[1] - yaw[0]))
 
 
 def _covered(times: FloatArray, at: FloatArray, longest_s: float = 0.25) -> NDArray[np.bool_]:
