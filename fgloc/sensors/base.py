@@ -19,7 +19,7 @@ from pydantic import Field, FiniteFloat
 
 from fgloc.files.settings import Section
 from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
-from fgloc.sensors.measurements import LandmarkSighting, PoseMeasurement
+from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
 from fgloc.types import Event, FloatArray, LandmarkMap, MotionEvent, Setting
 
 if TYPE_CHECKING:
@@ -366,7 +366,7 @@ class Context:
 
 
 class Sensor(Protocol):
-    """A sensor whose measurements depend on the robot's pose.
+    """A sensor whose measurements depend on the robot's pose: of landmarks of the map, or of places of its own.
 
     Attributes:
         name: key of ``robot.yaml`` and name of the entry point.
@@ -390,7 +390,7 @@ class Sensor(Protocol):
         """
         ...
 
-    def measure(self, event: Any) -> Iterable[PoseMeasurement]:
+    def measure(self, event: Any) -> Iterable[LandmarkMeasurement]:
         """What one event (that passed its check) measured, at its own stamp."""
         ...
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +71,16 @@ class LandmarkSensor:
             ConfigError: marker corners without map, and no marker size.
         """
         return tuple(self._measure[type(event)](event))
+
+    def known(self, measurements: Iterable[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
+        """Those of another package's sensor whose landmark the map has, and those of none."""
+        landmark_map, kept = self._context.landmark_map, []
+        for m in measurements:
+            if m.of_landmark and (landmark_map is None or m.landmark_id not in landmark_map):
+                self._context.rejections[f"{m.counted_as}.unknown_id"] += 1
+            else:
+                kept.append(m)
+        return kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +163,7 @@ class MotionCompensation:
                 late = [m.compensated(motion, cov) for m in late]
             measured.extend(late)
         for sensed in step.sensed:
-            now: list[LandmarkMeasurement] = list(self._sensor_of[type(sensed)].measure(sensed))
+            now = self._landmarks.known(self._sensor_of[type(sensed)].measure(sensed))
             if now and sensed.stamp_ns != step.stamp_ns:
                 motion, cov = self._motion_to(step, sensed.stamp_ns)
                 now = [m.compensated(motion, cov) for m in now]

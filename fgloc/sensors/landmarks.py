@@ -75,16 +75,10 @@ class SightingContext:
 
     def polar(self, stamp_ns: int, landmark_id: int, place: FloatArray, cov_xy: FloatArray) -> PointMeasurement | None:
         """Range and bearing from the base of a place ``(2,)`` in the base frame with covariance ``(2, 2)``."""
-        x, y = (float(v) for v in place)
-        distance = math.hypot(x, y)
-        if distance < MIN_RANGE_M:
+        if math.hypot(float(place[0]), float(place[1])) < MIN_RANGE_M:
             self.reject("range")
             return None
-        J = np.array([[-y / distance**2, x / distance**2], [x / distance, y / distance]])
-        cov = J @ cov_xy @ J.T
-        bearing = math.atan2(y, x)
-        cauchy_k = self.config.landmarks.cauchy_k
-        return PointMeasurement(stamp_ns, landmark_id, distance, bearing, 0.5 * (cov + cov.T), cauchy_k=cauchy_k)
+        return PointMeasurement.of_point(stamp_ns, landmark_id, place, cov_xy, self.config.landmarks.cauchy_k)
 
     def planar(
         self, stamp_ns: int, landmark_id: int, place: FloatArray, cov_xy: FloatArray, yaw: float, yaw_var: float

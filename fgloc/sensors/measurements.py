@@ -247,16 +247,16 @@ class PixelMeasurement:
         """Weight in comparison with others of its kind [1/px²]."""
         return 1.0 / self.sigma_px**2
 
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> PixelMeasurement:
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
         """With the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s, jitter_s=jitter_s)
 
-    def tilted(self, T: FloatArray, rates: FloatArray) -> PixelMeasurement:
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
         """As seen from a tilted base; see `LandmarkSighting.tilted`."""
         camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
         return replace(self, camera=camera, tilting=rates)
 
-    def compensated(self, motion: FloatArray, cov: FloatArray) -> PixelMeasurement:
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
         ad = se2.adjoint(motion)
         x, y, yaw = motion
@@ -267,7 +267,7 @@ class PixelMeasurement:
         spread = cov if self.motion_cov is None else cov + self.motion_cov
         return replace(self, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ self.twist)
 
-    def scaled(self, factor: float) -> PixelMeasurement:
+    def scaled(self, factor: float) -> Self:
         """With the variance of the corners times a factor."""
         return replace(self, sigma_px=math.sqrt(factor) * self.sigma_px)
 
@@ -339,6 +339,17 @@ class PointMeasurement:
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement
 
+    @classmethod
+    def of_point(
+        cls, stamp_ns: int, landmark_id: int, point: FloatArray, cov: FloatArray, cauchy_k: float = 3.0
+    ) -> Self:
+        """Range and bearing of a point ``(2,)`` in the base frame, not its origin, with covariance ``(2, 2)``."""
+        x, y = (float(v) for v in point)
+        distance = math.hypot(x, y)
+        J = np.array([[-y / distance**2, x / distance**2], [x / distance, y / distance]])
+        polar = J @ cov @ J.T
+        return cls(stamp_ns, landmark_id, distance, math.atan2(y, x), 0.5 * (polar + polar.T), cauchy_k=cauchy_k)
+
     @property
     def point(self) -> FloatArray:
         """Position in the base frame ``(2,)`` [m]."""
@@ -354,15 +365,15 @@ class PointMeasurement:
         """Weight in comparison with others of its kind."""
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> PointMeasurement:
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
         """With the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
-    def tilted(self, T: FloatArray, rates: FloatArray) -> PointMeasurement:
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
         """The same: ranges are taken to be in the plane."""
         return self
 
-    def compensated(self, motion: FloatArray, cov: FloatArray) -> PointMeasurement:
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
         ad = se2.adjoint(motion)
         x, y = self.point
@@ -371,7 +382,7 @@ class PointMeasurement:
         added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
         return replace(self, range_m=r, bearing_rad=bearing, cov=self.cov + added, twist=ad @ self.twist)
 
-    def scaled(self, factor: float) -> PointMeasurement:
+    def scaled(self, factor: float) -> Self:
         """With the covariance times a factor."""
         return replace(self, cov=self.cov * factor)
 
@@ -472,21 +483,21 @@ class FrameMeasurement:
         """Weight in comparison with others of its kind."""
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> FrameMeasurement:
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
         """With the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
-    def tilted(self, T: FloatArray, rates: FloatArray) -> FrameMeasurement:
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
         """The same: poses are taken to be in the plane."""
         return self
 
-    def compensated(self, motion: FloatArray, cov: FloatArray) -> FrameMeasurement:
+    def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
         pose = se2.compose(motion, self.pose)
         moved = se2.compose_cov(cov, self.pose, self.cov)
         return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
 
-    def scaled(self, factor: float) -> FrameMeasurement:
+    def scaled(self, factor: float) -> Self:
         """With the covariance times a factor."""
         return replace(self, cov=self.cov * factor)
 
@@ -560,7 +571,7 @@ class PoseMeasurement(ABC):
         return ()
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """Other interpretations of the reading, most probable first, tried where the chi-square gate refuses it.
+        """Other interpretations of the reading, most probable first, tried where the chi-square gate rejects it.
 
         Args:
             predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.

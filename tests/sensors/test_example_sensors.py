@@ -1,4 +1,4 @@
-"""Sensors of other packages, by the two of examples/: found, configured, validated, fused, and made to fail."""
+"""Sensors of other packages, by those of examples/: found, configured, validated, fused, and made to fail."""
 
 import importlib
 import json
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from source_roots import PYTHONPATH
 
+from benchmarks.equal_cases import Drive
 from benchmarks.example_sensors import example_sensors
 from benchmarks.sensors import only
 from fgloc import se2
@@ -23,10 +24,11 @@ from fgloc.evaluation.metrics import compute_metrics
 from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.runner import run
-from fgloc.sensors.base import Context
+from fgloc.sensors.base import Context, with_values
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
+from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.sim.record import record
 from fgloc_datasets.sim.scenario import Gnss, Scenario, Uwb
 from fgloc_datasets.sim.sensors import geodetic
@@ -302,6 +304,54 @@ def test_online_every_estimator_takes_both(recording, kind):
     result = run(recording / "bag", None, config, "online", check=False)
     assert compute_metrics(result, config).ate_rmse_m < 0.03
     assert result.counts["gnss"] > 40
+
+
+# --- Landmarks of the map ---------------------------------------------------------------------------------------------
+
+NO_CLOCK = {"time_offset_sigma_s": 0.0}  # that of another package's sensor is taken as given
+
+
+def write_cloud(bag, topic, stamp_ns, seen, received_ns):
+    """Ranges and bearings as the points of a cloud, with an unknown one."""
+    points = [
+        bag.make("geometry_msgs/msg/Point32", x=r * math.cos(b), y=r * math.sin(b), z=0.0)
+        for _, r, b in [*seen, (99, 1.0, 0.0)]
+    ]
+    ids = np.array([*(i for i, _, _ in seen), 99], dtype=np.float32)
+    channel = bag.make("sensor_msgs/msg/ChannelFloat32", name="id", values=ids)
+    content = {"points": points, "channels": [channel]}
+    bag._write("/reflectors", "sensor_msgs/msg/PointCloud", stamp_ns, received_ns, "base_link", content)
+
+
+@pytest.fixture(scope="module")
+def drives(folders, tmp_path_factory):
+    """A drive among beacons, one of which was moved, twice: seen by the built-in sensor and by that of examples/."""
+    made = tmp_path_factory.mktemp("drives")
+    Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "beacons")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BagWriter, "range_bearing", write_cloud)
+        Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "reflectors")
+    return made
+
+
+@pytest.mark.parametrize("mode", ["online", "batch"])
+def test_landmarks_of_another_package_are_treated_as_those_of_the_built_in_sensor(drives, mode):
+    """First pose, gate, shared information, the moved landmark and the fit are the same."""
+    results = {}
+    for name in ("beacons", "reflectors"):
+        config = load_config(drives / name / "robot.yaml")
+        config = with_values(config, "landmarks", NO_CLOCK)
+        if name == "reflectors":
+            config = with_values(config, "reflectors", {"range_sigma_m": 0.05, "bearing_sigma_rad": 0.015})
+        results[name] = run(drives / name / "bag", drives / name / "map.yaml", config, mode, check=False)
+    ours, theirs = results["beacons"], results["reflectors"]
+    assert len(theirs.trajectory) == len(ours.trajectory) > 80
+    assert np.abs(theirs.trajectory.poses - ours.trajectory.poses).max() < 1e-4  # points are of 32 bits
+    assert theirs.counts["reflectors"] == ours.counts["range_bearing"] > 50
+    reasons = [[(d.step, d.landmark_id, d.reason) for d in r.decisions if d.landmark_id >= 0] for r in (ours, theirs)]
+    assert reasons[0] == reasons[1]
+    assert theirs.rejections["reflectors.unknown_id"] > 50
+    assert "reflectors.quarantined" in theirs.rejections
 
 
 def command_line(folders, *arguments):
