@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from fgloc.frames import rpy_matrix
 from fgloc.sensors import registry
-from fgloc.sensors.base import Joined
+from fgloc.sensors.base import Joiner
 from fgloc.sensors.failures import Carriage, Change, EventFailure, Failure, Scene, When, by_receipt
 from fgloc.sensors.registry import SensorName, events_of
 from fgloc.types import Event, LandmarkMap, RawEvent, Sighting, SightingsEvent
@@ -287,7 +287,7 @@ class Kidnap(Failure):
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The events that are left, in order of receipt."""
         cuts = _merged([(_ns(a), _ns(b)) for a, b in self.when.schedule(scene).intervals])
-        joined: dict[str, Joined] = {}
+        joined: dict[str, Joiner] = {}
 
         def kept() -> Iterator[tuple[int, Event]]:
             for event in events:
@@ -297,7 +297,7 @@ class Kidnap(Failure):
                     self.touch(scene)
                     continue
                 if (joiner := registry.joiner_of(event)) is not None:
-                    event = joined.setdefault(event.topic, joiner()).join(event, shift)
+                    event = joined.setdefault(event.topic, joiner())(event, shift)
                 now_ns = event.received_ns - _removed_until(cuts, received_ns)
                 if shift:
                     event = replace(event, stamp_ns=event.stamp_ns - shift, received_ns=event.received_ns - shift)

@@ -22,6 +22,7 @@ from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
 from fgloc.sensors import registry
+from fgloc.sensors.base import InstallationState
 from fgloc.sensors.cameras import pinhole
 from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS, rounded
 from fgloc.types import Camera, Finding, FloatArray, InstallationFound, LandmarkMap, Setting, Severity, note
@@ -50,7 +51,7 @@ def found_values(
       ``camera.focal_scale``, ``.cx_px``, ``.cy_px``, ``.k1``, ``.k2``;
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
-    motion = [row for made in registry.motion_installations() for row in made.found(config)]
+    motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
     out = _values([*motion, *_sighting_rows()], installation, belief)
     if camera is not None and "camera" in installation.blocks:
         first = installation.blocks["camera"][0]
@@ -153,34 +154,17 @@ def settings_found(found: InstallationFound, config: Config) -> tuple[Setting, .
         found: what was found.
         config: as the run used it.
     """
-    state = _State(found)
+    state = InstallationState(found)
     motion, sightings = _of_motion(state, config), _of_sightings(state, config)
     return (*motion, *sightings, *_of_camera(state, config, found.camera), *_clocks(state, config, found))
 
 
-class _State:
-    def __init__(self, found: InstallationFound) -> None:
-        self.index = {name: i for i, name in enumerate(found.names)}
-        self.mean, self.cov, self.prior = found.mean, found.cov, found.prior_cov
-
-    def setting(self, name: str, given: float, found: float, gains: Mapping[str, float]) -> Iterator[Setting]:
-        """One that depends on parameters of the state with these derivatives; none if it depends on none of them."""
-        gains = {key: g for key, g in gains.items() if key in self.index}
-        if gains:
-            rows, g = [self.index[key] for key in gains], np.array(list(gains.values()))
-            sigmas = [math.sqrt(g @ cov[np.ix_(rows, rows)] @ g) for cov in (self.cov, self.prior)]
-            yield Setting(name, given, found, *sigmas)
-
-    def value(self, name: str) -> float:
-        return float(self.mean[self.index[name]]) if name in self.index else 0.0
-
-
-def _of_motion(state: _State, config: Config) -> Iterator[Setting]:
-    for installation in registry.motion_installations():
+def _of_motion(state: InstallationState, config: Config) -> Iterator[Setting]:
+    for installation in registry.MOTION_INSTALLATIONS:
         yield from installation.settings(state, config)
 
 
-def _of_sightings(state: _State, config: Config) -> Iterator[Setting]:
+def _of_sightings(state: InstallationState, config: Config) -> Iterator[Setting]:
     scale, bias = config.landmarks.range_scale, config.landmarks.bearing_bias_rad
     found = scale * math.exp(min(state.value("sightings.range_scale"), _MOST_LOG_SCALE))
     yield from state.setting("landmarks.range_scale", scale, found, {"sightings.range_scale": scale})
@@ -188,7 +172,7 @@ def _of_sightings(state: _State, config: Config) -> Iterator[Setting]:
     yield from state.setting("landmarks.bearing_bias_rad", bias, bias + state.value(name), {name: 1.0})
 
 
-def _of_camera(state: _State, config: Config, camera: Camera | None) -> Iterator[Setting]:
+def _of_camera(state: InstallationState, config: Config, camera: Camera | None) -> Iterator[Setting]:
     if camera is None or "camera.x_m" not in state.index:
         return
     place = slice(state.index["camera.x_m"], state.index["camera.x_m"] + 6)
@@ -209,7 +193,7 @@ def _of_camera(state: _State, config: Config, camera: Camera | None) -> Iterator
         yield from state.setting(key, float(at), float(at) + state.value(key), {key: 1.0})
 
 
-def _clocks(state: _State, config: Config, found: InstallationFound) -> Iterator[Setting]:
+def _clocks(state: InstallationState, config: Config, found: InstallationFound) -> Iterator[Setting]:
     clocks = {"camera.time_offset_s": found.seen_by, "sightings.time_offset_s": found.seen_by}
     clocks["wheels.time_offset_s"] = found.wheels
     for name, role in clocks.items():
@@ -233,7 +217,7 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
         if getattr(getattr(config, section), name) > 0.0:
             put(key, max(float(f"{sigma:.4g}"), changes.get(section, {}).get(name, 0.0)))
 
-    sigmas = reduce(or_, (dict(made.sigmas) for made in registry.motion_installations()), _SIGMAS)
+    sigmas = reduce(or_, (dict(made.sigmas) for made in registry.MOTION_INSTALLATIONS), _SIGMAS)
     for s in settings:
         if s.name in sigmas:
             put(s.name, round(s.found, 7))

@@ -7,6 +7,7 @@ docs/adding-a-sensor.md goes through one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,7 +21,7 @@ from pydantic import Field, FiniteFloat
 from fgloc.files.settings import Section
 from fgloc.sensors.checks import Collector, FieldChecks, TimingOnly
 from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
-from fgloc.types import Event, FloatArray, LandmarkMap, MotionEvent, Setting
+from fgloc.types import Event, FloatArray, InstallationFound, LandmarkMap, MotionEvent, Setting
 
 if TYPE_CHECKING:
     from fgloc.config import Config, GateConfig
@@ -227,12 +228,8 @@ class RawMistake(NamedTuple):
     values: Mapping[str, object]
 
 
-class Joined(Protocol):
-    """One topic without a jump where a piece of the recording was cut out."""
-
-    def join(self, event: Event, shift: int) -> Event:
-        """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
-        ...
+Joiner = Callable[[Event, int], Event]
+"""Makes the events of one topic count on across cuts; the second argument is what was cut out before it so far [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,14 +285,24 @@ class FoundRow(NamedTuple):
     gain: float
 
 
-class InstallationState(Protocol):
-    """What a run has found of the installation."""
+class InstallationState:
+    """What a run has found of the installation, for the settings that it makes of it."""
+
+    def __init__(self, found: InstallationFound) -> None:
+        self.index = {name: i for i, name in enumerate(found.names)}
+        self.mean, self.cov, self.prior = found.mean, found.cov, found.prior_cov
 
     def value(self, name: str) -> float:
-        """Of a parameter; 0 if it is no state."""
+        """Value of a parameter; 0 if it is no state."""
+        return float(self.mean[self.index[name]]) if name in self.index else 0.0
 
     def setting(self, name: str, given: float, found: float, gains: Mapping[str, float]) -> Iterator[Setting]:
-        """A setting that depends on parameters with these derivatives; none if it depends on no state."""
+        """A setting that depends on parameters with these derivatives; none if it depends on none of the state."""
+        gains = {key: g for key, g in gains.items() if key in self.index}
+        if gains:
+            rows, g = [self.index[key] for key in gains], np.array(list(gains.values()))
+            sigmas = [math.sqrt(g @ cov[np.ix_(rows, rows)] @ g) for cov in (self.cov, self.prior)]
+            yield Setting(name, given, found, *sigmas)
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,6 +338,7 @@ class BuiltIn:
             sees no landmarks.
         measured: classes of measurements that have its name in ``steps.csv``.
         joined: makes its events count on across a piece of the recording that was cut out; None: they count nothing.
+        installation: what it is off by, if it measures motion.
         first_settings: what ``fgloc init`` writes of it; None: nothing.
     """
 
@@ -340,7 +348,8 @@ class BuiltIn:
     failing_as: str = ""
     failures: tuple[type[Any], ...] = ()
     carried: Callable[[Any], Callable[[Event], Event]] | None = None
-    joined: Callable[[], Joined] | None = None
+    joined: Callable[[], Joiner] | None = None
+    installation: MotionInstallation | None = None
     measures: Callable[[Any], Callable[[Any], Iterator[LandmarkSighting]]] | None = None
     measured: tuple[type[LandmarkSighting], ...] = ()
     first_settings: FirstSettings | None = None

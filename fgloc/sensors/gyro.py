@@ -504,6 +504,7 @@ def _minimum_jerk(s: float) -> tuple[float, float, float]:
 
 GYRO = BuiltIn(
     name="gyro",
+    installation=INSTALLATION,
     streams=(
         Stream(
             "imu",

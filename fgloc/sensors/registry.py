@@ -10,27 +10,23 @@ from pydantic import AfterValidator
 
 from fgloc.extensions import outside_sensors
 from fgloc.files.settings import Section
-from fgloc.sensors import gyro
 from fgloc.sensors.base import (
     BuiltIn,
     Context,
     Converter,
     FirstSettings,
-    Joined,
-    MotionInstallation,
+    Joiner,
     Parameter,
     Sensor,
     Stream,
 )
 from fgloc.sensors.commands import COMMANDS, CommandInput
 from fgloc.sensors.gyro import GYRO, GyroInput
-from fgloc.sensors.learned import sensor as learned
 from fgloc.sensors.learned.sensor import LEARNED
 from fgloc.sensors.marker_pose import MARKER_POSE
 from fgloc.sensors.markers.sensor import MARKERS, MarkersInput
 from fgloc.sensors.measurements import LandmarkSighting
 from fgloc.sensors.range_bearing import RANGE_BEARING, RangeBearingInput
-from fgloc.sensors.wheels import motion as wheels
 from fgloc.sensors.wheels.events import WheelsInput
 from fgloc.sensors.wheels.sensor import WHEELS
 from fgloc.types import Event, RawEvent
@@ -45,13 +41,8 @@ class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBeari
     """Methods that make the events of the built-in sensors from plain numbers."""
 
 
-_BUILT_IN = (WHEELS, COMMANDS, LEARNED, GYRO, MARKERS, MARKER_POSE, RANGE_BEARING)
-_MOTION_INSTALLATIONS = (wheels.INSTALLATION, gyro.INSTALLATION, learned.INSTALLATION)
-
-
-def built_in() -> tuple[BuiltIn, ...]:
-    """The built-in sensors."""
-    return _BUILT_IN
+BUILT_IN: tuple[BuiltIn, ...] = (WHEELS, COMMANDS, GYRO, LEARNED, MARKERS, MARKER_POSE, RANGE_BEARING)
+MOTION_INSTALLATIONS = tuple(sensor.installation for sensor in BUILT_IN if sensor.installation is not None)
 
 
 def sensors() -> tuple[type[Sensor], ...]:
@@ -70,7 +61,7 @@ def streams() -> tuple[Stream, ...]:
 
 @cache
 def _streams(outside: tuple[type[Sensor], ...]) -> tuple[Stream, ...]:
-    own = [stream for sensor in built_in() for stream in sensor.streams]
+    own = [stream for sensor in BUILT_IN for stream in sensor.streams]
     return (*own, *(stream for sensor in outside for stream in sensor.streams))
 
 
@@ -102,7 +93,7 @@ def role_of_event(event: Event) -> str | None:
 def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
     """Classes of events by the name that failures have for their sensor."""
     found: dict[str, tuple[type[Event], ...]] = {}
-    for sensor in built_in():
+    for sensor in BUILT_IN:
         name = sensor.failing_as or sensor.name
         found[name] = (*found.get(name, ()), *(stream.event for stream in sensor.streams))
     return found | {s.name: tuple(stream.event for stream in s.streams) for s in sensors()}
@@ -131,14 +122,14 @@ def events_of(sensor: str) -> tuple[type[Event], ...]:
 def failures() -> tuple[type[Section], ...]:
     """Failures of all sensors."""
     return tuple(
-        failure for own in (*(s.failures for s in built_in()), *(s.failures for s in sensors())) for failure in own
+        failure for own in (*(s.failures for s in BUILT_IN), *(s.failures for s in sensors())) for failure in own
     )
 
 
 def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
     """What becomes of the events of a robot that is carried, by class; those of other classes are left as they are."""
     made: dict[type[Event], Callable[[Event], Event]] = {}
-    for sensor in built_in():
+    for sensor in BUILT_IN:
         if sensor.carried is not None:
             made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.carried(carriage))
     return made
@@ -146,35 +137,30 @@ def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
 
 def title_of(name: str) -> str:
     """Of a sensor, in sentences."""
-    return next((sensor.title for sensor in built_in() if sensor.name == name and sensor.title), name)
-
-
-def motion_installations() -> tuple[MotionInstallation, ...]:
-    """What wheels, gyro and learned motion are off by."""
-    return _MOTION_INSTALLATIONS
+    return next((sensor.title for sensor in BUILT_IN if sensor.name == name and sensor.title), name)
 
 
 def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
     """Parameters of the motion sources in the order in which they stand in the state."""
-    made = [p for installation in _MOTION_INSTALLATIONS for p in installation.parameters(config, sources)]
+    made = [p for installation in MOTION_INSTALLATIONS for p in installation.parameters(config, sources)]
     return tuple(sorted(made, key=lambda p: p.rank))
 
 
 def first_settings() -> tuple[FirstSettings, ...]:
     """What the sensors write into the first settings of an unknown robot."""
-    return tuple(sensor.first_settings for sensor in built_in() if sensor.first_settings is not None)
+    return tuple(sensor.first_settings for sensor in BUILT_IN if sensor.first_settings is not None)
 
 
 def detected_kinds() -> tuple[str, ...]:
     """Names of the landmark measurements that are made of raw data."""
-    raw = [s for s in built_in() if any(issubclass(stream.event, RawEvent) for stream in s.streams)]
+    raw = [s for s in BUILT_IN if any(issubclass(stream.event, RawEvent) for stream in s.streams)]
     return tuple(sensor.name for sensor in raw if sensor.measured)
 
 
 def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:
     """What makes measurements of the sightings of one run, by class of event."""
     made: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = {}
-    for sensor in built_in():
+    for sensor in BUILT_IN:
         if sensor.measures is not None:
             made |= dict.fromkeys((stream.event for stream in sensor.streams), sensor.measures(context))
     return made
@@ -182,12 +168,12 @@ def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[L
 
 def landmark_kinds() -> tuple[str, ...]:
     """Names of all landmark measurements."""
-    return tuple(sensor.name for sensor in built_in() if sensor.measured)
+    return tuple(sensor.name for sensor in BUILT_IN if sensor.measured)
 
 
-def joiner_of(event: Event) -> Callable[[], Joined] | None:
+def joiner_of(event: Event) -> Callable[[], Joiner] | None:
     """What joins the events of a topic on to those before a cut; None if they count nothing."""
-    return next((s.joined for s in built_in() if any(type(event) is stream.event for stream in s.streams)), None)
+    return next((s.joined for s in BUILT_IN if any(type(event) is stream.event for stream in s.streams)), None)
 
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:

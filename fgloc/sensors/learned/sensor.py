@@ -352,4 +352,4 @@ def left_out_note(seconds: float) -> str:
     )
 
 
-LEARNED = BuiltIn(name="learned", title="learned motion")
+LEARNED = BuiltIn(name="learned", title="learned motion", installation=INSTALLATION)

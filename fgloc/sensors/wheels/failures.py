@@ -390,7 +390,7 @@ class JoinedWheels:
         self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
         self._last: FloatArray | None = None  # as reported
 
-    def join(self, event: Event, shift: int) -> Event:
+    def __call__(self, event: Event, shift: int) -> Event:
         """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
         assert isinstance(event, JointsEvent | OdometryEvent)
         angles = isinstance(event, JointsEvent)

@@ -38,6 +38,7 @@ from fgloc.sensors.wheels.events import (
     joints_validator,
     odometry_validator,
 )
+from fgloc.sensors.wheels.motion import INSTALLATION
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
@@ -457,6 +458,7 @@ def freed(config: Config) -> tuple[Config, ...]:
 
 WHEELS = BuiltIn(
     name="wheels",
+    installation=INSTALLATION,
     first_settings=FIRST_SETTINGS,
     streams=(
         Stream(
