@@ -3,6 +3,7 @@
 PYTHON ?= python3
 JOBS ?= 2
 BENCHMARKS ?= steps real sim identification adaptive ablation gross
+QUICK ?= $(addprefix tests/,test_layout.py test_fault_catalogue.py docs files intake view graph/test_graph.py graph/test_observation.py)
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 BIN := .venv/bin
@@ -11,12 +12,13 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo follow test test-all check equal format bench docs docs-test dist clean
+.PHONY: help demo follow quick test test-all check equal format bench docs docs-test dist clean
 
 help:
 	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
 	@echo "make follow    a simulated robot drives itself along waypoints: a picture and a table, in follow-out/"
-	@echo "make test      the quick tests"
+	@echo "make quick     those tests that take less than a minute together"
+	@echo "make test      all but the slow tests: some minutes"
 	@echo "make test-all  all tests"
 	@echo "make check     ruff format, ruff, mypy"
 	@echo "make equal     whether short runs of all kinds give the committed results, bit by bit"
@@ -31,6 +33,9 @@ demo: .venv/.base
 
 follow: .venv/.sim
 	$(BIN)/fgloc sim follow-demo --out follow-out --workers $(JOBS)
+
+quick: .venv/.dev
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(QUICK)
 
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
