@@ -268,7 +268,8 @@ BUILT_IN_ROLES = ("odometry", "command", "joints", "imu", "image", "camera_info"
 
 def role_names() -> tuple[Role, ...]:
     """All roles, the built-in ones first."""
-    return (*BUILT_IN_ROLES, *(stream.role for sensor in outside_sensors() for stream in sensor.streams))
+    outside = (stream.role for sensor in outside_sensors() for stream in sensor.streams)
+    return tuple(dict.fromkeys((*BUILT_IN_ROLES, *outside)))  # one may read a built-in role from a message of its own
 
 
 def _known_role(role: str) -> str:

@@ -354,6 +354,42 @@ def test_landmarks_of_another_package_are_treated_as_those_of_the_built_in_senso
     assert "reflectors.quarantined" in theirs.rejections
 
 
+# --- Motion -----------------------------------------------------------------------------------------------------------
+
+
+def write_twist(bag, topic, stamp_ns, pose, twist, received_ns):
+    """The twist of an odometry alone, in a message that no built-in sensor reads."""
+    v, omega = twist
+    vector = "geometry_msgs/msg/Vector3"
+    made = bag.make(
+        "geometry_msgs/msg/Twist",
+        linear=bag.make(vector, x=v, y=0.0, z=0.0),
+        angular=bag.make(vector, x=0.0, y=0.0, z=omega),
+    )
+    made = bag.make("geometry_msgs/msg/TwistWithCovariance", twist=made, covariance=np.zeros(36))
+    bag._write(
+        "/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", stamp_ns, received_ns, "base_link", {"twist": made}
+    )
+
+
+def test_motion_in_a_message_of_another_package_is_that_of_the_wheels(folders, tmp_path):
+    """The same twists, the same poses."""
+    Drive("beacons", seconds=8.0, seed=1).write(tmp_path / "odometry")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BagWriter, "odometry", write_twist)
+        Drive("beacons", seconds=8.0, seed=1).write(tmp_path / "velocity")
+    results = []
+    for name in ("odometry", "velocity"):
+        folder = tmp_path / name
+        results.append(
+            run(folder / "bag", folder / "map.yaml", load_config(folder / "robot.yaml"), "online", check=False)
+        )
+    ours, theirs = results
+    assert theirs.counts["wheels"] == ours.counts["wheels"] > 30
+    np.testing.assert_allclose(theirs.trajectory.poses, ours.trajectory.poses, atol=1e-12)
+    assert theirs.trajectory.stamps_ns.tolist() == ours.trajectory.stamps_ns.tolist()
+
+
 def command_line(folders, *arguments):
     """fgloc in a process of its own, which finds the sensors by their entry points."""
     env = os.environ | {"PYTHONPATH": os.pathsep.join([PYTHONPATH, *map(str, folders)])}
