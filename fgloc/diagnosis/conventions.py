@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from fgloc import se2
-from fgloc.config import Config, Role, config_of
+from fgloc.config import Config, Role, WheelsConfig, config_of
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
@@ -103,6 +103,7 @@ class Conventions:
         handling: when a person had the robot in hand; nothing is compared there.
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
         commanded: whether commands stand in for wheels.
+        wheels: with which the wheels' path was read; what is found since then is not in it.
     """
 
     config: Config
@@ -112,6 +113,7 @@ class Conventions:
     handling: Handling = field(default_factory=Handling)
     opposite: bool = False
     commanded: bool = False
+    wheels: WheelsConfig = field(default_factory=WheelsConfig)
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
         """Note a finding, and set its lines."""
@@ -144,6 +146,7 @@ def conventions(
     _odometry(found, signals)
     _yaw_of_gyro(found, signals, imu_up)
     path = signals.path(found.config)
+    found.wheels = found.config.wheels
     found.commanded = signals.source == "command"
     if path is None or path.length_m < 0.05:
         if (rates := signals.rates()) is not None:
@@ -154,7 +157,7 @@ def conventions(
     seen = signals.sightings()
     undecided = found.opposite and not _opposite(found, signals, path, seen, T_base_sensor)
     if found.opposite and not undecided:
-        path = signals.path(found.config) or path
+        path, found.wheels = signals.path(found.config) or path, found.config.wheels
     by_gyro, turn_sigma = _turn_of(path, gyro)
     sensor = None if seen is None else _sensor(found, by_gyro, seen, T_base_sensor, landmark_map, turn_sigma)
     drifting = _drifts(found, signals, path, imu_up, T_base_sensor)
@@ -1068,7 +1071,7 @@ def _true_body(found: Conventions, signals: Signals, path: Path) -> BodyFit | No
     if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0 and fit.turns.off(1.0, _RATE_SCALE):
         turns = fit.turns
         if not any(f.code == "wheels.turn" for f in found.findings):
-            scale_omega = round(found.config.wheels.scale_omega * turns.value, 4)
+            scale_omega = round(found.wheels.scale_omega * turns.value, 4)
             text = (
                 f"By the truth the robot turns {turns.value:.3f} ± {turns.sigma:.2g} times as much as its wheels say "
                 f"(a track or a geometry that is not the robot's); if so, set wheels.scale_omega: {scale_omega:g}"
@@ -1157,7 +1160,7 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
     unit = unit_of(1.0 / fit.scale.value)
     if unit is None and abs(math.log(fit.scale.value)) < _WHEELS_OFF:
         if fit.scale.off(1.0, _SCALE):
-            scale_v = round(found.config.wheels.scale_v * fit.scale.value, 4)
+            scale_v = round(found.wheels.scale_v * fit.scale.value, 4)
             text = (
                 f"By the truth the robot moves {fit.scale.value:.3f} ± {fit.scale.sigma:.2g} times as far as its "
                 f"wheels say; if the truth's metres are right, set wheels.scale_v: {scale_v:g}"
