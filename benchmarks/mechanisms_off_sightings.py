@@ -25,7 +25,7 @@ OF_SIGHTINGS: tuple[Mechanism, ...] = (
         "fit_kernel",
         "Cauchy kernel in the fit of a pose to sightings: one wrong sighting does not corrupt the pose.",
         ("estimation/pose_fit.py",),
-        (Switch(f"{_POSE_FIT}:cauchy_k", Returns(_NO_KERNEL)),),
+        (Switch(f"{_POSE_FIT}:_kernel", Returns(_NO_KERNEL)),),
         batch=True,
         case="carried30",
     ),
