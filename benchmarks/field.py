@@ -294,7 +294,8 @@ def excused(recording: Recording, o: Outcome, mode: Mode) -> bool:
 
 def crash(o: Outcome, command: str, code: int) -> bool:
     """Whether a command ended without a sentence of its own."""
-    return code not in (0, 3) and ("Traceback" in o.said[command] or "error" not in o.said[command])
+    said = o.said[command]
+    return code not in (0, 3) and ("Traceback" in said or not re.search("error|To be settled", said))
 
 
 def beyond_gate(recording: Recording, o: Outcome, mode: Mode) -> list[str]:

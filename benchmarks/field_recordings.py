@@ -446,6 +446,7 @@ RECORDINGS = (
         "/robot/pose",
         lever=True,
         landmarks=False,
+        development=True,
     ),
     Recording(
         "tricycle",
@@ -455,6 +456,7 @@ RECORDINGS = (
         "/truth",
         lever=True,
         landmarks=False,
+        development=True,
     ),
     Recording(
         "car_park",
@@ -464,6 +466,7 @@ RECORDINGS = (
         "/gps",
         lever=True,
         landmarks=False,
+        development=True,
     ),
     Recording(
         "car_gnss",
@@ -481,6 +484,7 @@ RECORDINGS = (
         "/truth",
         lever=True,
         landmarks=False,
+        development=True,
     ),
     Recording(
         "uwb_indoor",
@@ -509,6 +513,7 @@ RECORDINGS = (
             partial(_pyfg, robot),
             "/truth",
             "map",
+            development=robot != "B",
         )
         for robot in "ABCDE"
     ),
