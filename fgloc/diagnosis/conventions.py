@@ -728,7 +728,9 @@ def _constants(
         _scale(found, path, seen, m, landmark_map)
     if len(found.findings) == before:
         m, scaled = _by_map(found, path, seen, m, T, landmark_map), False
-    place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], _PLACED_M) and f.sigma < 0.5 * _PLACED_M]
+    # the graph finds what is within the place's prior
+    least = max(_PLACED_M, 3.0 * found.config.landmarks.position_sigma_m)
+    place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], least) and f.sigma < 0.5 * _PLACED_M]
     turned = m.yaw.off(0.0, _TURNED_RAD)
     if (place or turned) and _varied(path):
         moved = T.copy()
