@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from fgloc.sensors.base import Context, Sensor, Stream
     from fgloc.sensors.maps import load_map
     from fgloc.sensors.measurements import PoseMeasurement
-from fgloc.types import Decision, Estimate, LandmarkMap, Mode, SensorEvent, Trajectory
+    from fgloc.types import Decision, Estimate, LandmarkMap, Mode, SensorEvent, Trajectory
 
 __all__ = [
     "CameraError",

@@ -306,6 +306,10 @@ def _twist_rate(
 def _twist_late(found: Conventions, rows: FloatArray, yaw: FloatArray) -> None:
     """Name a twist that follows its own pose late: it is smoothed, or computed from older poses."""
     times = rows[:, 0]
+    known = (np.diff(times) > 0.0) & (np.diff(times) < _SILENT_S)
+    turns = np.diff(yaw)[known] / np.diff(times)[known]
+    if not len(turns) or min(np.std(turns), np.std(rows[:, 6])) < _VARIED:
+        return  # a constant turn has no lag, and a pose that does not move has none either
     gaps = np.cumsum(np.append(0.0, np.diff(times)) > _SILENT_S, dtype=np.int64)
     fit = fit_rate(Path(times, np.column_stack([rows[:, 1:3], yaw]), gaps), times, turn_by(times, rows[:, 6]))
     interval_s = float(np.median(np.diff(times)))  # a mean twist of the last interval is half of it late

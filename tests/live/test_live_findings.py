@@ -85,7 +85,7 @@ def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most(
 
 def test_a_mirrored_sensor_is_named_live():
     with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
-        made = [mirrored(event) for event in swerving()]
+        made = [mirrored(event) for event in swerving(seconds=26.0)]
         feed(live, made[: len(made) // 2])
         time.sleep(4.0)  # it is compared meanwhile; what little motion says has to be said twice
         feed(live, made[len(made) // 2 :])
