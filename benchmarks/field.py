@@ -376,7 +376,7 @@ def _first(o: Outcome, mode: Mode) -> str:
     findings = o.findings(mode)
     if not findings:
         return "–"
-    text = str(findings[0]["text"]).replace("|", "\\|").replace("\n", " ")
+    text = str(findings[0]["text"]).replace("|", "\\|").replace("\n", " ").replace(f"{DATA}/", "")
     return text if len(text) < 160 else f"{text[:157]}…"
 
 
