@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What came of it: see `fgloc_datasets.sim.following.loop.Score`; or why it failed."""
+    """Score of the drive (`fgloc_datasets.sim.following.loop.Score`), or the reason why it failed."""
 
     track_mm: float = float("nan")
     reached: float = 0.0

@@ -338,7 +338,7 @@ def sighting_errors(run: Run, sensor: FloatArray) -> FloatArray:
 
 
 def _all_errors(run: Run, sensor: FloatArray) -> FloatArray:
-    """As `sighting_errors`, of every sighting, across gaps of the truth too."""
+    """Errors of range and bearing as `sighting_errors` has them, of every sighting, across gaps of the truth too."""
     scale, camera_x, bias, latency = sensor
     at = run.sightings_ns - int(latency * 1e9)
     pose = se2.interpolate(run.truth_ns, run.truth, at)

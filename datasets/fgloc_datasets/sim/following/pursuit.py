@@ -85,7 +85,7 @@ class Curve:
 
     @property
     def length_m(self) -> float:
-        """Of the whole curve."""
+        """Length of the curve [m]."""
         return float(self.along_m[-1])
 
     def distances(self, places: FloatArray) -> FloatArray:
