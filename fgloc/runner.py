@@ -161,7 +161,7 @@ def run(
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
-        replay = _replayed(recording, parts, mode, progress, options)
+        replay = replayed(recording, parts, mode, progress, options)
         outcome = Outcome.of(recording, parts, replay, wrong)
     if not replay.estimates:
         raise EstimatorError(outcome.failed(never_found(replay, outcome.rejections)))
@@ -225,7 +225,7 @@ def _contradiction(parts: Assembly) -> Contradiction | None:
     return Contradiction(tuple(estimator.contradicted), estimator.asked()) if estimator.contradicted else None
 
 
-def _replayed(
+def replayed(
     recording: Recording,
     parts: Assembly,
     mode: RunMode,

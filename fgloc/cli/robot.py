@@ -38,9 +38,12 @@ def init(
     from fgloc.calibration.first_settings import first_settings
     from fgloc.config import load_config
     from fgloc.files.outputs import write_text
+    from fgloc.motion_noise import with_motion_noise
     from fgloc.recording.storage import find_beside
 
     found = first_settings(bag)
+    with run_bar("init") as progress:
+        found = with_motion_noise(found, bag, progress)
     write_text(out, found.text)
     load_config(out)
     say_table(("role", "topic"), list(found.roles.items()))

@@ -238,17 +238,23 @@ def _refined(
     start[2:4] = np.clip(start[2:4], -2.0, 2.0)
     start[4:] += _NUDGE_S  # a step of derivatives is a share of the value: at 0 there is none
 
-    def solve(use: NDArray[np.bool_], x0: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-        part = _Places(path, times[use], z[use], tracks[use], turn_sigma)
+    def solve(use: NDArray[np.bool_], x0: FloatArray, sigma: float) -> tuple[FloatArray, _Places, FloatArray]:
+        part = _Places(path, times[use], z[use], tracks[use], turn_sigma, sigma)
         fit = least_squares(part.residuals, x0, loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
-        return fit.x, part.misfit(fit.x), part.by_priors(fit.jac)
+        return fit.x, part, part.by_priors(fit.jac)
 
     everything = np.ones(len(z), dtype=bool)
-    x, typical, by_priors = solve(everything, start)
+    x, part, by_priors = solve(everything, start, _Places.SIGMA)
+    sigma = part.spread(x)  # of wheels that are bad, places scatter more: a narrow kernel takes some for the truth
+    if sigma > _Places.SIGMA:
+        x, part, by_priors = solve(everything, x, sigma)
+    typical = part.misfit(x)
     blocks = np.minimum(((times - times[0]) / max(times[-1] - times[0], 1e-9) * _BLOCKS).astype(int), _BLOCKS - 1)
     sigmas = np.full(len(x), np.inf)
     if len(np.unique(tracks)) >= _FEWEST_TRACKS:
-        sigmas = np.hypot(_jackknifed(lambda use: solve(use, x)[0], blocks, _by_landmark(ids)), by_priors)
+        sigmas = np.hypot(_jackknifed(lambda use: solve(use, x, part.sigma)[0], blocks, _by_landmark(ids)), by_priors)
+    for k in (1, 4):  # the wheels' noise has more than one place where a yaw or a lag fits a little better
+        sigmas[k] = _as_sure(x, k, float(sigmas[k]), part.gain)
     scale, yaw, bx, by, late, turn = x.tolist()
     if abs(late) >= MOST_LAG_S or abs(scale) > _MOST_LOG_SCALE:  # it ran to where nothing tells
         sigmas = np.full(len(x), np.inf)
@@ -299,7 +305,7 @@ def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, place
             part = _Places(path, times, z, _tracks(times, ids))
             start = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
             fit = least_squares(part.residuals, start, loss="cauchy", diff_step=1e-4, max_nfev=30)
-            along, across = np.split(part.residuals(fit.x)[: 2 * len(z)] * part.SIGMA, 2)
+            along, across = np.split(part.residuals(fit.x)[: 2 * len(z)] * part.sigma, 2)
         errors.append(np.array([along, across]))
         spreads.append(_MAD * np.median(np.abs(errors[-1]), axis=1))
         tracks = np.unique(_tracks(times, ids), return_inverse=True)[1]
@@ -352,15 +358,45 @@ def _tracks(times: FloatArray, ids: IntArray) -> IntArray:
     return out
 
 
+def _gain(before: FloatArray, after: FloatArray, tracks: IntArray) -> float:
+    """Mean gain of cost of a track, in standard deviations by the scatter from track to track; 0: they are too few.
+
+    What only noise explains fits better in some tracks and worse in others.
+
+    Args:
+        before: white residuals ``(2 n,)``.
+        after: likewise.
+        tracks: ``(n,)`` number of the track of each pair.
+    """
+    costs = [np.log1p(r**2).reshape(2, -1).sum(axis=0) for r in (before, after)]
+    gains = np.bincount(tracks, costs[0] - costs[1]) / np.bincount(tracks)
+    if len(gains) < _FEWEST_TRACKS:
+        return 0.0
+    return float(gains.mean()) / (float(gains.std(ddof=1)) / math.sqrt(len(gains)) + 1e-9)
+
+
+def _as_sure(x: FloatArray, k: int, sigma: float, gain: Callable[[FloatArray, int], float]) -> float:
+    """Sigma of the unknown ``k`` of a fit, such that it differs from 0 by no more sigmas than the fit gains by it."""
+    size = abs(float(x[k]))
+    return sigma if size < 2.0 * sigma else max(sigma, size / max(gain(x, k), 0.5))
+
+
 class _Places:
     """Residuals of sightings against the mean place of their track."""
 
-    SIGMA = 0.03  # of a range over its length, and of a bearing [rad]
+    SIGMA = 0.03  # of a range over its length, and of a bearing [rad], unless they scatter more
     PLACE_M = 0.3  # prior of the sensor's place: it sits on the robot
 
     def __init__(
-        self, path: Path, times: FloatArray, z: ComplexArray, tracks: IntArray, turn_sigma: float = TURN
+        self,
+        path: Path,
+        times: FloatArray,
+        z: ComplexArray,
+        tracks: IntArray,
+        turn_sigma: float = TURN,
+        sigma: float = SIGMA,
     ) -> None:
+        self.sigma = sigma
         self._turn_sigma = turn_sigma
         _, self._tracks = np.unique(tracks, return_inverse=True)
         self._path, self._times, self._z = path, times, z
@@ -370,7 +406,7 @@ class _Places:
         self._repeated = len(times) / len(np.unique(np.column_stack([self._tracks, times.astype(np.int64)]), axis=0))
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """``(2 n + 3,)``: along and across the line of sight, over the range, in units of `SIGMA`; and the priors."""
+        """``(2 n + 3,)``: along and across the line of sight, over the range, in units of `sigma`; and the priors."""
         scale, yaw, bx, by, late, turn = x.tolist()
         alpha, beta = math.exp(min(scale, 50.0)) * np.exp(1j * yaw), complex(bx, by)
         if turn != self._turned[0]:
@@ -381,7 +417,7 @@ class _Places:
         place = (real + 1j * imaginary)[self._tracks]
         # in the sensor: what would be seen of that place, over what was seen; 1 if they agree
         ratio = ((place - p) / r - beta) / (alpha * self._z)
-        off = (ratio - 1.0) / self.SIGMA
+        off = (ratio - 1.0) / self.sigma
         off = np.where(np.isfinite(off), off, 1e3)
         prior = self._repeated * np.square([bx / self.PLACE_M, by / self.PLACE_M, turn / self._turn_sigma])
         # a prior is no outlier: such that the robust loss of it is its square
@@ -396,10 +432,27 @@ class _Places:
         means = np.linalg.pinv(J.T @ J + np.diag(information))[:, [2, 3, 5]] * (self._repeated / priors)
         return np.asarray(np.linalg.norm(means, axis=1))
 
+    def gain(self, x: FloatArray, k: int) -> float:
+        """Gain by the unknown ``k`` of a fit against 0; see `_gain`."""
+        others = np.delete(np.arange(len(x)), k)
+
+        def without(rest: FloatArray) -> FloatArray:
+            whole = np.zeros(len(x))
+            whole[others] = rest
+            return self.residuals(whole)
+
+        fit = least_squares(without, x[others], loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
+        n = 2 * len(self._z)
+        return _gain(without(fit.x)[:n], self.residuals(x)[:n], self._tracks)
+
+    def spread(self, x: FloatArray) -> float:
+        """Robust standard deviation of the residuals, without their unit."""
+        return self.sigma * _MAD * float(np.median(np.abs(self.residuals(x)[: 2 * len(self._z)])))
+
     def misfit(self, x: FloatArray) -> float:
         """Robust standard deviation of a landmark's place in the sensor's plane [m]."""
         n = len(self._z)
-        off = self.residuals(x)[: 2 * n] * self.SIGMA
+        off = self.residuals(x)[: 2 * n] * self.sigma
         return _MAD * float(np.median(np.hypot(off[:n], off[n:]) * np.abs(self._z)))
 
 
@@ -633,7 +686,11 @@ def _body(
         own, turned = own.conj(), -turned
     phi = np.asarray(np.unwrap(np.angle(turn))) if len(turn) else np.zeros(0)
     phi = np.interp(start + window_s, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
-    turns = _explained(turned, phi)[0] if float(np.std(phi)) > 0.05 else 1.0
+    turns = 1.0
+    if float(np.std(phi)) > 0.05:
+        turns, explained = _explained(turned, phi)
+        if 0.0 < turns < 1.0 and explained > 0.0:  # the wheels' noise makes it smaller, by down to the share explained
+            turns = min(1.0, turns / explained)
     x, residual = irls(np.column_stack([own, -(turn - 1.0)]), base, 1e-6, _SITS)
     size = abs(x[0])
     relative = complex(x[0]) / size**2 if size > 1e-9 else 1e9 + 0j  # e^{iδ} over s: its distances over the robot's
@@ -849,18 +906,30 @@ class _OnMap:
         off = np.concatenate([along / self.sigma_m, across / self.sigma_rad])
         return np.where(np.isfinite(off), off, 1e3)
 
-    def solve(self, x: FloatArray) -> FloatArray:
-        """Gauss-Newton with Cauchy weights; sightings of one landmark within a second count as one."""
+    def gain(self, x: FloatArray, k: int) -> float:
+        """Gain by the unknown ``k`` of a fit against 0; a track is a landmark in a window. See `_gain`."""
+        prior, start = self.PRIOR.copy(), x.copy()
+        prior[k], start[k] = 1e-6, 0.0
+        tracks = np.unique(np.column_stack([self.window, self.ids]), axis=0, return_inverse=True)[1].ravel()
+        return _gain(self.residuals(self.solve(start, prior)), self.residuals(x), tracks)
+
+    def solve(self, x: FloatArray, sigmas: FloatArray = PRIOR) -> FloatArray:
+        """Gauss-Newton with Cauchy weights; sightings of one landmark within a second count as one.
+
+        Args:
+            x: start.
+            sigmas: ``(7,)`` of the priors.
+        """
         cells = len(np.unique(np.column_stack([self.ids, self.times.astype(np.int64)]), axis=0))
-        share, prior = cells / len(self), self.PRIOR**-2.0
+        share, prior = cells / len(self), sigmas**-2.0
         for _ in range(20):
             r = self.residuals(x)
             J = np.column_stack([(self.residuals(x + 1e-5 * e) - r) / 1e-5 for e in np.eye(len(x))])
             weights = share / (1.0 + (r / 1.5) ** 2)
             H = (J.T * weights) @ J + np.diag(prior)
             step = np.linalg.solve(H, -(J.T @ (weights * r) + prior * x))
-            x = x + step / max(1.0, float(np.abs(step / self.PRIOR).max()))
-            if np.abs(step / self.PRIOR).max() < 1e-3:
+            x = x + step / max(1.0, float(np.abs(step / sigmas).max()))
+            if np.abs(step / sigmas).max() < 1e-3:
                 break
         return x
 
@@ -905,6 +974,8 @@ def fit_on_map(
     s = np.maximum(by_time, sigmas(_by_landmark(on_map.ids)))
     # of the one figure that every landmark tells by itself, their errors are known: they average out
     s[-1] = math.hypot(by_time[-1], (noise.map_m or 0.0) / math.sqrt(len(np.unique(on_map.ids))))
+    for k in (2, 5):  # as in `_refined`
+        s[k] = _as_sure(x, k, float(s[k]), on_map.gain)
     scale, bias, yaw, at_x, at_y, late, turns, too_long = (
         Figure(float(v), float(sigma)) for v, sigma in zip(values(x), s, strict=True)
     )
@@ -938,7 +1009,7 @@ def track_noise(path: Path, seen: Sightings, m: Mounting) -> Noise:
     part = _Places(path, times, z, _tracks(times, ids))
     x = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
     n = len(z)
-    off = part.residuals(x)[: 2 * n] * part.SIGMA
+    off = part.residuals(x)[: 2 * n] * part.sigma
     along, across = off[:n] * np.abs(z) * m.scale.value, off[n:]
     sigma_m, sigma_rad = (_MAD * float(np.median(np.abs(one))) for one in (along, across))
     correlated = correlation_time(times, ids, along / max(sigma_m, 1e-9))

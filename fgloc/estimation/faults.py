@@ -196,9 +196,9 @@ class FaultAttribution:
             steps: for how many the sources differ, the last of them is not in the log yet; None: over a whole window.
 
         Returns:
-            None if sightings cannot tell.
+            None if sightings cannot tell; without a map none tells a pose by itself.
         """
-        frames = self._stretch(steps)
+        frames = self._stretch(steps) if self._estimator.factors.known else None
         if frames is None:
             return None
         self._fits = {k: fit for k, fit in self._fits.items() if k >= frames[0].k}

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeVar
 
 import gtsam
@@ -23,7 +23,7 @@ from fgloc.graph.joint import MOST_STEPS, fuse
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.noise import whitening_of
 from fgloc.stats import ROUNDING, chi2_bound
-from fgloc.types import FloatArray, IntArray, Landmark
+from fgloc.types import FloatArray, IntArray, Landmark, MotionMeasurement
 
 # --- Initial values, order of elimination, covariances ----------------------------------------------------------------
 
@@ -369,6 +369,35 @@ class BatchSmoother:
             total += 0.5 * float(np.linalg.slogdet(np.array([cov for cov in covs if len(cov) == size]))[1].sum())
         return total
 
+    def evidence(self, motions: Sequence[tuple[MotionMeasurement, ...]]) -> float:
+        """Logarithm of the likelihood of the whole log, but for a constant, with other motions of its keyframes.
+
+        ``-½ min |A x - b|² - log |R| - ½ Σ log |Q|``, with the white graph ``A x = b`` linear about the solution, its
+        square root R (``RᵀR = AᵀA``) and the covariances Q of the motions: Laplace's approximation. What is the best
+        covariance of the motions has the largest evidence. On a flat floor only.
+
+        Source: MacKay 1992, "Bayesian interpolation".
+
+        Args:
+            motions: those that end at each keyframe.
+
+        Raises:
+            EstimatorError: the graph leaves a pose undetermined.
+        """
+        frames = [replace(frame, motions=some) for frame, some in zip(self.frames, motions, strict=True)]
+        before, self._motions = self._motions, BatchMotions(frames, self._factors.installation)
+        try:
+            linear = self._linearized().linearize(self._values)
+        finally:
+            self._motions = before
+        try:
+            root, solution = with_deep_stack(lambda: _eliminated(linear, self._order))
+        except RuntimeError as error:
+            raise EstimatorError("the graph leaves a pose undetermined") from error
+        covs = np.array([m.cov for some in motions for m in some]).reshape(-1, 3, 3)
+        of_motions = 0.5 * float(np.linalg.slogdet(covs)[1].sum())
+        return -float(linear.error(solution)) - float(root.logDeterminant()) - of_motions
+
     def rows(self) -> int:
         """Length of the residuals of all sightings that `cost` counts."""
         seen = [s for frame in self.frames for s in _seen(frame)]
@@ -512,6 +541,14 @@ class BatchSmoother:
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
         self._values = optimizer.optimize()
         return float(optimizer.error())
+
+
+def _eliminated(
+    linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering | None
+) -> tuple[gtsam.GaussianBayesNet | gtsam.GaussianBayesTree, gtsam.VectorValues]:
+    """Square root of a linear graph, and its solution."""
+    root = linear.eliminateSequential() if order is None else linear.eliminateMultifrontal(order)
+    return root, root.optimize()
 
 
 def _seen(frame: Keyframe) -> tuple[LandmarkFactor, ...]:

@@ -1,0 +1,166 @@
+"""Noise of the wheels' motion, as the landmarks of one recording tell it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.optimize import minimize
+
+from fgloc.assembly import assemble
+from fgloc.calibration.first_settings import RobotFile, with_findings
+from fgloc.config import Config, NoiseDensity, config_of
+from fgloc.errors import FglocError
+from fgloc.graph.contradictions import smoothed_within_priors
+from fgloc.graph.measurement_log import Keyframe
+from fgloc.graph.noise import FusionRules
+from fgloc.recording.reader import open_recording
+from fgloc.recording.storage import find_beside
+from fgloc.replay import Progress
+from fgloc.runner import replayed
+from fgloc.sensors.base import with_values
+from fgloc.types import Event, Finding, FloatArray, MotionMeasurement
+
+_EXCERPT_S = 300.0  # of the recording; of one with images a part, as their markers have to be found
+_IMAGES_S = 60.0
+_LEAST_STEPS = 100
+_RANGE = math.log(4.0)  # of each factor, up and down
+_PRIOR = math.log(3.0)  # sigma of its logarithm
+_TELLS = 1.0  # by which the logarithm of the likelihood must grow
+_FAR = 2.0  # with such a factor other sightings are accepted: a second round
+_ACCURACY = 0.1  # of the logarithms
+
+
+def with_motion_noise(robot: RobotFile, bag: Path, progress: Progress | None = None) -> RobotFile:
+    """The first settings of a robot, with the noise of its wheels where sightings tell it."""
+    if not {"image", "sightings"} & robot.roles.keys():
+        return robot
+    try:
+        config = config_of(yaml.safe_load(robot.text) or {})
+        found = identify_motion_noise(bag, find_beside(bag, "map.yaml"), config, progress)
+    except FglocError:  # why it cannot be smoothed, `info` and a run say
+        return robot
+    return (
+        robot if found is None else replace(robot, text=with_findings(robot.text, [found]), found=(*robot.found, found))
+    )
+
+
+def identify_motion_noise(
+    bag: Path, map_path: Path | None, config: Config, progress: Progress | None = None
+) -> Finding | None:
+    """Factors on the wheels' noise densities, of distances and of yaw, under which the recording is most likely.
+
+    The recording is smoothed, its sightings, map and installation with the noise and priors that they have; then the
+    evidence of the linear graph is maximised over both factors (`fgloc.graph.batch.BatchSmoother.evidence`). Steps
+    in which the wheels were judged wrong or at rest keep their noise.
+
+    A recording can show that the noise is larger. That it is smaller it shows only in part, as errors that last longer
+    than a step seem smaller than they are: a factor below 1 is replaced by its root, and for commands by 1.
+
+    Args:
+        bag: the recording; the first five minutes are used, of one with images the first.
+        map_path: marker map; None: landmarks are estimated too.
+        config: of the robot.
+        progress: called now and then.
+
+    Returns:
+        What to set, under the code "wheels.noise"; None: the densities are right, or the recording does not tell.
+
+    Raises:
+        FglocError: the recording cannot be smoothed.
+    """
+    total, gained, noise = np.ones(2), 0.0, config.wheels.noise
+    for _ in range(2):
+        tried = with_values(config, "wheels", {"noise": NoiseDensity(**_scaled(noise, total))})
+        found = _most_likely(bag, map_path, tried, progress)
+        if found is None:
+            break
+        factors, gain = found
+        total, gained = total * factors, gained + gain
+        if factors.max() < _FAR:
+            break
+    if gained < _TELLS:
+        return None
+    value = f"{{{', '.join(f'{key}: {density:.3g}' for key, density in _scaled(noise, total).items())}}}"
+    text = (
+        f"The noise of the wheels' motion is {total[0]:.2g} times the default along the way and {total[1]:.2g} times "
+        f"in turns: so the sightings are more likely (gain of log-likelihood {gained:.0f}): set wheels.noise: {value}."
+    )
+    return Finding("wheels.noise", text, lines={"wheels.noise": value}, value=float(total[0]))
+
+
+def _most_likely(
+    bag: Path, map_path: Path | None, config: Config, progress: Progress | None
+) -> tuple[FloatArray, float] | None:
+    """Both factors ``(2,)``, and the gain of log-likelihood; None: there is nothing to tell them by."""
+    with open_recording(bag, config.recording) as recording:
+        parts = assemble(recording, map_path, config, True)
+        longest_s = _EXCERPT_S if parts.detector is None else _IMAGES_S
+        replay = replayed(recording, parts, "batch", progress, {"events": lambda events: _first(events, longest_s)})
+    log, factors = parts.localizer.estimator.log, parts.localizer.factors
+    if not replay.estimates or factors.installation.ground:
+        return None
+    solver, _ = smoothed_within_priors(log, factors, config.batch, config.estimator.gate_probability)
+    sound = [_is_sound(frame) for frame in solver.frames]
+    if sum(sound) < _LEAST_STEPS:
+        return None
+    rules = parts.localizer.motion.sources.rules
+
+    def cost(logs: FloatArray) -> float:
+        scale = np.exp(logs[[0, 0, 1]])
+        motions = [
+            _with_noise(frame, scale, rules) if ok else frame.motions
+            for frame, ok in zip(solver.frames, sound, strict=True)
+        ]
+        return 0.5 * float(np.sum(np.square(logs))) / _PRIOR**2 - solver.evidence(motions)
+
+    best = minimize(
+        cost,
+        np.zeros(2),
+        method="Nelder-Mead",
+        bounds=[(-_RANGE, _RANGE)] * 2,
+        options={
+            "initial_simplex": [[0.0, 0.0], [math.log(2.0), 0.0], [0.0, math.log(2.0)]],
+            "xatol": _ACCURACY,
+            "fatol": _TELLS,
+        },
+    )
+    least = 0.0 if rules.wheels_are_commands else 0.5
+    logs = np.where(best.x < 0.0, least * best.x, best.x)
+    return np.exp(logs), cost(np.zeros(2)) - cost(logs)
+
+
+def _scaled(noise: NoiseDensity, factors: FloatArray) -> dict[str, float]:
+    of_way, of_yaw = factors.tolist()
+    return {key: value * (of_yaw if key.startswith("yaw") else of_way) for key, value in noise.model_dump().items()}
+
+
+def _first(events: Iterator[Event], seconds: float) -> Iterator[Event]:
+    """The events until so long after the first."""
+    first = next(events, None)
+    if first is not None:
+        yield first
+        yield from takewhile(lambda event: event.stamp_ns - first.stamp_ns < seconds * 1e9, events)
+
+
+def _is_sound(frame: Keyframe) -> bool:
+    """Whether the wheels measured the motion to a keyframe, and nothing was found wrong with them."""
+    return (
+        bool(frame.motions)
+        and frame.readings.wheels is not None
+        and not (
+            frame.readings.at_rest or frame.budget.rejected or frame.budget.scale != 1.0 or frame.prior is not None
+        )
+    )
+
+
+def _with_noise(frame: Keyframe, scale: FloatArray, rules: FusionRules) -> tuple[MotionMeasurement, ...]:
+    wheels = frame.readings.wheels
+    assert wheels is not None
+    readings = replace(frame.readings, wheels=replace(wheels, cov=wheels.cov * np.outer(scale, scale)))
+    return tuple(frame.budget.combine(readings, rules))
