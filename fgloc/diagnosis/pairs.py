@@ -32,6 +32,7 @@ _MOST_PAIRS = 4000
 _BLOCKS = 8  # of time, or of landmarks, of the jackknife
 _FEWEST_TRACKS = 5  # landmarks times _TRACK_S: the errors of one track are alike, and fewer are no sample
 _MOST_LOG_SCALE = 10.0  # beyond any unit of length
+_GAINS = 2.5  # standard deviations of the gain from track to track: noise of the wheels gains up to 2.4
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _RATE_HALF_S = 0.15  # yaw rates are means over twice this
 _TURN_HALF_S = 1.0
@@ -376,9 +377,11 @@ def _gain(before: FloatArray, after: FloatArray, tracks: IntArray) -> float:
 
 
 def _as_sure(x: FloatArray, k: int, sigma: float, gain: Callable[[FloatArray, int], float]) -> float:
-    """Sigma of the unknown ``k`` of a fit, such that it differs from 0 by no more sigmas than the fit gains by it."""
+    """Sigma of the unknown ``k`` of a fit; where the fit gains by it no more than by noise, it is wider."""
     size = abs(float(x[k]))
-    return sigma if size < 2.0 * sigma else max(sigma, size / max(gain(x, k), 0.5))
+    if size < 2.0 * sigma or (gained := gain(x, k)) > _GAINS:
+        return sigma
+    return max(sigma, size / max(gained, 0.5))
 
 
 class _Places:
