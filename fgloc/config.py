@@ -177,7 +177,8 @@ class LandmarksConfig(Section):
         0.0,
         ge=0,
         le=1e6,
-        description="correlation time of one landmark's errors: sightings closer than this share their information",
+        description="correlation time of one landmark's errors: a sighting so soon after another has its covariance "
+        "times repeat_s over the time between them; not of marker corners",
     )
 
 

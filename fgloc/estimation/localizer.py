@@ -24,6 +24,212 @@ from fgloc.sensors.equipment import MotionCompensation, MotionSensors, PoseSenso
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.types import Decision, Estimate, FloatArray, Ground, LandmarkMap, Mode, MotionReadings, Step
 
+# --- The loop ---------------------------------------------------------------------------------------------------------
+
+
+class Localizer:
+    """Estimates ``T_map_base``, one Step at a time.
+
+    Attributes:
+        estimator: the filter, whose log the batch smoother starts from.
+        factors: maker of landmark factors, shared with the batch smoother.
+        motion: what of the motion sources enters the graph.
+        sightings: what of the sightings enters the graph.
+        tracking: whether the robot is where it is estimated to be.
+        counts: factors added, by kind.
+        stopwatch: time spent in each phase.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        motion: MotionSensors,
+        poses: PoseSensors,
+        keep_all: bool = False,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            config: everything tunable.
+            landmark_map: the known map; None: landmarks become variables and the first pose is the origin.
+            motion: sensors of the motion.
+            poses: sensors of landmarks, and registered ones.
+            keep_all: keep the measurement log of the whole run, for the batch smoother.
+        """
+        self.estimator = make_estimator(config, landmark_map, motion, poses, keep_all)
+        self.factors = self.estimator.factors
+        self.motion = MotionJudge(config, motion, self.estimator)
+        self.tracking = Tracking(config, landmark_map, self.factors, keep_all)
+        self.sightings = SightingJudge(config, self.estimator, self.tracking)
+        self.stopwatch = Stopwatch()
+        self._compensation = MotionCompensation(poses, motion, config.camera.time_jitter_s)
+        self._recorder = Recorder(
+            config,
+            self.tracking,
+            self.motion,
+            self.sightings,
+            self._compensation,
+            self.estimator,
+            makes_map=landmark_map is None,
+        )
+        self.counts = self._recorder.counts
+        self._keep_all = keep_all
+        self._segment = -1
+        self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
+        self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
+
+    def update(self, step: Step) -> Estimate | None:
+        """Return the pose at the end of a step; None while the first pose is not known."""
+        since_fix_s = self.tracking.since_fix_s
+        self.tracking.advance_time(step.dt)
+        self._prepare(step)
+        # 1. Measure: one call per sensor; a sensor without data yields nothing
+        with self.stopwatch("motion"):
+            readings = self.motion.read(step, since_fix_s)
+        with self.stopwatch("sightings"):
+            sightings = self._compensation.measure(step, self.factors.time_offset_s)
+        # 2. No pose yet, or lost: collect steps and search the map
+        if self.tracking.initializing:
+            return self._begin(step, readings, sightings)
+        return self._advance(step, readings, sightings)
+
+    def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        """The loop from one keyframe to the next."""
+        # 3. Judge the motion sources against each other, then the sightings against the pose that they predict
+        with self.stopwatch("weigh"):
+            motion = self.motion.judge(step, readings)
+            motion, seen = self.sightings.judge(step, sightings, motion)
+        if seen.elsewhere is not None:
+            return self._jump(step, seen.elsewhere, [*motion.revisions, *seen.decisions])
+        # 4. Fuse: if the graph cannot be solved with them, the estimator leaves the sightings out
+        with self.stopwatch("fuse"):
+            rebuilt = self.estimator.rebuilt
+            belief = self.estimator.update(
+                step.stamp_ns, step.dt, motion.factors, seen.accepted, seen.logged, seen.predicted
+            )
+        frame = self.estimator.newest
+        frame.readings, frame.budget = motion.readings, motion.budget
+        if self.estimator.rebuilt > rebuilt:
+            self._recorder.rejections["estimator.window_rebuilt"] += 1
+            seen = seen.dropped("window_rebuilt")
+        self._recorder.count(frame)
+        # 5. Judge by the fused pose: the motion sources' drift, and landmarks that were moved
+        if seen.accepted:
+            self.tracking.record_fix()
+        self.motion.commit(motion, belief if seen.accepted else None, seen.observes_yaw)
+        moved, pose_changed = self.sightings.exclude_moved(step, motion, seen)
+        if pose_changed:
+            self.motion.restart()
+        # 6. Record
+        rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
+        return self._recorder.record(step, frame, rows)
+
+    def restart_at(self, pose: PoseWithCovariance) -> None:
+        """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
+
+        Sightings that contradict it do not hold: the map is searched.
+        """
+        self._restart = pose
+
+    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
+        """The segment is over: if its first pose was never found, start from the most probable place.
+
+        Args:
+            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
+
+        Returns:
+            The estimates of its steps; none if there is nothing to make up for.
+        """
+        found = self.tracking.give_up(no_landmark_sensor)
+        if found is None:
+            return []
+        first, mode = self.estimator.k + 1, Mode.LOST if self.tracking.lost else Mode.UNCONFIRMED
+        estimates = self._replay(found)
+        frames = [frame for k, frame in self.estimator.log.keyframes.items() if k >= first]
+        return self._recorder.never_confirmed(estimates, frames, mode)
+
+    def _prepare(self, step: Step) -> None:
+        """Before a step is measured: begin a segment where nothing connects it to the last, or search if lost."""
+        if step.segment != self._segment or self._restart is not None:
+            self._begin_segment(step)
+        elif not self.tracking.initializing and self.tracking.is_unlocalized(self.estimator.belief):
+            self.sightings.modes.forget()
+            self.tracking.get_lost()
+
+    def _begin_segment(self, step: Step) -> None:
+        if self._keep_all:
+            self.finish()
+        if self._segment not in (-1, step.segment):
+            self._recorder.clock_jumped(self.estimator.k + 1, step)
+        self._segment = step.segment
+        known, self._restart = self._restart, None
+        self._recorder.begin_segment(told=known is not None)
+        self.motion.begin_segment(step)
+        self.sightings.begin_segment()
+        self._prior = self.tracking.begin_segment(self.estimator.belief, known)
+
+    def _begin(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
+        """Take in a step while the pose is looked for; the estimate of it, if there is one by now."""
+        if self._prior is not None:
+            prior, self._prior = self._prior, None  # it does not hold once the robot got lost
+            self.tracking.start_known()
+            return self._start(step, prior, sightings)
+        motions = self.motion.combine(step, readings)
+        self.estimator.level(motions)
+        found = self.tracking.collect(step, motions, sightings, readings)
+        if found is None and self.tracking.lost:
+            return self._advance(step, readings, ())
+        if found is None:
+            return self._recorder.unconfirmed(self.estimator.k + 1, step)
+        if self.tracking.lost:
+            return self._jump(step, found, ())
+        estimates = self._replay(found)
+        return replace(estimates[-1], decisions=tuple(d for estimate in estimates for d in estimate.decisions))
+
+    def _jump(self, step: Step, found: InitialPose, decisions: Sequence[Decision]) -> Estimate:
+        """Go on from a place that nothing connects with the estimated pose; ``decisions``: that led there."""
+        before, place = self.estimator.belief, found.newest
+        if before is not None:
+            decisions = [*decisions, place_decision(self.estimator.k + 1, step.stamp_ns, before, place, JUMP)]
+            self.tracking.found(before, place)
+        self.motion.restart()
+        self.sightings.restart()
+        self._recorder.rejections["motion.jump"] += 1
+        decisions = [*decisions, *self.sightings.exclude_displaced(self.estimator.k + 1, step, found)]
+        estimate = self._start(step, place, ())
+        return replace(estimate, decisions=(*decisions, *estimate.decisions))
+
+    def _replay(self, found: InitialPose) -> list[Estimate]:
+        """Run the collected steps through the loop."""
+        first, *rest = found.steps
+        self.motion.begin_replay()
+        displaced = self.sightings.exclude_displaced(self.estimator.k + 1, first.step, found)
+        estimates = [self._start(first.step, found.first, first.sightings)]
+        estimates[0] = replace(estimates[0], decisions=(*displaced, *estimates[0].decisions))
+        return estimates + [self._advance(later.step, later.readings, later.sightings) for later in rest]
+
+    def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
+        self.estimator.forget_ground()
+        seen = self.sightings.associate(step, sightings, prior)
+        pose = self.estimator.start(step.stamp_ns, prior, seen.accepted)
+        self.sightings.begin_graph(seen, pose)
+        self.tracking.record_fix(bool(seen.accepted))
+        self.motion.record_fix()
+        self._recorder.count(self.estimator.newest)
+        return self._recorder.record(step, self.estimator.newest, seen.decisions)
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """What was not used so far, by reason."""
+        return self._recorder.rejections + self.motion.rejections + self.sightings.rejections
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know so far, one sentence each."""
+        return (*self.tracking.notes, *self.sightings.notes, *self.motion.notes)
+
+
 # --- Record -----------------------------------------------------------------------------------------------------------
 
 _COMPARED = 200  # poses, over the run
@@ -195,209 +401,3 @@ def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:
         return estimate
     ground = estimate.ground
     return replace(estimate, cov=cov, ground=None if ground is None else ground.with_planar(cov))
-
-
-# --- The loop ---------------------------------------------------------------------------------------------------------
-
-
-class Localizer:
-    """Estimates ``T_map_base``, one Step at a time.
-
-    Attributes:
-        estimator: the filter, whose log the batch smoother starts from.
-        factors: maker of landmark factors, shared with the batch smoother.
-        motion: what of the motion sources enters the graph.
-        sightings: what of the sightings enters the graph.
-        tracking: whether the robot is where it is estimated to be.
-        counts: factors added, by kind.
-        stopwatch: time spent in each phase.
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        landmark_map: LandmarkMap | None,
-        motion: MotionSensors,
-        poses: PoseSensors,
-        keep_all: bool = False,
-    ) -> None:
-        """Put the parts together.
-
-        Args:
-            config: everything tunable.
-            landmark_map: the known map; None: landmarks become variables and the first pose is the origin.
-            motion: sensors of the motion.
-            poses: sensors of landmarks, and registered ones.
-            keep_all: keep the measurement log of the whole run, for the batch smoother.
-        """
-        self.estimator = make_estimator(config, landmark_map, motion, poses, keep_all)
-        self.factors = self.estimator.factors
-        self.motion = MotionJudge(config, motion, self.estimator)
-        self.tracking = Tracking(config, landmark_map, self.factors, keep_all)
-        self.sightings = SightingJudge(config, self.estimator, self.tracking)
-        self.stopwatch = Stopwatch()
-        self._compensation = MotionCompensation(poses, motion, config.camera.time_jitter_s)
-        self._recorder = Recorder(
-            config,
-            self.tracking,
-            self.motion,
-            self.sightings,
-            self._compensation,
-            self.estimator,
-            makes_map=landmark_map is None,
-        )
-        self.counts = self._recorder.counts
-        self._keep_all = keep_all
-        self._segment = -1
-        self._prior: PoseWithCovariance | None = None  # where the segment starts, if that is known without sightings
-        self._restart: PoseWithCovariance | None = None  # where the next step is to begin anew
-
-    def update(self, step: Step) -> Estimate | None:
-        """Take in one step; return the newest pose, or None while the first pose is not yet known."""
-        since_fix_s = self.tracking.since_fix_s
-        self.tracking.advance_time(step.dt)
-        self._prepare(step)
-        # 1. Measure: one call per sensor; a sensor without data yields nothing
-        with self.stopwatch("motion"):
-            readings = self.motion.read(step, since_fix_s)
-        with self.stopwatch("sightings"):
-            sightings = self._compensation.measure(step, self.factors.time_offset_s)
-        # 2. No pose yet, or lost: collect steps and search the map
-        if self.tracking.initializing:
-            return self._begin(step, readings, sightings)
-        return self._advance(step, readings, sightings)
-
-    def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
-        """The loop from one keyframe to the next."""
-        # 3. Judge: the motion sources against each other, the sightings against the predicted pose
-        with self.stopwatch("weigh"):
-            motion = self.motion.judge(step, readings)
-            motion, seen = self.sightings.judge(step, sightings, motion)
-        if seen.elsewhere is not None:
-            return self._jump(step, seen.elsewhere, [*motion.revisions, *seen.decisions])
-        # 4. Fuse: if the graph cannot be solved with them, the estimator leaves the sightings out
-        with self.stopwatch("fuse"):
-            rebuilt = self.estimator.rebuilt
-            belief = self.estimator.update(
-                step.stamp_ns, step.dt, motion.factors, seen.accepted, seen.logged, seen.predicted
-            )
-        frame = self.estimator.newest
-        frame.readings, frame.budget = motion.readings, motion.budget
-        if self.estimator.rebuilt > rebuilt:
-            self._recorder.rejections["estimator.window_rebuilt"] += 1
-            seen = seen.dropped("window_rebuilt")
-        self._recorder.count(frame)
-        # 5. Judge by the fused pose: the motion sources' drift, and landmarks that were moved
-        if seen.accepted:
-            self.tracking.record_fix()
-        self.motion.commit(motion, belief if seen.accepted else None, seen.observes_yaw)
-        moved, pose_changed = self.sightings.exclude_moved(step, motion, seen)
-        if pose_changed:
-            self.motion.restart()
-        # 6. Record
-        rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
-        return self._recorder.record(step, frame, rows)
-
-    def restart_at(self, pose: PoseWithCovariance) -> None:
-        """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
-
-        Sightings that contradict it do not hold: the map is searched.
-        """
-        self._restart = pose
-
-    def finish(self, no_landmark_sensor: bool = False) -> list[Estimate]:
-        """The segment is over: if its first pose was never found, start from the most probable place.
-
-        Args:
-            no_landmark_sensor: nothing could have seen a landmark: then the map's origin is as probable as any place.
-
-        Returns:
-            The estimates of its steps; none if there is nothing to make up for.
-        """
-        found = self.tracking.give_up(no_landmark_sensor)
-        if found is None:
-            return []
-        first, mode = self.estimator.k + 1, Mode.LOST if self.tracking.lost else Mode.UNCONFIRMED
-        estimates = self._replay(found)
-        frames = [frame for k, frame in self.estimator.log.keyframes.items() if k >= first]
-        return self._recorder.never_confirmed(estimates, frames, mode)
-
-    def _prepare(self, step: Step) -> None:
-        """Before a step is measured: begin a segment where nothing connects it to the last, or search if lost."""
-        if step.segment != self._segment or self._restart is not None:
-            self._begin_segment(step)
-        elif not self.tracking.initializing and self.tracking.is_unlocalized(self.estimator.belief):
-            self.sightings.modes.forget()
-            self.tracking.get_lost()
-
-    def _begin_segment(self, step: Step) -> None:
-        if self._keep_all:
-            self.finish()
-        if self._segment not in (-1, step.segment):
-            self._recorder.clock_jumped(self.estimator.k + 1, step)
-        self._segment = step.segment
-        known, self._restart = self._restart, None
-        self._recorder.begin_segment(told=known is not None)
-        self.motion.begin_segment(step)
-        self.sightings.begin_segment()
-        self._prior = self.tracking.begin_segment(self.estimator.belief, known)
-
-    def _begin(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
-        """Take in a step while the pose is looked for; the estimate of it, if there is one by now."""
-        if self._prior is not None:
-            prior, self._prior = self._prior, None  # it does not hold once the robot got lost
-            self.tracking.start_known()
-            return self._start(step, prior, sightings)
-        motions = self.motion.combine(step, readings)
-        self.estimator.level(motions)
-        found = self.tracking.collect(step, motions, sightings, readings)
-        if found is None and self.tracking.lost:
-            return self._advance(step, readings, ())
-        if found is None:
-            return self._recorder.unconfirmed(self.estimator.k + 1, step)
-        if self.tracking.lost:
-            return self._jump(step, found, ())
-        estimates = self._replay(found)
-        return replace(estimates[-1], decisions=tuple(d for estimate in estimates for d in estimate.decisions))
-
-    def _jump(self, step: Step, found: InitialPose, decisions: Sequence[Decision]) -> Estimate:
-        """Go on from a place that nothing connects with the estimated pose; ``decisions``: that led there."""
-        before, place = self.estimator.belief, found.newest
-        if before is not None:
-            decisions = [*decisions, place_decision(self.estimator.k + 1, step.stamp_ns, before, place, JUMP)]
-            self.tracking.found(before, place)
-        self.motion.restart()
-        self.sightings.restart()
-        self._recorder.rejections["motion.jump"] += 1
-        decisions = [*decisions, *self.sightings.exclude_displaced(self.estimator.k + 1, step, found)]
-        estimate = self._start(step, place, ())
-        return replace(estimate, decisions=(*decisions, *estimate.decisions))
-
-    def _replay(self, found: InitialPose) -> list[Estimate]:
-        """Run the collected steps through the loop."""
-        first, *rest = found.steps
-        self.motion.begin_replay()
-        displaced = self.sightings.exclude_displaced(self.estimator.k + 1, first.step, found)
-        estimates = [self._start(first.step, found.first, first.sightings)]
-        estimates[0] = replace(estimates[0], decisions=(*displaced, *estimates[0].decisions))
-        return estimates + [self._advance(later.step, later.readings, later.sightings) for later in rest]
-
-    def _start(self, step: Step, prior: PoseWithCovariance, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
-        self.estimator.forget_ground()
-        seen = self.sightings.associate(step, sightings, prior)
-        pose = self.estimator.start(step.stamp_ns, prior, seen.accepted)
-        self.sightings.begin_graph(seen, pose)
-        self.tracking.record_fix(bool(seen.accepted))
-        self.motion.record_fix()
-        self._recorder.count(self.estimator.newest)
-        return self._recorder.record(step, self.estimator.newest, seen.decisions)
-
-    @property
-    def rejections(self) -> Counter[str]:
-        """What was not used so far, by reason."""
-        return self._recorder.rejections + self.motion.rejections + self.sightings.rejections
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
-        return (*self.tracking.notes, *self.sightings.notes, *self.motion.notes)
