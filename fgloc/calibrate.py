@@ -100,7 +100,7 @@ def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]
 
 
 def pooled(founds: Sequence[InstallationFound], maps: Collection[str | None], config: Config) -> tuple[Setting, ...]:
-    """What several runs know together: their information added, that of the prior once.
+    """Settings estimated by several runs together: their information is added, that of the prior counts once.
 
     Args:
         founds: of each run.

@@ -301,7 +301,7 @@ class TopicsConfig(Section):
     truth: str | None = None
 
     def given(self, role: Role) -> str | None:
-        """What is given for a role."""
+        """Topic that is given for a role; None: none is given."""
         return getattr(self, role, None)
 
 
@@ -520,7 +520,7 @@ def files_of(config: type[Config]) -> Iterator[tuple[str, str]]:
 
 
 def yaml_of(config: Config, folder: Path) -> str:
-    """What `load_config` reads back from a file in this folder: the values that were given, without the defaults."""
+    """YAML of a configuration for a file in this folder: the values that were given, without the defaults."""
     data = config.model_dump(mode="json", exclude_unset=True)
     for section, key in files_of(type(config)):
         path = getattr(getattr(config, section), key)

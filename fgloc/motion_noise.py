@@ -1,4 +1,4 @@
-"""Noise of the wheels' motion, as the landmarks of one recording tell it."""
+"""Noise of the wheels' motion, estimated from the landmarks of one recording by maximum evidence."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ACCURACY = 0.1  # of the logarithms
 
 
 def with_motion_noise(robot: RobotFile, bag: Path, progress: Progress | None = None) -> RobotFile:
-    """The first settings of a robot, with the noise of its wheels where sightings tell it."""
+    """First settings of a robot, with the noise of its wheels where sightings determine it."""
     if not {"image", "sightings"} & robot.roles.keys():
         return robot
     try:
@@ -97,7 +97,7 @@ def identify_motion_noise(
 def _most_likely(
     bag: Path, map_path: Path | None, config: Config, progress: Progress | None
 ) -> tuple[FloatArray, float] | None:
-    """Both factors ``(2,)``, and the gain of log-likelihood; None: there is nothing to tell them by."""
+    """Most likely factors ``(2,)`` and their gain of log-likelihood; None: the recording does not determine them."""
     with open_recording(bag, config.recording) as recording:
         parts = assemble(recording, map_path, config, True)
         longest_s = _EXCERPT_S if parts.detector is None else _IMAGES_S

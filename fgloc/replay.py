@@ -84,7 +84,7 @@ class TopicActivity:
     """
 
     def __init__(self, expected: Mapping[Role, str]) -> None:
-        """``expected``: topic of each role that is to be used."""
+        """Begin without messages; ``expected``: topic of each role that is to be used."""
         self._expected = dict(expected)
         self._topics: dict[str, _Times] = {}
         self._without = set(expected.values())
@@ -210,7 +210,7 @@ class Replay:
                 self._on_step(step, estimate)
 
     def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
-        """Note one step's outcome."""
+        """Note the outcome and the time [ms] of one step."""
         self.step_ms.append(milliseconds)
         if self._first_step_ns is None:
             self._first_step_ns = step.stamp_ns
@@ -222,7 +222,7 @@ class Replay:
         self.decisions.extend(estimate.decisions)
 
     def make_up(self, estimates: list[Estimate]) -> None:
-        """Note what only the end of the run made possible; it replaces nothing that was reported before."""
+        """Add estimates that only the end of the run made possible; they replace none that was reported before."""
         self.decisions.extend(d for estimate in estimates for d in estimate.decisions)
         if not self.estimates:
             self.estimates = estimates

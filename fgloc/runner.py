@@ -96,7 +96,7 @@ def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:
 
 
 def sentence(note: str) -> str:
-    """With a capital, unless it begins with a name (of a topic, a file), and with a full stop."""
+    """Note with a capital, unless it begins with a name (of a topic, a file), and with a full stop."""
     first = note.split(maxsplit=1)[0]
     return (note[0].upper() + note[1:] if first.isalpha() else note) + ("" if note.endswith((".", "?", "!")) else ".")
 
@@ -220,7 +220,7 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
 
 
 def _contradiction(parts: Assembly) -> Contradiction | None:
-    """Constants that were held online."""
+    """Contradiction by the constants that were held online; None if there are none."""
     estimator = parts.localizer.estimator
     return Contradiction(tuple(estimator.contradicted), estimator.asked()) if estimator.contradicted else None
 

@@ -32,7 +32,7 @@ def wrap_array(angles: FloatArray) -> FloatArray:
 
 
 def compose(a: Triple, b: Triple) -> FloatArray:
-    """``T_a ∘ T_b``; the yaw is wrapped."""
+    """Compose two poses: ``T_a ∘ T_b``; the yaw is wrapped."""
     ax, ay, at = a
     bx, by, bt = b
     c, s = math.cos(at), math.sin(at)
@@ -48,14 +48,14 @@ def compose_array(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def inverse(a: Triple) -> FloatArray:
-    """``T_a⁻¹``."""
+    """Inverse pose ``T_a⁻¹``."""
     ax, ay, at = a
     c, s = math.cos(at), math.sin(at)
     return np.array([-c * ax - s * ay, s * ax - c * ay, wrap(-at)])
 
 
 def between(a: Triple, b: Triple) -> FloatArray:
-    """``T_a⁻¹ ∘ T_b``: b seen from a."""
+    """Pose of b seen from a, ``T_a⁻¹ ∘ T_b``."""
     return compose(inverse(a), b)
 
 

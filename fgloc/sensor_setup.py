@@ -39,7 +39,7 @@ _SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded i
 
 
 class HasFrames(Protocol):
-    """Anything with transforms."""
+    """Interface of an object with transforms."""
 
     @property
     def frames(self) -> FrameTree:
@@ -52,12 +52,12 @@ class StreamFacts(HasFrames, Protocol):
 
     @property
     def name(self) -> str:
-        """For messages to the user."""
+        """Name of the stream, for messages to the user."""
         ...
 
     @property
     def roles(self) -> Mapping[Role, str]:
-        """Topic of each role that is there."""
+        """Topic of each role that the stream has."""
         ...
 
     @property

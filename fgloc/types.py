@@ -201,7 +201,7 @@ class Step:
 
     @property
     def dt(self) -> float:
-        """Length [s]."""
+        """Length of the step [s]."""
         return (self.stamp_ns - self.start_ns) * 1e-9
 
     def of(self, kind: type[M]) -> tuple[M, ...]:
@@ -275,7 +275,7 @@ class Landmark:
 
     @property
     def planar(self) -> FloatArray:
-        """``(3,)`` x, y, yaw: yaw of the face normal if the marker stands, of its x axis if it lies."""
+        """Planar pose ``(3,)`` x, y, yaw: yaw of the face normal if the marker stands, of its x axis if it lies."""
         axis = self.rotation[:, 2] if abs(self.rotation[2, 2]) < 0.7 else self.rotation[:, 0]
         return np.array([self.position[0], self.position[1], np.arctan2(axis[1], axis[0])])
 
@@ -440,7 +440,7 @@ class Ground:
     cov: FloatArray  # (6, 6) of x, y, z, roll, pitch, yaw in the map frame, as in ROS
 
     def with_planar(self, cov: FloatArray) -> Ground:
-        """With another covariance ``(3, 3)`` of x, y and yaw, which are then not correlated with the others."""
+        """Ground with another covariance ``(3, 3)`` of x, y and yaw, which are then not correlated with the others."""
         whole = self.cov.copy()
         whole[PLANAR, :] = whole[:, PLANAR] = 0.0
         whole[np.ix_(PLANAR, PLANAR)] = cov

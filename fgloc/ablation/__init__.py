@@ -1,1 +1,1 @@
-"""What the loss of each sensor costs: failures as filters of events, swept over recordings and variants."""
+"""Ablation: failures of sensors as filters of events, swept over recordings and variants."""

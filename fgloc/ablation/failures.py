@@ -29,11 +29,11 @@ class Dropout(EventFailure):
     sensor: SensorName
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Messages of the sensor."""
+        """Classes of the sensor's messages."""
         return events_of(self.sensor)
 
     def begin(self, scene: Scene) -> Change:
-        """Drop."""
+        """Return the function that drops each message."""
         return lambda event: None
 
 
@@ -46,11 +46,11 @@ class ClockOffset(EventFailure):
     drift_ppm: float = Field(0.0, description="µs gained per second since the start")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Messages of the sensor."""
+        """Classes of the sensor's messages."""
         return events_of(self.sensor)
 
     def begin(self, scene: Scene) -> Change:
-        """Move the stamp."""
+        """Return the function that moves the stamp of each message."""
 
         def change(event: Event) -> Event:
             moved = self.offset_s + self.drift_ppm * 1e-6 * scene.seconds(event)
@@ -137,11 +137,11 @@ class SightingFailure(EventFailure):
     stage: ClassVar[Literal["recorded", "sightings"]] = "sightings"
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Sightings of all kinds."""
+        """Class of the messages with sightings."""
         return (SightingsEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Apply `alter` to each sighting of a message."""
+        """Return the function that applies `alter` to each sighting of a message."""
         alter = self.alter(scene)
 
         def change(event: Event) -> Event | None:
@@ -156,7 +156,7 @@ class SightingFailure(EventFailure):
 
     @abstractmethod
     def alter(self, scene: Scene) -> Callable[[Sighting], Sighting | None]:
-        """What happens to one sighting (None: hidden), with the state of one run."""
+        """Return the function that changes one sighting, or hides it (None), with the state of one run."""
 
 
 class SightingNoise(SightingFailure):
@@ -311,7 +311,7 @@ def _ns(seconds: float) -> int:
 
 
 def _merged(intervals: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The intervals in order, those that overlap as one."""
+    """Intervals in order, overlapping ones merged."""
     out: list[tuple[int, int]] = []
     for start, end in sorted(intervals):
         if out and start <= out[-1][1]:
@@ -322,12 +322,12 @@ def _merged(intervals: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _removed_until(cuts: list[tuple[int, int]], at: int) -> int:
-    """How much of the time before ``at`` is cut out."""
+    """Time [ns] before ``at`` that is cut out."""
     return sum(min(end, at) - start for start, end in cuts if start < at)
 
 
 def _removed(cuts: list[tuple[int, int]], at: int) -> int | None:
-    """The same; None if ``at`` is cut out itself."""
+    """Time [ns] before ``at`` that is cut out; None if ``at`` itself is cut out."""
     return None if any(start <= at < end for start, end in cuts) else _removed_until(cuts, at)
 
 
@@ -406,7 +406,7 @@ def corrupt(
     events: Iterator[Event],
     scenes: Sequence[Scene],
 ) -> Iterator[Event]:
-    """Events after all failures of a stage, one after the other.
+    """Events after all failures of a stage, applied one after the other.
 
     Args:
         failures: in the order in which they act.

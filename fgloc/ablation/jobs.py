@@ -54,7 +54,7 @@ class Track(BaseModel):
 
 
 class Cost(BaseModel):
-    """What a run took; never the same twice."""
+    """Wall time, CPU time and peak memory of one run; never the same twice."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -64,7 +64,7 @@ class Cost(BaseModel):
 
 
 class Record(BaseModel):
-    """What is known of a job after its run. All but ``cost`` depends on the inputs alone."""
+    """Result of a job's run. All fields but ``cost`` depend on the inputs alone."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -80,12 +80,12 @@ class Record(BaseModel):
 
 
 def record_path(out: Path, key: str) -> Path:
-    """Where a job's record is."""
+    """Path of a job's record."""
     return out / "jobs" / f"{key}.json"
 
 
 def owner_path(out: Path, folder: str) -> Path:
-    """Where the key of the job is that wrote the files of a folder last."""
+    """Path of the file with the key of the job that wrote a folder last."""
     return out / "jobs" / f"{folder}.owner"
 
 
@@ -279,7 +279,7 @@ def execute(job: Job, out: Path) -> str:
 
 
 def detections_path(out: Path, job: Job) -> Path:
-    """Where the markers that are found in a job's images are kept for the other jobs that see them."""
+    """Path of the file with the markers detected in a job's images, shared by the jobs with the same images."""
     return out / "detections" / f"{job.images}.npz"
 
 

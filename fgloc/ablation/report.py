@@ -140,7 +140,7 @@ def select(runs: Iterable[Run], failure: str, severity: float | None, variant: s
 
 
 def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
-    """What a failure costs the first variant at its last severity, run by run against the same without failure."""
+    """Sentence: error that a failure costs the first variant at its last severity, by pairs of runs."""
     entry = next(f for f in suite.failures if f.name == failure)
     severity = list(entry.severities())[-1][0]
     variant = suite.variants[0].name
@@ -164,7 +164,7 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
 
 
 def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
-    """How the mean error changes from the first of each pair to the second, if it measurably does."""
+    """Sentence: change of the mean error from the first to the second of each pair, if it is measurable."""
     before, after = np.mean(pairs, axis=0)
     runs = f"over {len(pairs)} run{'s' if len(pairs) > 1 else ''}"
     if len(pairs) > 1:
@@ -180,7 +180,7 @@ def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
 
 
 def _measurable(pairs: Sequence[tuple[float, float]]) -> bool:
-    """Whether the mean change exceeds its spread, or of many runs what chance makes of it; one run has no spread."""
+    """Whether the mean change exceeds its spread or, for many runs, its 95 % confidence interval; True for one run."""
     if len(pairs) < 2:
         return True
     more, n = np.diff(pairs), len(pairs)
@@ -190,7 +190,7 @@ def _measurable(pairs: Sequence[tuple[float, float]]) -> bool:
 
 
 def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
-    """What a variant changes against the first one, where that is most: the same recordings, failures and seeds.
+    """Sentence: largest change of error of a variant against the first one, by pairs of runs with the same inputs.
 
     Returns:
         A sentence; None if no run of both gave a figure.

@@ -54,7 +54,7 @@ class Severity(Section):
 
     @property
     def axis(self) -> str:
-        """What is varied, in words, with its unit."""
+        """Label of the varied quantity, with its unit."""
         name = self.label or _words(self.field)
         return f"{name} [{self.unit}]" if self.unit else name
 

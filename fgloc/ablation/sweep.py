@@ -95,7 +95,7 @@ def _recorded(out: Path, key: str, error: str | None) -> Record:
 
 
 def _by_turns(jobs: Sequence[Job]) -> list[Job]:
-    """Jobs of different images in turn, so that those of the same ones find what the first of them has detected."""
+    """Jobs ordered so that those with the same images are apart, and reuse the detections of the first of them."""
     turns: Counter[str] = Counter()
     ranked = []
     for place, job in enumerate(jobs):
@@ -125,7 +125,7 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
 
 
 def _shared_images(todo: Sequence[Job], out: Path) -> dict[str, Job]:
-    """Images that several jobs see as they were recorded, and whose markers are still to be found: one of the jobs."""
+    """One job for each set of unaltered images that several jobs share and whose markers are not detected yet."""
     count = Counter(job.images for job in todo)
     return {
         job.images: job
@@ -138,13 +138,13 @@ def _shared_images(todo: Sequence[Job], out: Path) -> dict[str, Job]:
 
 
 def _prepare(job: Job, out: Path) -> None:
-    """`detect`; what goes wrong is left to the jobs."""
+    """Detect the markers of a job's images; errors are left to the jobs."""
     with suppress(Exception):
         detect(job, out)
 
 
 def _attempt(job: Job, out: Path) -> str | OutputError:
-    """`execute`; what cannot be written comes back as a value, for the worker would log an exception at length."""
+    """Execute a job; return an error of output instead of raising it, as the worker would log that at length."""
     try:
         return execute(job, out)
     except OutputError as error:
@@ -232,7 +232,7 @@ _TAKEN = {"jobs"}  # the sweep's own folder
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be done with each bag.
+    """Jobs of a sweep over several bags, and the bags that cannot be tried.
 
     Attributes:
         names: folders of the bags, in their order.

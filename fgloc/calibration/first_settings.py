@@ -59,7 +59,7 @@ _MEANINGS: dict[Role, str] = {
 
 @dataclass(frozen=True, slots=True)
 class RobotFile:
-    """What `first_settings` found.
+    """Text of a robot.yaml as `first_settings` writes it, with its topics, its gaps and its findings.
 
     Attributes:
         text: of robot.yaml.

@@ -1,4 +1,4 @@
-"""What a run has found of the installation: values, settings with their lines, and those that were given wrong.
+"""Installation estimated by a run: values, settings with their lines, and given values that it contradicts.
 
 A careful installation is off by its prior sigmas, and finding that is what the state is for: it is no reason to write.
 Reported is what the measurements alone have further off than three sigmas of the two together (`Setting.off`), and
@@ -128,7 +128,7 @@ _SIGMAS = {  # the field that takes the sigma of settings back; of several the l
 
 
 def installation_found(parts: Assembly, roles: Container[str], belief: InstallationEstimate) -> InstallationFound:
-    """What a run of these parts has found, from a recording with these roles."""
+    """Installation estimated by a run of these parts, for a recording with these roles."""
     installation, landmark_map, source = parts.localizer.factors.installation, parts.landmark_map, parts.wheels.source
     n = installation.constants  # height, roll and pitch of a pose are no installation
     found = InstallationFound(
@@ -256,7 +256,7 @@ def map_found(landmark_map: LandmarkMap, installation: Installation, belief: Ins
 
 
 def _readable(cov: FloatArray) -> FloatArray:
-    """Of a marker the sigmas alone, which somebody can read."""
+    """Covariance ``(n, n)`` as written to a map: of a marker its diagonal only, of a point the symmetric matrix."""
     return np.diag(np.diag(cov)) if len(cov) > 2 else 0.5 * (cov + cov.T)
 
 
@@ -268,19 +268,19 @@ _UNITS |= {"yaw_per_m": "rad/m", "slowdown": "s/rad"}
 
 
 def setting_unit(name: str) -> str:
-    """Of a setting such as ``camera.cx_px``; "-" of a ratio."""
+    """Unit of a setting such as ``camera.cx_px``; "-" for a ratio."""
     section, _, key = name.partition(".")
     named = section if section.startswith("stamp_offset") else key
     return _UNITS.get(named) or (_SUFFIXES.get(named.rpartition("_")[2], "-") if "_" in named else "-")
 
 
 def given_text(s: Setting) -> str:
-    """What was given, with the digits that what was found has."""
+    """Given value of a setting, with as many digits as the estimated value has."""
     return rounded(s.given, s.sigma)[0]
 
 
 def found_text(s: Setting) -> str:
-    """What was found and its sigma."""
+    """Estimated value of a setting and its sigma."""
     return " ± ".join(rounded(s.found, s.sigma))
 
 

@@ -169,7 +169,7 @@ def _check(bag: Path, recording: Recording, config: Config) -> None:
 
 
 def _coarseness(corners: FloatArray) -> float:
-    """On the noise of the corners ``(4, 2)`` of a marker seen small or from the side.
+    """Factor (1 or more) on the noise of corners ``(4, 2)`` of a marker seen small or from the side.
 
     Blur then shifts its edges by what the cells beside them are, alike in all views from there: with this the
     directions of a simulated survey are a third better.
@@ -193,7 +193,7 @@ _SPREAD_M = 0.25  # standard deviation of places that determine a direction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guess:
-    """Where a marker is, about.
+    """Approximate pose of a marker.
 
     Attributes:
         T: ``(4, 4)`` takes its coordinates to those of the trajectory.
@@ -209,7 +209,7 @@ class Guess:
 def guess(
     poses: FloatArray, seen: Sequence[Sequence[PixelMeasurement]], sizes: Mapping[int, float], least: int
 ) -> tuple[dict[int, Guess], dict[int, str]]:
-    """Where the views of each marker agree that it is.
+    """Approximate pose of each marker on which its views agree.
 
     Of the two poses that explain a view of a flat square, the right one stays in place as the robot moves, while the
     mirrored one wanders.
@@ -268,7 +268,7 @@ def _agreed(views: list[tuple[int, float, list[FloatArray]]]) -> Guess:
 
 
 def _near(one: FloatArray, both: FloatArray, depths: FloatArray) -> FloatArray:
-    """Whether each pose of each view is about this one ``(n, 2)``."""
+    """Mask ``(n, 2)``: whether each of the two poses of each view is close to this one."""
     apart = np.linalg.norm(both[..., :3, 3] - one[:3, 3], axis=2)
     cos = 0.5 * (np.einsum("nkij,ij->nk", both[..., :3, :3], one[:3, :3]) - 1.0)
     return np.asarray((apart < _AGREE_M + _AGREE_PER_M * depths[:, None]) & (cos > np.cos(_AGREE_RAD)))
@@ -315,7 +315,7 @@ def _planar(T: FloatArray) -> FloatArray:
 
 
 def planar_matrix(pose: Iterable[float]) -> FloatArray:
-    """``(4, 4)`` of a pose on the floor."""
+    """Homogeneous matrix ``(4, 4)`` of a pose on the floor."""
     x, y, yaw = pose
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -462,7 +462,7 @@ class Distance:
     sigma_m: float = 0.002
 
     def of(self, landmarks: Mapping[int, Landmark]) -> float:
-        """As these landmarks have it [m]."""
+        """Distance [m] between the two markers in this map."""
         return float(np.linalg.norm(landmarks[self.second].position - landmarks[self.first].position))
 
 
@@ -504,7 +504,7 @@ class SurveyGraph:
         config: Config,
         distances: Sequence[Distance] = (),
     ) -> None:
-        """Put the graph together.
+        """Build the graph.
 
         Args:
             legs: the drives.
@@ -524,7 +524,7 @@ class SurveyGraph:
         self.belief = self.installation.prior()
 
     def solve(self) -> None:
-        """Find everything.
+        """Estimate markers, trajectories and installation.
 
         Raises:
             EstimatorError: there is no solution.
@@ -660,7 +660,7 @@ _CONTRADICTS = 4.0  # sigmas by which a measured distance may miss
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """What came out.
+    """Result of a survey.
 
     Attributes:
         landmarks: the map, each marker with its covariance ``(6, 6)``.

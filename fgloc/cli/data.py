@@ -374,7 +374,7 @@ def evaluate_model(
 
 
 def _write_config(bags: list[Path], out: Path) -> None:
-    """``--init``."""
+    """Write the training configuration that ``--init`` asks for, and print warnings and the next step."""
     from fgloc.files.outputs import write_text
     from fgloc_training.recordings import look, missing, training_yaml
 

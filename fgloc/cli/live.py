@@ -132,7 +132,7 @@ def _tell(sentence: str) -> None:
 
 @contextmanager
 def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator[Callable[[str], None]]:
-    """A page that shows the run; what is to be told goes there too."""
+    """Open a page that shows the run; yield the function that shows a sentence there too."""
     from fgloc.recording.truth import base_pose
     from fgloc.types import Event, TruthEvent
     from fgloc.view.page import Page
@@ -158,7 +158,7 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 
 @contextmanager
 def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
-    """The pose, on a terminal."""
+    """Show the pose in one line while the block runs, on a terminal only."""
     if not sys.stderr.isatty():
         yield
         return
@@ -201,7 +201,7 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
 
 
 def _exit_if_wrong(node: Node) -> None:
-    """Say again what makes the poses wrong, and end with the code of a run that is not to be trusted."""
+    """Repeat the errors of the run and end with the code of a run that is not to be trusted, if there are any."""
     from fgloc.types import Severity
 
     findings = () if node.live is None else node.live.status().findings

@@ -1,4 +1,4 @@
-"""Arguments that several commands share, what is taken where they are not given, and the extras that commands need."""
+"""Arguments that several commands share, their defaults, and the extras that commands need."""
 
 from __future__ import annotations
 

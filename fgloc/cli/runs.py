@@ -161,7 +161,7 @@ def _write(result: RunResult, bag: Path, out: Path, command: str, figures: Seque
 
 
 def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mcap: Path | None) -> None:
-    """Say what came out, and write it for the viewers that were asked for."""
+    """Print the figures of a run, and write it for the viewers that were asked for."""
     from fgloc.evaluation.judgements import gravest
 
     write_for_viewers(result, rrd, mcap)
@@ -337,7 +337,7 @@ def write_for_viewers(result: RunResult, rrd: Path | None, mcap: Path | None) ->
 
 
 def _base_frame(config: Any) -> str:
-    """Of a configuration as ``config.json`` has it."""
+    """Name of the base frame in a configuration as ``config.json`` has it; the default if it names none."""
     recording = config.get("recording") if isinstance(config, dict) else None
     base = recording.get("base_frame") if isinstance(recording, dict) else None
     return base if isinstance(base, str) else _BASE

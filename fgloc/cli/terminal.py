@@ -1,4 +1,4 @@
-"""What the commands say: sentences, tables, exit codes, and their progress on stderr."""
+"""Output of the commands: sentences, tables, exit codes, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def exit_unless_trusted(result: RunResult) -> None:
 
 @contextmanager
 def kept_on_interrupt(kept: str = "of this result nothing was written; an earlier one is as it was") -> Iterator[None]:
-    """Say on Ctrl-C what there is, and end with the code that shells give to it."""
+    """Print on Ctrl-C what was kept, and end with the exit code that shells expect of an interrupt."""
     try:
         yield
     except KeyboardInterrupt:
@@ -73,12 +73,12 @@ def kept_on_interrupt(kept: str = "of this result nothing was written; an earlie
 
 
 def group(about: str) -> typer.Typer:
-    """Commands below a name."""
+    """Typer application for a group of commands."""
     return typer.Typer(help=about, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 def warn(text: str) -> None:
-    """What the user should act on, on stderr: in red on a terminal."""
+    """Print a warning on stderr, in red on a terminal."""
     say_remark("warning", text, err=True)
 
 
@@ -165,7 +165,7 @@ def shown() -> Iterator[None]:
 
 @contextmanager
 def run_bar(label: str) -> Iterator[Progress]:
-    """Takes seconds of one recording that are done, and its length [s]."""
+    """Progress bar of one recording: yields a function of the seconds done and the length [s]."""
     try:
         yield lambda done_s, length_s: tell(label, done_s, length_s, "s")
     finally:
@@ -174,7 +174,7 @@ def run_bar(label: str) -> Iterator[Progress]:
 
 @contextmanager
 def jobs_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Takes jobs of a sweep that are done, and their number."""
+    """Progress bar of a sweep: yields a function of the number of jobs done and in total."""
     try:
         yield lambda done, total: tell(label, done, total)
     finally:
@@ -207,7 +207,7 @@ class Bars:
     """A listener that shows bars on a terminal; they vanish when their work is done."""
 
     def __init__(self) -> None:
-        """Show nothing until something is told."""
+        """Prepare; nothing is shown before the first progress is reported."""
         self._progress: Any = None
         self._tasks: dict[str, Any] = {}
 
@@ -227,7 +227,7 @@ class Bars:
         self._progress.update(self._tasks[of.label], completed=of.done, total=of.total, amount=_amount(of))
 
     def close(self) -> None:
-        """Take the bars away."""
+        """Remove the bars."""
         if self._progress is not None:
             self._progress.stop()
         self._progress = None

@@ -93,7 +93,7 @@ _UNIT = 0.04  # share by which a scale may miss a unit's
 
 @dataclass
 class Conventions:
-    """What was found, and what it was found by.
+    """Findings on the conventions of a recording, the configuration with their lines set, and the evidence.
 
     Attributes:
         findings: with the lines that undo them.
@@ -326,7 +326,7 @@ def _twist_late(found: Conventions, rows: FloatArray, yaw: FloatArray) -> None:
 
 
 def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
-    """Lines that undo what is wrong with the twist alone: those given if the twist has to be used, else the pose is."""
+    """Lines that undo an error of the twist alone: those given if the twist has to be used, else the source "pose"."""
     return lines if found.config.wheels.source == "twist" else {"wheels.source": "pose"}
 
 
@@ -334,7 +334,7 @@ def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
 
 
 def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None) -> None:
-    """Name an odometry whose yaw is the gyro's: it goes with the gyro where the angles of the wheels turn otherwise."""
+    """Report an odometry whose yaw is the gyro's: it follows the gyro where the wheels' angles give another turn."""
     rates, rows = signals.rates(), in_order(signals.odometry)
     if rates is None or len(rows) < 50:
         return
@@ -378,7 +378,7 @@ def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None
 
 
 def _by_hand(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> tuple[Signals, Path]:
-    """Name when the robot was held, lifted or turned by hand; the signals without that time."""
+    """Report when the robot was held, lifted or turned by hand; return the signals without that time."""
     trial = Conventions(found.config)
     _gyro(trial, signals, path, imu_up)
     if any(f.code in ("imu.axes", "imu.gravity") for f in trial.findings):
@@ -768,7 +768,7 @@ def _constants(
 
 
 def _lines_of(found: Conventions) -> set[str]:
-    """Keys that what was found sets."""
+    """Keys of robot.yaml that the findings set."""
     return {key for finding in found.findings for key in finding.lines}
 
 

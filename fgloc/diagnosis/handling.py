@@ -56,7 +56,7 @@ _REST_S = 2.0  # of rest, for the size of gravity
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Handling:
-    """Stretches of time and what the IMU shows beside them.
+    """Stretches of time in which a person handled the robot, and the specific force at rest.
 
     Attributes:
         lifted: it was lifted, or turned by hand.
@@ -75,7 +75,7 @@ class Handling:
 
 
 def handling(signals: Signals, config: Config, path: Path, up: FloatArray) -> Handling:
-    """Find them.
+    """Find the stretches in which the robot was lifted, turned by hand or held.
 
     Args:
         signals: of the recording.
@@ -107,14 +107,14 @@ def handling(signals: Signals, config: Config, path: Path, up: FloatArray) -> Ha
 
 
 def outside(signals: Signals, found: Handling) -> Signals:
-    """The signals of the IMU without these stretches."""
+    """Signals without the IMU's measurements in the handled stretches."""
     times = np.array([row[0] for row in signals.imu])
     kept = ~_inside(times, found.spans)
     return replace(signals, imu=[row for row, keep in zip(signals.imu, kept, strict=True) if keep])
 
 
 def cut(path: Path, found: Handling) -> Path:
-    """The wheels' path, whose motion is not known in these stretches."""
+    """Path of the wheels, its motion marked as unknown in the handled stretches."""
     handled = _inside(path.times, found.spans)
     return Path(path.times, path.poses, path.gaps + np.cumsum(handled))
 
@@ -201,7 +201,7 @@ _MOST = 20_000  # readings that are kept
 
 
 class FloorWatch:
-    """Collects which way is up."""
+    """Collector of the vertical direction in the base frame, to test whether the floor is flat."""
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class FloorWatch:
         landmarks: LandmarkSensor,
         landmark_map: LandmarkMap | None,
     ) -> None:
-        """Take the sensors.
+        """Set up for the sensors of a run.
 
         Args:
             attitude: None: there is no accelerometer, so that images are looked at.
@@ -286,7 +286,7 @@ class FloorWatch:
 
     @property
     def sentence(self) -> str | None:
-        """What is wrong; None: nothing."""
+        """Sentence that the floor is not flat, with the largest pitch and roll [°]; None: it seems flat."""
         if len(self._ups) < _LEAST:
             return None
         ups = np.array(self._ups)

@@ -48,7 +48,7 @@ _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mistakes:
-    """What is wrong with a set-up.
+    """Mistakes of a set-up, and the set-up with them undone.
 
     Attributes:
         findings: one for each mistake, with the line to be set; none on a sound set-up.
@@ -91,7 +91,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
-    """What `inspect` reports of a recording, with the gross mistakes first among the findings; it is read once.
+    """Report of `inspect` on a recording, read once, with the gross mistakes first among the findings.
 
     Raises:
         RecordingError: nothing can be read.
@@ -146,7 +146,7 @@ class _Search:
         return setup, memory
 
     def go_on(self, recording: Recording, setup: SensorSetup, excerpt: Excerpt) -> None:
-        """As `run`, of an excerpt that was read."""
+        """Check an excerpt that was read already, otherwise as `run`."""
         if not self._check(recording, setup, excerpt):
             return
         for _ in range(_MOST_READINGS):
@@ -335,7 +335,7 @@ class Diagnosis:
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """What is surely wrong with the configuration, and makes the poses wrong: a sentence each."""
+        """Sentences on errors of the configuration that make the poses wrong: here, a floor that is not flat."""
         sentence = None if self._floor is None else self._floor.sentence
         return () if sentence is None else (sentence,)
 
@@ -375,7 +375,7 @@ class Diagnosis:
 
     @staticmethod
     def _of_camera(findings: Iterable[Finding]) -> Iterator[Finding]:
-        """Findings about points that corners of markers tell: sizes and focal length are in every distance.
+        """Findings with the severity that corners of markers allow; wrong scales also name marker size, focal length.
 
         Small turns of the camera are left to the graph, and to the fit of corners before a run: at a marker's distance
         the wheels' own turn does the same.

@@ -319,7 +319,7 @@ def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, place
 
 
 def _start(m: Mounting) -> FloatArray:
-    """Start of `_OnMap.solve`."""
+    """Start values ``(7,)`` of `_OnMap.solve` from a mounting."""
     place = np.clip([m.x.value, m.y.value], -1.0, 1.0)
     return np.array([0.0, 0.0, m.yaw.value, *place, m.late_s.value + _NUDGE_S, m.turns.value - 1.0 + _NUDGE_S])
 
@@ -801,7 +801,7 @@ def _point_similarity(a: ComplexArray, b: ComplexArray) -> tuple[float, float] |
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a sensor of landmarks is off by on a known map, over short stretches of the wheels' path.
+    """Errors of a sensor of landmarks on a known map, estimated over short stretches of the wheels' path.
 
     Attributes:
         scale: true over reported range, once the bias is subtracted.
@@ -875,7 +875,7 @@ class _OnMap:
         return len(self.z)
 
     def take(self, keep: NDArray[np.bool_]) -> _OnMap:
-        """The same for a part of the sightings."""
+        """Residuals of a part of the sightings."""
         part = copy.copy(self)
         part.times, part.ids, part.z, part.m = self.times[keep], self.ids[keep], self.z[keep], self.m[keep]
         _, part.window = np.unique(self.window[keep], return_inverse=True)
@@ -904,7 +904,7 @@ class _OnMap:
         return np.abs(seen) - np.abs(away), np.asarray(off), np.asarray(rotation * turned * away)
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """``(2 n,)`` whitened."""
+        """Whitened residuals ``(2 n,)``: ranges, then bearings."""
         along, across, _ = self.errors(x)
         off = np.concatenate([along / self.sigma_m, across / self.sigma_rad])
         return np.where(np.isfinite(off), off, 1e3)

@@ -661,7 +661,7 @@ class Watch:
     """
 
     def __init__(self, mapped: bool, config: Config) -> None:
-        """Nothing has come in.
+        """Begin without data.
 
         Args:
             mapped: the landmarks' places are surveyed.
@@ -741,7 +741,7 @@ class Watch:
         )
 
     def findings(self) -> tuple[Finding, ...]:
-        """The same as a finding."""
+        """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
         return () if self.sentence is None else (Finding("sanity.odometry", self.sentence, Severity.ERROR),)
 
     def _restart(self, estimate: Estimate | None) -> None:

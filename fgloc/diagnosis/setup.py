@@ -55,12 +55,12 @@ class Change:
 
     @property
     def linearized(self) -> bool:
-        """Whether the fit knows it to first order only."""
+        """Whether the fit is linear in an angle of the camera, so that it has to be repeated."""
         return "camera.rx_rad" in self.free
 
 
 def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Iterator[Change]:
-    """All that is tried on a set-up.
+    """All changes that are tried on a set-up.
 
     Args:
         setup: as given.
@@ -212,7 +212,7 @@ def _scaled(setup: Setup, factor: float) -> Setup:
 
 
 def _with(setup: Setup, **values: float) -> Setup:
-    """The set-up with these values to start from; itself if they are its own."""
+    """Set-up that starts from these values; the same object if they are its own."""
     extras = setup.extras.copy()
     for name, value in values.items():
         extras[EXTRAS.index(name)] = value
@@ -225,7 +225,7 @@ def k1_of(setup: Setup) -> float:
 
 
 def angle_of(R: FloatArray) -> float:
-    """Of a rotation ``(3, 3)`` [rad]."""
+    """Angle [rad] of a rotation matrix ``(3, 3)``."""
     return math.acos(float(np.clip(0.5 * (np.trace(R) - 1.0), -1.0, 1.0)))
 
 
@@ -381,7 +381,7 @@ def _degrees(angle: float) -> float:
 
 
 def _roll(T: FloatArray) -> float:
-    """Of an optical frame about its viewing axis; 0 if its x axis is level."""
+    """Roll [rad] of an optical frame ``T (4, 4)`` about its viewing axis; 0 if its x axis is level."""
     return math.atan2(-T[2, 0], -T[2, 1])
 
 
@@ -427,7 +427,7 @@ _SAME = 0.5  # cost by which a further fit has to be better
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """What the check found.
+    """Result of `check_fit`.
 
     Attributes:
         fit: of the set-up as given; None where nothing could be fitted.
@@ -490,7 +490,7 @@ def check_fit(
 
 
 def _small(tried: Iterable[Change], setup: Setup, fit: Fit) -> list[Change]:
-    """Changes that are deviations only, those first that would lower the cost of a fit the most."""
+    """Small deviations among the changes, those first that would lower the cost of a fit the most."""
     small = [change for change in tried if change.setup is setup]
     return sorted(small, key=lambda change: -fit.gain(change.free))[:_FINALISTS]
 
@@ -505,7 +505,7 @@ def _looked_at(tried: Iterable[Change], stretches: Sequence[Stretch]) -> list[Ch
 
 
 def _ended(change: Change, stretches: Sequence[Stretch], poses: FloatArray | None) -> tuple[Change, Fit] | None:
-    """A change fitted to the end: what was found is taken in, as angles are linearized, and fitted again."""
+    """Change and fit after convergence; with angles, the solution is applied to the set-up and fitted again."""
     last: Fit | None = None
     for _ in range(_REFINED):
         fit = Problem(stretches, change.setup, change.free).solve(poses)

@@ -80,7 +80,7 @@ class Stretch:
 
 @dataclass
 class Excerpt:
-    """What was read.
+    """Signals and pictures read from the beginning of a recording.
 
     Attributes:
         signals: of wheels, gyro and truth.
@@ -127,7 +127,7 @@ class ExcerptCollector:
     """
 
     def __init__(self, recording: Recording, config: Config, detector: Detector | None) -> None:
-        """As `read_excerpt`, but nothing is read."""
+        """Prepare an empty excerpt; the arguments are those of `read_excerpt`."""
         self._signals = SignalCollector(config, recording.roles)
         self.found = Excerpt(self._signals.found)
         self.pictured = False
@@ -138,7 +138,7 @@ class ExcerptCollector:
         self._end_ns = recording.span_ns[0] + round(_PATIENCE_S * 1e9)
 
     def add(self, event: Event) -> bool:
-        """Take what is wanted of an event; False: it came after the last that is looked at."""
+        """Store the signals and markers of an event; False: it came after the end of the time to be read."""
         if isinstance(event, RawEvent) or (isinstance(event, SightingsEvent) and event.in_pixels):
             self._take_image(event)
         return self._signals.add(event)
@@ -253,10 +253,10 @@ Rows = tuple[FloatArray, FloatArray, IntArray]
 
 
 class Motion:
-    """Of all stretches."""
+    """Residuals of wheels and gyro between the images of all stretches."""
 
     def __init__(self, stretches: Sequence[Stretch], turned: FloatArray, config: Config) -> None:
-        """Prepare.
+        """Precompute what all poses share.
 
         Args:
             stretches: of the excerpt.
@@ -485,7 +485,7 @@ class Problem:
     """The stretches under one set-up."""
 
     def __init__(self, stretches: Sequence[Stretch], setup: Setup, free: Mapping[str, float]) -> None:
-        """Prepare.
+        """Precompute what all iterations share.
 
         Args:
             stretches: of the excerpt.

@@ -108,7 +108,7 @@ def turn_by(times: FloatArray, rate: FloatArray) -> FloatArray:
 
 @dataclass(eq=False)
 class Signals:
-    """What was collected. Times are seconds from ``origin_ns``.
+    """Signals collected from a recording. Times are seconds from ``origin_ns``.
 
     Attributes:
         motion: events of the wheels and commands that passed the gate, in order of receipt.
@@ -200,7 +200,7 @@ class SignalCollector:
     """Takes signals from the events of a recording, one by one."""
 
     def __init__(self, config: Config, roles: Mapping[Role, str] | None = None) -> None:
-        """Set up.
+        """Set up the bounds of plausible signals.
 
         Args:
             config: with the bounds of what is plausible; distances may be in any unit.
@@ -213,7 +213,7 @@ class SignalCollector:
         self._first_ns: int | None = None
 
     def add(self, event: Event) -> bool:
-        """Take what is wanted of an event; False: it came after the last that is looked at."""
+        """Store the signals of an event; False: it came after the end of the time to be read."""
         if self._first_ns is None:
             self._first_ns = self.found.origin_ns = event.received_ns
         if event.received_ns - self._first_ns > LONGEST_S * 1e9:
@@ -264,7 +264,7 @@ def read_signals(recording: Recording, config: Config) -> Signals:
 
 
 def take(recording: Recording, roles: Collection[Role], add: Callable[[Event], bool]) -> None:
-    """Hand the events of some roles to a collector, until it wants no more of them."""
+    """Pass the events of some roles to a collector, until it wants no more of them."""
     role_of = {recording.roles[role]: role for role in roles}
     for message in recording.messages(role_of.keys()):
         if not all(map(add, recording.decode(message, role_of[message[0]]))):
@@ -288,7 +288,7 @@ def other_clocks(delays: Mapping[Role, float]) -> tuple[Role, ...]:
 
 
 def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, float], given: Sequence[Role]) -> str:
-    """The sentence on such roles; ``given``: those that the configuration lists already."""
+    """Sentence on roles whose stamps are of another clock; ``given``: those that the configuration lists already."""
     usual = float(np.median([delay for role, delay in delays.items() if role not in roles]))
     sentence = " and ".join(
         f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
@@ -327,7 +327,7 @@ class SightingCollector:
         self._place = T_base_sensor
 
     def sightings(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
-        """What was seen where."""
+        """Place and noise of each landmark of a sightings event, in the sensor's axes."""
         if event.in_pixels and self._map is None and self._config.markers.default_size_m is None:
             return
         for m in self._sensor.measure(event):

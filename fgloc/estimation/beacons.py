@@ -1,4 +1,4 @@
-"""Where a robot is among beacons: a bounded Gaussian sum over every place that their sightings allow.
+"""Pose among beacons: a bounded Gaussian sum over every place that their sightings allow.
 
 One range and bearing leaves the pose free to turn about the beacon. That ring is cut into Gaussians, each with its own
 extended Kalman filter and its own weight; later sightings of other beacons decide between them. In exponential
@@ -40,7 +40,7 @@ RING = 24  # pieces of a ring, 15 degrees apart
 
 @dataclass(slots=True, eq=False)
 class Track:
-    """Where a beacon is in the base frame by some of its sightings: ``(2,)`` [m], ``(2, 2)``, and how many."""
+    """Position of a beacon in the base frame ``(2,)`` [m], covariance ``(2, 2)``, and number of its sightings."""
 
     point: FloatArray
     cov: FloatArray
@@ -48,7 +48,7 @@ class Track:
 
 
 class SeenBeacons:
-    """Where beacons are in the base frame, each by its own sightings: wherever it stands in the map.
+    """Positions of beacons in the base frame, each by its own sightings alone, without the map.
 
     Each has two tracks at most, as sightings with a wrong id, or before the robot was pushed, agree with no others.
     """
@@ -57,7 +57,7 @@ class SeenBeacons:
         self._tracks: dict[int, list[Track]] = {}  # the one that agreed last first
 
     def move(self, motion: FloatArray, cov: FloatArray) -> None:
-        """The robot moved: ``(3,)``, with the covariance ``(3, 3)`` of a right perturbation."""
+        """Move the beacons by a motion ``(3,)`` of the robot with covariance ``(3, 3)`` (right perturbation)."""
         back = se2.adjoint(se2.inverse(motion))[:2, :2]
         for track in (track for tracks in self._tracks.values() for track in tracks):
             x, y = track.point = back @ (track.point - motion[:2])
@@ -65,7 +65,7 @@ class SeenBeacons:
             track.cov = back @ track.cov @ back.T + J @ cov @ J.T
 
     def place(self, landmark_id: int) -> FloatArray:
-        """Where most sightings put it ``(2,)``."""
+        """Position ``(2,)`` [m] of a beacon in the base frame by the track with most sightings."""
         return max(self._tracks[landmark_id], key=lambda track: track.count).point
 
     def take(self, m: PointMeasurement, R: FloatArray, least: float) -> float | None:
@@ -120,7 +120,7 @@ def _point_by_sighting(m: PointMeasurement) -> FloatArray:
 
 
 def log_density(residual: FloatArray, S: FloatArray) -> FloatArray:
-    """Of sightings: residuals ``(n, 2)`` and their covariances ``(n, 2, 2)``."""
+    """Log density ``(n,)`` of sightings with residuals ``(n, 2)`` and covariances ``(n, 2, 2)``."""
     nis = np.einsum("ni,ni->n", residual, np.linalg.solve(S, residual[:, :, None])[:, :, 0])
     return np.asarray(-math.log(2.0 * math.pi) - 0.5 * (nis + np.log(np.linalg.det(S))))
 
@@ -164,7 +164,7 @@ _SAME = np.array([LINEAR_M, LINEAR_M, LINEAR_RAD])  # two hypotheses this near a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
-    """Of a landmark that stands elsewhere than the map says: ``(2,)`` [m], and twice the log odds that it does."""
+    """Displacement of a landmark from its place on the map ``(2,)`` [m], and twice the log odds that it was moved."""
 
     by: FloatArray
     evidence: float
@@ -190,7 +190,7 @@ class GaussianSum:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is known of the pose."""
+        """Forget all hypotheses and sightings."""
         self.poses, self.covs = np.zeros((0, 3)), np.zeros((0, 3, 3))
         self._log_prior = np.zeros(0)  # (n,), with what was merged into each
         self._log_elsewhere = 0.0  # log prior of all places but a tracked one
@@ -208,7 +208,7 @@ class GaussianSum:
         sightings: Sequence[LandmarkMeasurement],
         tracked: PoseWithCovariance | None = None,
     ) -> None:
-        """Take in one step. The work is bounded: so many hypotheses and sightings, times the landmarks in the map.
+        """Predict by the motions of one step and update by its sightings, with bounded work.
 
         Args:
             motions: over the step.
@@ -231,13 +231,13 @@ class GaussianSum:
 
     @property
     def log_weights(self) -> FloatArray:
-        """``(n,)`` of the likelihood of all sightings so far, not normalized."""
+        """Log weights ``(n,)`` of the hypotheses: prior and likelihood of all sightings so far, not normalized."""
         if not len(self.poses):
             return np.zeros(0)
         return np.asarray(self._log_prior + self._by_landmark().sum(1))
 
     def _by_landmark(self) -> FloatArray:
-        """``(n, L)`` log likelihood of each landmark's sightings, be it in place or moved."""
+        """Log likelihood ``(n, L)`` of each landmark's sightings, summed over "in place" and "moved"."""
         return np.logaddexp(_IN_PLACE + self._in_place, _MOVED + self._moved)
 
     def confirmed(self, tracked: PoseWithCovariance | None = None) -> PoseWithCovariance | None:
@@ -282,7 +282,7 @@ class GaussianSum:
         return PoseWithCovariance(self.poses[best], self.covs[best])
 
     def displaced(self) -> dict[int, Displacement]:
-        """Of each beacon seen, where it is and whether the map is wrong, if the most probable hypothesis is right."""
+        """Displacement of each beacon seen, by id, under the most probable hypothesis of the pose."""
         if not len(self.poses):
             return {}
         best = int(self.log_weights.argmax())
@@ -373,7 +373,7 @@ class GaussianSum:
         return likely is None
 
     def _cov(self, m: PointMeasurement) -> FloatArray:
-        """Of the sighting: with the errors that it shares with the last one of its landmark, and with all others."""
+        """Covariance ``(2, 2)`` of a sighting with its systematic errors, larger if it soon repeats its landmark."""
         config = self._config
         placed = config.position_sigma_m
         cov = m.cov + np.diag(

@@ -29,7 +29,7 @@ _MEDIAN = chi2_bound(0.5, se2.DOF)  # of the NIS of a step, if the covariances a
 
 @dataclass(frozen=True, slots=True)
 class GlrResult:
-    """What is thought of the newest step.
+    """Result of the GLR test for the newest step.
 
     Attributes:
         flagged: whether the sources disagree now.
@@ -67,7 +67,7 @@ class GlrTest:
         self._length_s = self._calm_s = 0.0
 
     def reset(self) -> None:
-        """Forget all: nothing connects what comes with what was."""
+        """Forget all steps, as nothing connects them with those to come."""
         self.flagged = False
         self._steps.clear()
         self._length_s = self._calm_s = 0.0
@@ -80,7 +80,7 @@ class GlrTest:
         by_installation: FloatArray | None = None,
         installation_cov: FloatArray | None = None,
     ) -> GlrResult:
-        """Take in one step.
+        """Add one step and test all windows that end with it.
 
         Args:
             dt: its length [s].
@@ -136,7 +136,7 @@ class GlrTest:
 
 @dataclass(frozen=True, slots=True)
 class FaultVerdict:
-    """What the test makes of the motion sources.
+    """Verdict of the GLR test: faulty sources, covariance scales, onset.
 
     Attributes:
         budget: which of them are rejected and why, or the scale on their covariances.
@@ -158,7 +158,7 @@ class FaultVerdict:
 
 @dataclass(frozen=True, slots=True)
 class Contradicted:
-    """What sightings exclude.
+    """Motion sources that sightings contradict, and for how many steps.
 
     Attributes:
         sources: of the motion, by name.
@@ -245,7 +245,7 @@ class FaultAttribution:
         return self._fits[frame.k]
 
     def _nis(self, motions: Sequence[MotionMeasurement], went: FloatArray, cov: FloatArray) -> float:
-        """Of the difference of what a source measured and ``went (3,)``, which has ``cov (3, 3)``."""
+        """NIS of the difference between the motion of a source and ``went (3,)``, which has ``cov (3, 3)``."""
         total, cov_total = motions[0].motion, motions[0].cov
         by: dict[str, FloatArray] = {name: d for name, (d, _) in motions[0].depends_on.items()}
         for _, m in pairwise(motions):
@@ -285,7 +285,7 @@ class InnovationBias:
         self._windows: dict[Hashable, _Window] = {}
 
     def forget(self) -> None:
-        """The pose was set anew."""
+        """Forget all innovations, as the pose was set anew."""
         self._windows.clear()
 
     def is_biased(self, key: Hashable, stamp_ns: int, one: Linearized, pose_cov: FloatArray) -> bool:
@@ -341,7 +341,7 @@ class LiftMonitor:
     """
 
     def __init__(self, longest_s: float, up: FloatArray | None = None) -> None:
-        """Nothing has come in.
+        """Begin without data.
 
         Args:
             longest_s: how long after the last sign it has been set down, if nothing tells it earlier.
@@ -357,7 +357,7 @@ class LiftMonitor:
         self._sure_s = math.inf  # since the last that the ground cannot make
 
     def observe(self, k: int, step: Step, readings: MotionReadings) -> list[Decision]:
-        """Take in a step; rows of ``steps.csv`` while the robot is carried.
+        """Add a step; return rows of ``steps.csv`` while the robot is carried.
 
         Args:
             k: keyframe of the step.
@@ -401,18 +401,18 @@ class LiftMonitor:
         return told
 
     def carried_s(self, step: Step) -> float:
-        """How long before a step that it is carried over the robot was fixed last [s]."""
+        """Time [s] that the robot was carried since the last fix, before this step, which is added."""
         before, self._since_fix_s = self._since_fix_s, self._since_fix_s + step.dt
         return before
 
     def fix(self) -> None:
-        """Sightings have fixed the pose."""
+        """Note that sightings have fixed the pose."""
         self._since_fix_s = 0.0
         if self._quiet_s > _SETTLED_S:
             self.carried = False
 
     def reset(self) -> None:
-        """The clock jumped: nothing connects what comes with what was."""
+        """Forget all steps, as the clock jumped."""
         self.carried = False
         self._begin()
 
@@ -440,11 +440,11 @@ class _RiseTest:
 
     @property
     def known(self) -> bool:
-        """Whether it is known what is usual."""
+        """Whether the usual level of this run is known."""
         return self._learned_s > _LEARN_S
 
     def skip(self, step: Step) -> None:
-        """The robot is in the other state, driving or standing."""
+        """Forget the samples of the window, as the robot is in the other state, driving or standing."""
         self._samples.clear()
         self._length_s, self._newest_ns = 0.0, step.stamp_ns
 

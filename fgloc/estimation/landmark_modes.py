@@ -102,14 +102,14 @@ class LandmarkModes:
         self.restart()
 
     def restart(self) -> None:
-        """The pose was set anew, and proves nothing yet."""
+        """Forget all evidence but the landmarks left out, as the pose was set anew."""
         self._reset(np.ones(len(self._ids), dtype=np.bool_))
         self._returned.clear()
         self._in_place: set[int] = set()
         self._fused_ns = 0
 
     def forget(self) -> None:
-        """All that was found was found from a wrong pose."""
+        """Discard all hypotheses: the pose they were computed from was wrong."""
         self.displacements.clear()
         self.restart()
 
@@ -211,7 +211,7 @@ class LandmarkModes:
     def _take(
         self, predicted: PoseWithCovariance, belief: PoseWithCovariance, seen: Sequence[LandmarkMeasurement]
     ) -> None:
-        """Sightings that were fused: their residuals, linear about the belief after them, and what they do to M."""
+        """Add the evidence of fused sightings, linear about the belief after them, and update M."""
         known, theta = self._known(predicted), self._known(belief).mean
         lines = self._factors.observe(seen).linearize(belief.pose, theta)
         if any(one.behind for one in lines):
@@ -293,7 +293,7 @@ class LandmarkModes:
         own: Explained | None = None,
         misread: float | None = None,
     ) -> None:
-        """Take in the evidence of one sighting.
+        """Add the evidence of one sighting.
 
         Args:
             m: the sighting.
@@ -316,7 +316,7 @@ class LandmarkModes:
         self._explained[row] += explains[row]
 
     def _add_information(self, row: int, information: FloatArray, same_errors: bool) -> None:
-        """What a sighting knows of its landmark's displacement ``(2, 2)``.
+        """Add the information ``(2, 2)`` of a sighting about its landmark's displacement.
 
         Errors of a marker's corners are the same in one image after another while the view hardly changes: a few tenths
         of a pixel that put a small one at 6 m off by 0.17 m. So its sharpest sighting counts for all of them.

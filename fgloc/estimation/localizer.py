@@ -48,7 +48,7 @@ class Localizer:
         poses: PoseSensors,
         keep_all: bool = False,
     ) -> None:
-        """Put the parts together.
+        """Build the parts of the loop.
 
         Args:
             config: everything tunable.
@@ -170,7 +170,7 @@ class Localizer:
         self._prior = self.tracking.begin_segment(self.estimator.belief, known)
 
     def _begin(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
-        """Take in a step while the pose is looked for; the estimate of it, if there is one by now."""
+        """Process a step while the pose is searched for; return its estimate, if there is one already."""
         if self._prior is not None:
             prior, self._prior = self._prior, None  # it does not hold once the robot got lost
             self.tracking.start_known()
@@ -221,12 +221,12 @@ class Localizer:
 
     @property
     def rejections(self) -> Counter[str]:
-        """What was not used so far, by reason."""
+        """Number of measurements that were not used so far, by reason."""
         return self._recorder.rejections + self.motion.rejections + self.sightings.rejections
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
+        """Sentences for the user about the run so far."""
         return (*self.tracking.notes, *self.sightings.notes, *self.motion.notes)
 
 
@@ -306,7 +306,7 @@ class Recorder:
         estimator: Estimator,
         makes_map: bool,
     ) -> None:
-        """Take the parts that know it."""
+        """Store the parts that know clock, mode and installation."""
         self.counts: Counter[str] = Counter()
         self.rejections: Counter[str] = Counter()
         self._clock_sigma_s = config.recording.clock_sigma_s

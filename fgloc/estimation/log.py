@@ -89,7 +89,7 @@ def segment_decision(k: int, stamp_ns: int) -> Decision:
 
 
 def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:
-    """Of landmarks in quarantine."""
+    """Sentence for each landmark that was found to be moved and is not used."""
     for landmark_id, moved in displacements.items():
         yield (
             f"marker {landmark_id} does not stand where the map has it: it seems to be {math.hypot(*moved):.2f} m "
@@ -98,7 +98,7 @@ def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:
 
 
 def flag_notes(flags: Mapping[str, int]) -> Iterator[str]:
-    """Of sources that were flagged, by "source.reason"."""
+    """Sentence for each source that was flagged, with the number of flags; keys are "source.reason"."""
     for kind, n in sorted(flags.items()):
         source, reason = kind.split(".")
         yield f"the {registry.title_of(source)} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"

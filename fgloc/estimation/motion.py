@@ -106,7 +106,7 @@ class MotionSources:
     """Reads wheels, learned motion and gyro, and follows what is known of their drift."""
 
     def __init__(self, config: Config, sensors: MotionSensors, factors: LandmarkFactors | None = None) -> None:
-        """Take the sensors.
+        """Set up for the sensors of a run.
 
         Args:
             config: of all of them.
@@ -259,7 +259,7 @@ class MotionSources:
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov, inertial=inertial)
 
     def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, observes_yaw: bool = True) -> None:
-        """The robot went on by a step.
+        """Update bias and drift of the sources after a step.
 
         Args:
             readings: of that step.
@@ -304,7 +304,7 @@ class MotionSources:
         return variance / (noise + math.sqrt(noise**2 + bias * variance))
 
     def begin_segment(self) -> None:
-        """The clock jumped: nothing is known of what happened in between."""
+        """Forget the last fix, as nothing is known of the motion during a jump of the clock."""
         self._silent_s = self._yaw_indirect_s = 0.0
         if self.gyro is not None:
             self.gyro.forget_fix()
@@ -315,7 +315,7 @@ class MotionSources:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Difference:
-    """Of two motion sources over a step, in the body frame.
+    """Difference of two motion sources over a step, in the body frame.
 
     Attributes:
         value: ``(3,)``.
@@ -397,7 +397,7 @@ class MotionFaultMonitor:
         track_m: float | None,
         attribution: FaultAttribution | None = None,
     ) -> None:
-        """Set up.
+        """Set up thresholds and sources.
 
         Args:
             config: thresholds, and known failures.
@@ -421,18 +421,18 @@ class MotionFaultMonitor:
         self._differing_steps = 0  # for how many steps the two have differed
 
     def begin(self, step: Step) -> None:
-        """The first step of the run, or of a segment."""
+        """Begin the test with the first step of the run, or of a segment."""
         if self._first_ns is None:
             self._first_ns = step.start_ns
         self.reset()
 
     def reset(self) -> None:
-        """Nothing connects what comes with what was."""
+        """Forget all steps, as nothing connects them with those to come."""
         self._glr.reset()
         self._travels.clear()
 
     def judge(self, step: Step, readings: MotionReadings) -> FaultVerdict:
-        """Take in the readings of a step that follows the last one."""
+        """Test the sources with the readings of a step that follows the last one."""
         rejected = self._known_failures(step)
         if "wheels" in rejected:  # nothing to be found out
             self.reset()
@@ -455,7 +455,7 @@ class MotionFaultMonitor:
         return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
 
     def _wrong_sources(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
-        """The sources that are wrong with the reason, and of how many of the newest steps that is news."""
+        """Wrong sources with the reason, and the number of newest steps for which that is news."""
         since, was_left_out = verdict.since, self._model_wrong_s > 0.0
         self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)
@@ -481,7 +481,7 @@ class MotionFaultMonitor:
         return wrong, found.steps
 
     def _contradicted(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> Contradicted | None:
-        """What sightings exclude; None: they cannot tell, or need not be asked.
+        """Motion sources that sightings contradict; None: sightings cannot decide, or no decision is due.
 
         They are asked while wheels and learned motion differ; of a model that is left out, once every window.
         """
@@ -522,7 +522,7 @@ class MotionFaultMonitor:
             total -= self._travels.popleft()
 
     def _failure(self, since: int) -> str:
-        """What kind of failure it looks like: which wheel stood still while the robot went on, and which one turned."""
+        """Kind of the wheels' failure: frozen, one wheel dead, or slip at an onset; else the kind found before."""
         if since:  # what was before is no evidence
             self._travels = deque(list(self._travels)[-since:])
         _, *ways = np.sum(self._travels, axis=0)
@@ -544,7 +544,7 @@ class MotionFaultMonitor:
 
 
 def _without(readings: MotionReadings, sources: Iterable[str]) -> MotionReadings:
-    """The readings of the other sources."""
+    """Readings without those of these sources."""
     gone: dict[str, Any] = dict.fromkeys(sources)
     return replace(readings, **gone)
 
@@ -591,7 +591,7 @@ class MotionJudge:
     """
 
     def __init__(self, config: Config, sensors: MotionSensors, estimator: Estimator) -> None:
-        """Take the sensors, and the estimator whose past motions are revised."""
+        """Set up for the sensors of a run, and the estimator whose past motions are revised."""
         self.sources = MotionSources(config, sensors, estimator.factors)
         self.rejections: Counter[str] = Counter()
         self._estimator = estimator
@@ -601,18 +601,18 @@ class MotionJudge:
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:
-        """The clock jumped, or this is the first step: nothing connects it to what was before."""
+        """Begin a segment, after a jump of the clock or with the first step."""
         self.sources.begin_segment()
         self._faults.begin(step)
         self._lift.reset()
 
     def begin_replay(self) -> None:
-        """What comes next are earlier steps of the segment, collected until the first pose was known."""
+        """Prepare for earlier steps of the segment, which were collected until the first pose was known."""
         self.sources.begin_segment()
         self._lift.reset()
 
     def restart(self) -> None:
-        """The pose was set anew: no motion led there."""
+        """Forget motion and faults, as the pose was set anew and no motion led there."""
         self.sources.begin_segment()
         self._faults.reset()
 
@@ -648,13 +648,13 @@ class MotionJudge:
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
 
     def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
-        """The robot went on by a step: see `MotionSources.commit`."""
+        """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
         if fix is not None:
             self.record_fix()
         self.sources.commit(motion.readings, fix, observes_yaw)
 
     def record_fix(self) -> None:
-        """Sightings, or a given pose, tell where the robot is."""
+        """Note that sightings, or a given pose, have fixed where the robot is."""
         self._lift.fix()
 
     @property
@@ -669,7 +669,7 @@ class MotionJudge:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of the sources, one sentence each."""
+        """Sentences for the user about the motion sources."""
         return (*self._model_notes(), *flag_notes(self._faults.flags))
 
     @property

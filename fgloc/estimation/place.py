@@ -105,7 +105,7 @@ class PlaceSearch:
 
 
 def _spread(sightings: Sequence[LandmarkMeasurement], most: int) -> Sequence[LandmarkMeasurement]:
-    """All of them or, of too many, every second, third and so on of each landmark: those seen in turns are all kept."""
+    """At most ``most`` sightings, thinned out evenly within each landmark."""
     if len(sightings) <= most:
         return sightings
     return sorted(sightings, key=lambda m: m.landmark_id)[:: -(-len(sightings) // most)]
@@ -166,7 +166,7 @@ class GlobalSearch:
     def __init__(
         self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors, keep_all: bool = False
     ) -> None:
-        """Take the parts; ``keep_all``: steps that the search has forgotten are kept for the replay from the start."""
+        """Set up for a map; ``keep_all``: steps that the search has forgotten are kept for the replay."""
         self._config = config
         self._keep_all = keep_all
         self._window_ns = round(config.estimator.initialise_s * 1e9)
@@ -180,17 +180,17 @@ class GlobalSearch:
         self.initializing = True
 
     def reset(self) -> None:
-        """Look for the pose again."""
+        """Begin a new search of the first pose."""
         self.forget()
         self.initializing = self._first = True
 
     @property
     def searching(self) -> bool:
-        """Whether there is anything collected."""
+        """Whether any steps are collected."""
         return bool(self._steps)
 
     def forget(self) -> None:
-        """What was collected is of no use any more: the robot is where it was estimated to be."""
+        """Discard the collected steps and hypotheses: the robot is where it was estimated to be."""
         self._steps.clear()
         self._earlier.clear()
         self.hypotheses.reset()
@@ -272,7 +272,7 @@ class GlobalSearch:
         return InitialPose(steps, PoseWithCovariance(oldest.pose, cov), newest, gathered, displaced)
 
     def _compensated(self) -> Iterator[LandmarkMeasurement]:
-        """Every collected sighting as seen from the newest step."""
+        """Every collected sighting, moved to the newest step."""
         here = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
         for collected, then in zip(reversed(self._steps), _back(here, self._steps), strict=True):
             for m in collected.sightings:
@@ -280,7 +280,7 @@ class GlobalSearch:
 
 
 def _back(newest: PoseWithCovariance, steps: Sequence[SearchStep]) -> Iterator[PoseWithCovariance]:
-    """The poses of these steps if that of the last one is this; the last one first."""
+    """Poses at these steps, from the newest back, if the robot is at ``newest`` now."""
     pose, cov = newest.pose, newest.cov
     yield newest
     for collected in reversed(list(steps)[1:]):

@@ -72,7 +72,7 @@ class PoseFit:
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray) -> Fit | None:
-        """As `fit_pose`."""
+        """Fit the pose from a starting pose, as `fit_pose` does; None if the sightings do not determine it."""
         pose, previous = start, math.inf
         for step in range(MOST_STEPS):
             normal, pull, cost, dof = np.zeros((se2.DOF, se2.DOF)), np.zeros(se2.DOF), 0.0, 0
@@ -102,7 +102,7 @@ class PoseFit:
         return costs, dofs
 
     def _whiten(self, batch: Batch, stack: Stacked) -> FloatArray:
-        """What is not known of the installation, of the stamps and of the motion in between counts as noise."""
+        """Whitening matrices ``(n, d, d)``; uncertainty of installation, stamps and motion between counts as noise."""
         n, d = stack.residual.shape
         cov = np.broadcast_to(np.eye(d), (n, d, d))
         if len(self._cov):
@@ -118,7 +118,7 @@ class PoseFit:
     def _white(
         self, pose: FloatArray, anew: bool
     ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray]]:
-        """Of each kind: residuals, Jacobians, what is behind the camera, residuals of each, Cauchy constants."""
+        """For each kind: white residuals and Jacobians, mask of those behind the camera, dimensions, Cauchy k."""
         for i, (rows, batch) in enumerate(self._observed.batches):
             stack = batch.evaluate(np.broadcast_to(pose, (len(rows), 3)), self._theta, by_installation=anew)
             if anew:
@@ -165,7 +165,7 @@ class PoseConsensus:
 
     @property
     def certain(self) -> bool:
-        """Whether it explains enough, and is known well enough."""
+        """Whether the place explains enough sightings, and its covariance is small enough."""
         whole = self.share >= WHOLE_SHARE
         if not (whole or (self.landmarks > 1 and self.share > 0.5)) or self.fit.redundancy < 1:
             return False
@@ -191,6 +191,6 @@ class PoseConsensus:
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two poses are two places."""
+    """Whether two poses are further apart than `_NEAR` in position or yaw."""
     x, y, yaw = se2.between(a, b)
     return math.hypot(x, y) > _NEAR or abs(yaw) > _NEAR

@@ -328,12 +328,12 @@ class Association:
         return len(self._contradicting)
 
     def forget_contradictions(self) -> None:
-        """The pose was set anew: `contradicting` starts from 0."""
+        """Set `contradicting` to 0, as the pose was set anew."""
         self._contradicting.clear()
         self._bias.forget()
 
     def begin_segment(self) -> None:
-        """The clock jumped: nothing is known of when landmarks were seen last."""
+        """Forget when landmarks were seen last, as the clock jumped."""
         self._last_used_ns.clear()
         self.forget_contradictions()
 
@@ -369,7 +369,7 @@ class JudgedSightings:
         return any(s.measurement.observes_yaw for s in self.accepted)
 
     def dropped(self, reason: str) -> JudgedSightings:
-        """The same where the graph could not take any of them."""
+        """Judged sightings with none accepted, where the graph could not use any of them."""
         decisions = [replace(d, weight=0.0, reason=d.reason or reason) for d in self.decisions]
         return replace(self, accepted=(), decisions=decisions)
 
@@ -378,7 +378,7 @@ class SightingJudge:
     """Holds the sightings of each step against the predicted pose."""
 
     def __init__(self, config: Config, estimator: Estimator, tracking: Tracking) -> None:
-        """Take what knows the pose, and where else the robot may be."""
+        """Set up for the estimator that predicts the pose, and the tracking that searches for it."""
         self._estimator = estimator
         self._tracking = tracking
         self._association = Association(config, estimator.factors)
@@ -386,17 +386,17 @@ class SightingJudge:
 
     @property
     def modes(self) -> LandmarkModes:
-        """Which landmarks were moved."""
+        """Hypotheses of moved landmarks."""
         return self._association.modes
 
     @property
     def rejections(self) -> Counter[str]:
-        """What was not used so far, by reason."""
+        """Number of sightings that were not used so far, by reason."""
         return self._rejections + self._association.rejections
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of landmarks, one sentence each."""
+        """Sentences for the user about moved landmarks."""
         return tuple(moved_notes(self.modes.displacements))
 
     @property
@@ -405,11 +405,11 @@ class SightingJudge:
         return self._association.contradicting
 
     def begin_segment(self) -> None:
-        """The clock jumped: nothing is known of when landmarks were seen last."""
+        """Forget when landmarks were seen last, as the clock jumped."""
         self._association.begin_segment()
 
     def restart(self) -> None:
-        """The robot was found at another place."""
+        """Forget contradictions, as the robot was found at another place."""
         self._association.forget_contradictions()
 
     def judge(
@@ -464,7 +464,7 @@ class SightingJudge:
         ]
 
     def begin_graph(self, seen: JudgedSightings, belief: PoseWithCovariance) -> None:
-        """The graph begins with these sightings, which made a pose of the predicted one."""
+        """Begin the landmark hypotheses with the sightings that determined the first pose of the graph."""
         self.modes.restart()
         self.modes.observe((), seen.predicted, belief, seen.accepted)
 

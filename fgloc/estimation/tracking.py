@@ -37,7 +37,7 @@ class Tracking:
     def __init__(
         self, config: Config, landmark_map: LandmarkMap | None, factors: LandmarkFactors, keep_all: bool = False
     ) -> None:
-        """Take the parts; ``keep_all``: the steps before the first pose are all kept for the replay."""
+        """Set up for a map; ``keep_all``: the steps before the first pose are all kept for the replay."""
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
         self._known, self.installation = factors.known, factors.installation
@@ -56,7 +56,7 @@ class Tracking:
     def begin_segment(
         self, last: PoseWithCovariance | None, known: PoseWithCovariance | None = None
     ) -> PoseWithCovariance | None:
-        """The clock jumped, or the run begins; where the robot starts, if that is known without sightings.
+        """Begin a segment after a jump of the clock, or the run; return the start if it is known without sightings.
 
         Args:
             last: of the segment before.
@@ -79,7 +79,7 @@ class Tracking:
         )
 
     def advance_time(self, seconds: float) -> None:
-        """Time goes on."""
+        """Advance the clock [s]."""
         self._clock_s += seconds
 
     @property
@@ -99,7 +99,7 @@ class Tracking:
 
     @property
     def mode(self) -> Mode:
-        """Of the newest estimate."""
+        """Mode of the newest estimate: LOST, DEAD_RECKONING or OK."""
         if self.lost:
             return Mode.LOST
         return Mode.DEAD_RECKONING if self.dead_reckoning else Mode.OK
@@ -139,7 +139,7 @@ class Tracking:
         self.initial_pose_conflict = se2.between(predicted.pose, place.pose)
 
     def kidnapped_cov(self, contradicting: int, belief: PoseWithCovariance) -> FloatArray:
-        """What is added to the covariance ``(3, 3)`` of a pose that all landmarks seen since the last fix contradict.
+        """Covariance ``(3, 3)`` to add to a pose that all landmarks seen since the last fix contradict.
 
         Either each of them is wrong by itself, or the robot was carried away, and may be where the landmarks are.
 
@@ -155,7 +155,7 @@ class Tracking:
         return kidnapped * self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
-        """What is added to the covariance ``(3, 3)`` of a lost robot's pose, unless that itself says it is lost."""
+        """Covariance ``(3, 3)`` to add to a lost robot's pose; 0 if the belief itself is wide enough to be lost."""
         if self.is_unlocalized(belief):
             return np.zeros((3, 3))
         return self._spread_of_map(belief)
@@ -182,7 +182,7 @@ class Tracking:
         return bool(max(x, y) > _NOWHERE_M or yaw**2 > 2.0 * MAX_SIGMA[2] ** 2)
 
     def start_known(self) -> None:
-        """The pose is known; stop looking for it."""
+        """End the search, as the pose is known."""
         self._search.initializing = False
 
     def collect(
@@ -245,7 +245,7 @@ class Tracking:
         return started if apart(predicted.pose, started.newest.pose) else None
 
     def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
-        """The robot was found at another place than it was estimated at."""
+        """Note that the robot was found at another place than estimated, and end the search."""
         self._jump_count += 1
         if self._jump is None:
             self._jump = se2.between(estimated.pose, place.pose)
@@ -254,7 +254,7 @@ class Tracking:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each."""
+        """Sentences for the user about jumps, a first pose never found, and a contradicted first pose."""
         sentences = []
         if self._jump is not None:
             more = f", and {self._jump_count - 1} times more" if self._jump_count > 1 else ""

@@ -1,4 +1,4 @@
-"""What the report's plots to zoom show, as data for their script; of a long run every so many poses."""
+"""Data of the report's interactive plots, for their script; long runs are thinned out."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _landmarks(result: RunData) -> Mapping[str, Any]:
 
 
 def _label_side(landmark: Landmark) -> str:
-    """Behind a marker's face, where the robot does not drive, in Plotly's words."""
+    """Side of a marker's label in Plotly's words: behind its face, where the robot does not drive."""
     if not stands(landmark):
         return "top right"
     face = landmark.rotation[:2, 2]

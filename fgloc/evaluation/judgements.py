@@ -1,4 +1,4 @@
-"""What a run judged to be wrong, as episodes: adjacent rows of ``steps.csv`` that say the same are one judgement."""
+"""Episodes of a run's judgements: adjacent rows of ``steps.csv`` with the same verdict are one judgement."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def effect(kind: str, rows: Sequence[Decision], trajectory: Trajectory) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """A number of things."""
+    """Number with its noun, in the plural unless it is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -88,7 +88,7 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
 
 
 def _sigma_m(trajectory: Trajectory, stamp_ns: int, before: bool) -> float:
-    """Of the position at the last pose before a time, or at the first one not before it."""
+    """Sigma [m] of the position at the last pose before a time, or at the first one not before it."""
     at = int(np.searchsorted(trajectory.stamps_ns, stamp_ns)) - before
     if trajectory.covs is None or not 0 <= at < len(trajectory):
         return math.nan
@@ -198,7 +198,7 @@ class Judgement(BaseModel):
 
     @property
     def when(self) -> str:
-        """Seconds from the first pose, in words."""
+        """Time span in seconds from the first pose, in words."""
         if self.from_s is None or self.to_s is None:
             return "whole run"
         if self.to_s - self.from_s < 0.05:
@@ -252,7 +252,7 @@ def _episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[tup
 
 
 def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
-    """Rows by what they say, and of what."""
+    """Rows of ``steps.csv`` by kind and subject of their judgement."""
     last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in MOTION_SOURCES}
     moved = {d.landmark_id for d in decisions if d.reason in ("quarantined", "landmark_moved")}
     grouped: dict[tuple[Kind, str], list[Decision]] = defaultdict(list)
@@ -267,7 +267,7 @@ def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decis
 
 
 def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
-    """Kind and subject of a row; None: nothing is wrong, or another row says it."""
+    """Kind and subject of a row's judgement; None: nothing is wrong, or another row has that judgement."""
     if not d.reason:
         return None
     if d.kind in MOTION_SOURCES:
@@ -319,7 +319,7 @@ def _judgement(kind: Kind, subject: str, rows: Sequence[Decision], trajectory: T
 
 
 def _excess(d: Decision) -> float:
-    """How far a row is beyond its threshold."""
+    """Ratio of a row's statistic to its threshold; -1 without a statistic, 0 without a threshold."""
     statistic = d.residual if d.kind == "mode" else d.nis
     if not math.isfinite(statistic):
         return -1.0
@@ -359,7 +359,7 @@ def _number(value: float) -> str:
 
 
 def _of_setup(result: RunData) -> Iterator[Judgement]:
-    """What holds for the whole run: gross mistakes, and given values that the run contradicts."""
+    """Judgements on the whole run: gross mistakes, and given values that the run contradicts."""
     for sentence in result.mistakes:
         yield Judgement(
             kind="gross_mistake",

@@ -321,7 +321,7 @@ class FoundFinding(BaseModel):
 
 
 class GroundMetrics(BaseModel):
-    """Of the pose in space, on uneven ground; root mean squares."""
+    """Errors of the pose in space, on uneven ground: root mean squares, and the mean NEES over 6."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -342,7 +342,7 @@ class OdometryMetrics(BaseModel):
 
 
 class Metrics(BaseModel):
-    """What ``metrics.json`` holds. Keys that need a truth are None without one."""
+    """Content of ``metrics.json``. Keys that need a truth are None without one."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -437,7 +437,7 @@ def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"])
 
 
 def compute_metrics(result: RunData, config: Config) -> Metrics:
-    """Everything that ``metrics.json`` holds.
+    """Compute the content of ``metrics.json``.
 
     Raises:
         CovarianceError: a covariance of the estimate is not positive definite.
@@ -480,7 +480,7 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
 
 
 def ground_metrics(matched: Matched) -> GroundMetrics | None:
-    """Of the pose in space; None: it was not estimated."""
+    """Errors of the pose in space against the truth; None: it was not estimated."""
     errors, covs = matched.spatial_errors, matched.ground_covs
     if errors is None or covs is None:
         return None

@@ -172,7 +172,7 @@ def _draw_time(axes: Axes, poses: FloatArray, k: int, text: str) -> None:
 
 
 def _direction(poses: FloatArray, k: int, shortest: float) -> float | None:
-    """Of the motion at a pose [rad]; None where the robot stands, or jumps."""
+    """Direction of the motion about pose ``k`` [rad]; None where it is shorter than ``shortest``."""
     before, after = poses[max(k - 2, 0), :2], poses[min(k + 2, len(poses) - 1), :2]
     way = after - before
     return math.atan2(way[1], way[0]) if float(np.hypot(*way)) > shortest else None
@@ -236,12 +236,12 @@ def _draw_landmarks(axes: Axes, landmarks: LandmarkMap) -> list[Artist]:
 
 
 def stands(landmark: Landmark) -> bool:
-    """Whether it is a marker on a wall, not one on the floor or a point."""
+    """Whether a landmark is a marker on a wall, not one on the floor or a point."""
     return landmark.size_m > 0 and abs(landmark.rotation[2, 2]) < 0.7
 
 
 def _label_offset(landmark: Landmark) -> tuple[float, float]:
-    """Behind a marker's face, where the robot does not drive [points]."""
+    """Offset [points] of a marker's label: behind its face, where the robot does not drive."""
     if stands(landmark):
         yaw = float(landmark.planar[2])
         return -8.0 * math.cos(yaw), -8.0 * math.sin(yaw)
@@ -395,7 +395,7 @@ def _poses(result: RunData) -> FloatArray:
 def _handles(
     result: RunData, motions: Sequence[Decision], known: Sequence[Decision], truth: bool, slips: bool
 ) -> list[Any]:
-    """Legend entries of what is drawn."""
+    """Legend entries of the timeline's colors and symbols."""
     handles: list[Any] = []
     if any(d.weight > _FULL for d in motions):
         handles.append(Patch(color=BLUE, label="used as given"))
@@ -417,7 +417,7 @@ def _handles(
 
 
 def _flags(result: RunData, decisions: Sequence[Decision]) -> dict[str, FloatArray]:
-    """When each reason was given, the most frequent ones, by the order of kinds."""
+    """Times of each reason, for the most frequent ones, in the order of kinds."""
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
     for d in decisions:
         if d.kind != "mode" and (d.reason or d.weight == 0.0):  # modes are shaded
@@ -430,7 +430,7 @@ def _flags(result: RunData, decisions: Sequence[Decision]) -> dict[str, FloatArr
 
 
 def _activity(axes: Axes, span: float, title: str, rows: Mapping[str, FloatArray], color: str, bridge: bool) -> None:
-    """One row a name: bars where items came at a steady rate (`bridge`), else a tick each."""
+    """Draw one row for each name: bars where items came at a steady rate (`bridge`), else a tick each."""
     for row, times in enumerate(rows.values()):
         axes.broken_barh(_bars(np.unique(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
     _rows(axes, title, list(rows))
@@ -448,7 +448,7 @@ def _rows(axes: Axes, title: str, names: Sequence[str]) -> None:
 
 
 def _title(axes: Axes, title: str) -> None:
-    """Above a panel: beside it there are names of any length."""
+    """Put a title above a panel, as names of any length stand beside it."""
     axes.set_title(title, loc="left", fontsize=NORMAL, pad=2.5)
 
 
@@ -483,7 +483,7 @@ def _weights(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None
 
 
 def _fit(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None:
-    """NIS of the sightings over its expected value."""
+    """Draw the NIS of the sightings over its expected value."""
     for accepted, color, marker in _SIGHTING_LOOKS:
         chosen = [d for d in decisions if (d.weight > 0.0) == accepted]
         ratio = np.clip([d.nis / d.dof for d in chosen], 1e-2, 1e4)
@@ -508,12 +508,12 @@ def _landmarks(axes: Axes, result: RunData, span: float, decisions: Sequence[Dec
 
 
 def _row_of(decision: Decision) -> tuple[int, str]:
-    """Id of a landmark; without one, the kind."""
+    """Row of a decision: id of its landmark or, without one, its kind."""
     return decision.landmark_id, "" if decision.landmark_id >= 0 else decision.kind
 
 
 def _error(axes: Axes, result: RunData, matched: Matched, yaw: bool) -> None:
-    """Distance from the truth, or yaw error, with what the covariance makes of it."""
+    """Draw the distance from the truth, or the yaw error, with bands of its standard deviation."""
     covs = result.trajectory.covs
     error = np.abs(matched.errors[:, 2]) if yaw else matched.distances
     sigma = None if covs is None else np.sqrt(covs[:, 2, 2] if yaw else covs[:, 0, 0] + covs[:, 1, 1])

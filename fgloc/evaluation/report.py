@@ -40,7 +40,7 @@ from fgloc.types import InstallationFound, IntArray, Mode
 
 
 def page(template: str, **content: Any) -> str:
-    """A whole page.
+    """Render a whole page.
 
     Args:
         template: name of a file in ``templates/``.
@@ -163,7 +163,7 @@ def _captions(result: RunData, compared: bool) -> Mapping[str, str]:
 
 
 def _judged(found: Sequence[Judgement]) -> tuple[list[Row], int]:
-    """What was judged to be wrong, when, by which evidence, what that cost or saved; how many more there are."""
+    """Table of the gravest judgements (number, time, fault, evidence, effect), and how many more there are."""
     shown = {j.number for j in sorted(found, key=lambda j: (GRAVITY[j.kind], -j.rows))[:_MOST_ROWS]}
     rows: list[Row] = [(str(j.number), j.when, j.what, j.evidence, j.effect) for j in found if j.number in shown]
     return rows, len(found) - len(rows)
@@ -230,7 +230,7 @@ def _installation(result: RunData) -> list[Row]:
 
 
 def _landmarks(result: RunData) -> tuple[Row, list[Row]]:
-    """Head and rows; sigmas only of a map that has them."""
+    """Head and rows of the table of landmarks; with sigmas if the map has them."""
     landmarks = {} if result.landmarks is None else result.landmarks.landmarks
     used, refused = Counter[int](), Counter[int]()
     for decision in result.decisions:
@@ -319,7 +319,7 @@ def write_results(
 
 
 def _provenance(result: RunData, config: Config, command: str, input_hash: str | None) -> dict[str, Any]:
-    """What ``config.json`` holds: how the result came about."""
+    """Content of ``config.json``: command, input, versions and configuration of a run."""
     source = None if result.source is None else str(result.source)
     return {
         "command": command,
@@ -330,7 +330,7 @@ def _provenance(result: RunData, config: Config, command: str, input_hash: str |
 
 
 def _drawn(result: RunData, matched: Matched | None, config: Config) -> dict[str, Figure]:
-    """The figures of a run by name."""
+    """Plots of a run, by name."""
     drawn = {
         "trajectory": plot_trajectory(result, matched),
         "error": plot_error(result, matched),

@@ -1,4 +1,4 @@
-"""What the pictures of a run share: size, colors (those of Okabe and Ito), modes, the axes of time and of errors."""
+"""Style of the plots of a run: size, colors (those of Okabe and Ito), modes, the axes of time and of errors."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
 
 
 def tidy(axes: Axes) -> None:
-    """Grid and no frame."""
+    """Draw a grid and remove the frame of the plot."""
     axes.grid(color="#e5e5e5", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -144,7 +144,7 @@ class TimeAxis:
 
     @classmethod
     def of(cls, result: RunData) -> TimeAxis:
-        """From the first message or pose to the last pose."""
+        """Axis from the first message or pose to the last pose of a run."""
         poses = seconds(result, result.trajectory.stamps_ns)
         first = min([float(poses[0]), *(float(t.times.min()) for t in result.spans.values() if len(t.times))])
         first = max(first, float(poses[0]) - max(np.ptp(poses), 1.0))  # a stray old message is no reason to show years
@@ -169,7 +169,7 @@ class TimeAxis:
 
     @property
     def length(self) -> float:
-        """How long it is drawn [s]."""
+        """Drawn length of the axis [s]."""
         return float(self.places[-1] - self.places[0])
 
     def apply(self, axes: Axes) -> None:

@@ -163,7 +163,7 @@ def forget_separators(solution: Solved, row: int) -> None:
 
 
 def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
-    """Values of the keys that the graph still mentions."""
+    """Values without the keys that the graph does not contain."""
     kept, mentioned = gtsam.Values(values), set(graph.keyVector())
     for key in values.keys():  # noqa: SIM118 (gtsam.Values is not iterable)
         if key not in mentioned:
@@ -277,7 +277,7 @@ class BatchSmoother:
             self._leave_out_unlikely()
 
     def _begin_at_best(self) -> None:
-        """Of an unknown map: begin by dead reckoning where the online poses, one by one, fit worse: they ran away."""
+        """Start an unknown map's solution by dead reckoning where that fits better than the online poses."""
         online = self._values
         by_beliefs = self._relinearize()
         self._values = values_at(self.frames, dead_reckoned(self.frames), self.accepted, self._factors)
@@ -285,7 +285,7 @@ class BatchSmoother:
             self._values = online
 
     def _leave_out_unlikely(self) -> None:
-        """Of an unknown map: leave out sightings that the solution finds unlikely, and solve again."""
+        """Remove sightings of an unknown map whose NIS exceeds the gate at the solution, and solve again."""
         self.accepted = {
             k: tuple(s for s in held if _nis(s, self._values) <= chi2_bound(self._probability, _dof(s)))
             for k, held in self.accepted.items()
@@ -293,7 +293,7 @@ class BatchSmoother:
         self._optimize()
 
     def reconsider(self) -> bool:
-        """Of a known map: gate all sightings by this solution instead of the online one's, and solve again.
+        """Gate all sightings of a known map by this solution instead of the online one's, and solve again.
 
         With another installation others fit: those that were refused online may be what determines it.
 
@@ -399,12 +399,12 @@ class BatchSmoother:
         return -float(linear.error(solution)) - float(root.logDeterminant()) - of_motions
 
     def rows(self) -> int:
-        """Length of the residuals of all sightings that `cost` counts."""
+        """Number of residual rows of all sightings that `cost` counts."""
         seen = [s for frame in self.frames for s in _seen(frame)]
         return sum(s.measurement.dof for s in seen)
 
     def _cost_of_installation(self) -> float:
-        """Of its prior, where that is not among the priors of the poses."""
+        """Cost of the installation's prior; 0 where `_priors` contains that prior already."""
         n = self._factors.installation.constants
         if self._sightings is None or not n:
             return 0.0
@@ -421,7 +421,7 @@ class BatchSmoother:
         return with_deep_stack(lambda: self._result(marginals))
 
     def _marginals(self) -> Solved:
-        """Where the covariances of the last solution are."""
+        """Solver for the covariances of the last solution, made once."""
         if self._solved is None:
             self._solved = solved(self._graph, self._values, self._order)
         return self._solved
@@ -520,7 +520,7 @@ class BatchSmoother:
         return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
-        """Of the poses, and of an installation that no sightings of a known map bring in."""
+        """Priors of the poses and, without sightings of a known map, of the installation."""
         n = self._factors.installation.constants
         if n and self._sightings is None:
             prior = self._factors.installation.prior()

@@ -123,7 +123,7 @@ class BatchSightings:
         )
 
     def _of_installation(self, theta: FloatArray, values: gtsam.Values, rest: FloatArray) -> gtsam.NonlinearFactor:
-        """Its prior, and all that the sightings tell of it alone."""
+        """Factor of the installation's prior and of all terms of sightings in the installation alone."""
         prior, n = self._installation.prior(), len(theta)
         W = whitening_of(prior.cov[:n, :n])
         both = np.column_stack([W, W @ (theta - prior.mean[:n])])
@@ -137,10 +137,10 @@ class BatchSightings:
 
 
 class _Images:
-    """The images of some keyframes."""
+    """Sightings of some keyframes, grouped by image."""
 
     def __init__(self, held: Sequence[tuple[int, int, LandmarkFactor]], factors: LandmarkFactors) -> None:
-        """Take the sightings, each with the row and the number of its keyframe."""
+        """Prepare the sightings, each given with the row and the number of its keyframe."""
         self._row = np.array([i for i, _, _ in held], dtype=np.int64)
         self._k = np.array([k for _, k, _ in held], dtype=np.int64)
         self._sightings = [s for _, _, s in held]
@@ -154,7 +154,7 @@ class _Images:
     def factors(
         self, poses: FloatArray, theta: FloatArray, values: gtsam.Values, rest: FloatArray
     ) -> Iterator[gtsam.NonlinearFactor]:
-        """As `BatchSightings.factors`; what concerns the installation alone is added to ``rest``."""
+        """Factors of these images, linear about poses and installation; terms of the latter alone go to ``rest``."""
         own = poses[self._row]
         (_, batch), *others = self._observed.batches
         stack = None if others else batch.evaluate(own, theta)
@@ -172,7 +172,7 @@ class _Images:
             yield from self._of_poses(same[:, 0], white, own.shape[1], values, rest)
 
     def squares(self, poses: FloatArray, theta: FloatArray) -> tuple[FloatArray, IntArray]:
-        """As `BatchSightings.squares`."""
+        """Squared residual of each sighting by its own noise, and its rows, see `BatchSightings.squares`."""
         return self._observed.squares(poses[self._row], theta)
 
     def _of_poses(
@@ -196,7 +196,7 @@ class _Images:
             yield gtsam.LinearContainerFactor(linear, values)
 
     def _one_by_one(self, own: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
-        """Of recordings with sightings of several kinds."""
+        """Factors of recordings with sightings of several kinds, made keyframe by keyframe."""
         ground, own, constants = own[:, 3:], own[:, :3], len(theta)
         bounds = [0, *(np.flatnonzero(np.diff(self._row)) + 1).tolist(), len(self._row)]
         lines = [] if ground.shape[1] else self._observed.linearize(own, theta)
@@ -247,7 +247,7 @@ def _root(information: FloatArray) -> FloatArray:
 
 
 def whitenings(covs: Sequence[FloatArray]) -> FloatArray:
-    """As `whitening_of` has it, of several covariances ``(d, d)``."""
+    """Whitening matrices of several covariances ``(d, d)``, as `whitening_of` makes one."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(np.array(covs))))
     except np.linalg.LinAlgError:
@@ -272,13 +272,13 @@ class GroundMotions:
     """Factors of motion of all keyframes, made anew about each solution."""
 
     def __init__(self, frames: Sequence[Keyframe], installation: Installation) -> None:
-        """Take the keyframes in order."""
+        """Prepare the keyframes, given in order."""
         self._frames, self._installation = frames, installation
         first = installation.prior()
         self._prior = first.cov[installation.constants :, installation.constants :]
 
     def factors(self, poses: FloatArray, ground: FloatArray, theta: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
-        """All factors.
+        """Factors of motion and ground of all keyframes, linear about a solution.
 
         Args:
             poses: ``(n, 3)`` of the keyframes.

@@ -110,7 +110,7 @@ def by_eye(name: str) -> float:
 
 
 def explaining(rivals: Sequence[Rival], held: float, rows: int) -> tuple[Rival, ...]:
-    """Those that explain as much as the best of them, the best first; none if the best explains nothing.
+    """Rivals that explain as much as the best of them, the best first; none if the best explains nothing.
 
     Args:
         rivals: all that were tried.
@@ -130,7 +130,7 @@ def explaining(rivals: Sequence[Rival], held: float, rows: int) -> tuple[Rival, 
 
 
 def _candidates(installation: Installation, held: Sequence[str], known: bool) -> list[dict[str, float]]:
-    """What is freed: each constant that is held, the length of the motion alone, and others of the same effects."""
+    """Sets of constants to free, with sigmas: each one held, the length of the motion, others with the same effects."""
     effects, length = installation.effects, dict.fromkeys(installation.length, _BY_EYE_RATIO)
     concerned = {effect for name in held for effect in effects.get(name, ())}
     alone = [{name: by_eye(name)} for name in held]
@@ -158,7 +158,7 @@ def _rivals(names: tuple[str, ...], solver: BatchSmoother, factors: LandmarkFact
 
 
 def spread(held: FloatArray, rivals: Sequence[Rival]) -> FloatArray:
-    """What the rivals' trajectories add to the covariances of the poses ``(n, 3, 3)``: each may be the true one.
+    """Covariance ``(n, 3, 3)`` that the differences of the rivals' trajectories add to the poses.
 
     Args:
         held: poses ``(n, 3)`` with the priors as they were given.
@@ -174,7 +174,7 @@ def spread(held: FloatArray, rivals: Sequence[Rival]) -> FloatArray:
 
 
 def as_given(belief: InstallationEstimate, installation: Installation, held: Sequence[str]) -> InstallationEstimate:
-    """The installation with constants that are held as uncertain as their prior, and what follows them too."""
+    """Installation with the held constants at their prior, whose uncertainty the covariance includes."""
     rows = [installation.index[name] for name in held]
     prior = installation.prior()
     cov = considered(belief.cov, rows, prior.cov[np.ix_(rows, rows)])

@@ -78,7 +78,7 @@ class Estimator(ABC):
 
     @property
     def installed(self) -> InstallationEstimate:
-        """What is known of the installation now."""
+        """Newest estimate of the installation, with its covariance."""
         return self.factors.estimated
 
     @property
@@ -197,7 +197,7 @@ class Estimator(ABC):
         return (belief.installation or self.installed).mean[self.installation.constants :]
 
     def asked(self) -> InstallationEstimate:
-        """The installation with what is held as it was when it left the gate of its prior."""
+        """Installation in which held constants have the value at which they left the gate of their prior."""
         mean, cov = self.installed.mean.copy(), self.installed.cov.copy()
         for name, (value, sigma) in self.contradicted.items():
             i = self.installation.index[name]
@@ -306,7 +306,7 @@ class ExtendedKalmanFilter(Estimator):
         return split(PoseWithCovariance(pose, belief.cov, belief.cross, moved), conditioned(P, rows))
 
     def _begin_at(self, newest: Keyframe) -> None:
-        """A filter holds nothing else."""
+        """Do nothing: a filter holds no earlier keyframes."""
 
 
 # --- The two smoothers of GTSAM behind one interface ------------------------------------------------------------------
@@ -315,16 +315,16 @@ _NEVER = 1e9
 
 
 class Backend(Protocol):
-    """What `IncrementalEstimator` needs of a smoother."""
+    """Interface of the smoothers that `IncrementalEstimator` uses."""
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        """Add a keyframe; the slots of its factors, in their order."""
+        """Add a keyframe; return the slots of its factors, in their order."""
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Put factors in the place of those in these slots; their own slots."""
+        """Replace the factors in these slots; return the slots of the new ones."""
 
     def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors of what is there already."""
+        """Add factors on variables that the smoother already has."""
 
     def holds(self, k: int) -> bool:
         """Whether a keyframe is in the window."""
@@ -357,12 +357,12 @@ class FixedLag:
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Put factors in the place of others."""
+        """Replace the factors in these slots; return the slots of the new ones."""
         self._smoother.update(graph, gtsam.Values(), {}, slots)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
     def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors of what is there already."""
+        """Add factors on variables that the smoother already has."""
         self._smoother.update(graph, gtsam.Values(), {})
 
     def holds(self, k: int) -> bool:
@@ -394,11 +394,11 @@ class WholeRun:
         return list(self._isam2.update(graph, values).getNewFactorsIndices())
 
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Put factors in the place of others."""
+        """Replace the factors in these slots; return the slots of the new ones."""
         return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
 
     def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors of what is there already."""
+        """Add factors on variables that the smoother already has."""
         self._isam2.update(graph, gtsam.Values())
 
     def holds(self, k: int) -> bool:
@@ -433,7 +433,7 @@ def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> P
 def _joint_on_ground(
     isam2: gtsam.ISAM2, pose: FloatArray, estimate: Callable[[int], FloatArray], k: int, n: int
 ) -> PoseWithCovariance:
-    """As `_joint`, where the installation ends with the ground's height, roll and pitch at the keyframe."""
+    """Joint belief as `_joint`; the installation ends with height, roll and pitch of the ground at the keyframe."""
     keys = [pose_key(k), *([INSTALLATION] if n > len(GROUND) else []), ground_key(k)]
     found = isam2.jointMarginalCovariance(keys)
     P = np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys])
@@ -511,7 +511,7 @@ class IncrementalEstimator(Estimator):
                 self._solve_carefully(frame, frame.belief)
 
     def _solve_carefully(self, frame: Keyframe, initial: PoseWithCovariance) -> None:
-        """By QR, as long as the window holds what Cholesky fails at; if that fails too, the sightings are at fault."""
+        """Solve by QR while the window holds what Cholesky fails at; if that fails too, the sightings are at fault."""
         predicted = frame.belief
         self._careful_until_s = frame.elapsed_s + self._config.lag_s
         try:
@@ -520,7 +520,7 @@ class IncrementalEstimator(Estimator):
             self._rebuild(frame, predicted)
 
     def _linearization(self, frame: Keyframe) -> PoseWithCovariance:
-        """Where to linearize: at the prediction or, where sightings are far from linear over it, where they put it."""
+        """Point of linearization: the prediction or, for sightings that are nonlinear over it, the corrected pose."""
         known = frame.belief.installation or self.installed
         near = is_level_known(known, self.installation) and is_linear(frame.belief)
         if not frame.sightings or not self.factors.known or near:
@@ -538,7 +538,7 @@ class IncrementalEstimator(Estimator):
         return self._considered(belief)
 
     def _found(self, k: int) -> PoseWithCovariance:
-        """As the backend has it: what is held is as good as exact."""
+        """Belief of keyframe ``k`` by the backend, in which held constants are nearly exact."""
         assert self._backend is not None
         belief = self._backend.belief(k, len(self.factors.installation), self.installation.ground)
         if not (math.isfinite(belief.pose[2]) and math.isfinite(belief.cov[0, 0])):
@@ -546,7 +546,7 @@ class IncrementalEstimator(Estimator):
         return belief
 
     def _holding(self) -> gtsam.NonlinearFactorGraph:
-        """What keeps the constants that left the gate of their prior at what was given."""
+        """Factor that holds the constants that left the gate of their prior at the given values."""
         graph, constants = gtsam.NonlinearFactorGraph(), self.installation.constants
         rows = [self.installation.index[name] for name in self.contradicted]
         H = np.eye(constants)[rows] / EXACT
@@ -612,7 +612,7 @@ class IncrementalEstimator(Estimator):
         return frames[starts[-1] :] if starts else frames
 
     def _motion_factors(self, frame: Keyframe) -> list[gtsam.NonlinearFactor]:
-        """Of a keyframe, linear about the pose before it; a kernel on the wheels needs factors that are not."""
+        """Motion factors of a keyframe, linear about the pose before it; with a kernel on the wheels, nonlinear."""
         before, motions = self.log.keyframes.get(frame.k - 1), frame.motions
         if self.installation.ground and motions:
             motions = step_of(motions, self._theta_before(frame), self.installation).motions

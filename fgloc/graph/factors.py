@@ -219,7 +219,7 @@ class LandmarkFactors:
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
 
     def with_installation(self, installation: Installation) -> LandmarkFactors:
-        """The same with other priors, where what is taken as exact is as it was given."""
+        """Copy with another installation; parameters with a smaller prior sigma than before start from its mean."""
         other = copy.copy(self)
         other.installation = installation
         held = np.flatnonzero(installation.sigmas < self.installation.sigmas)
@@ -231,7 +231,7 @@ class LandmarkFactors:
 
     @property
     def estimated(self) -> InstallationEstimate:
-        """What is known of the installation now."""
+        """Newest estimate of the installation, with its covariance."""
         return self._estimated
 
     @estimated.setter
@@ -251,7 +251,7 @@ class LandmarkFactors:
 
     @property
     def landmarks(self) -> Mapping[int, Landmark]:
-        """Of the known map, by id; none of an unknown one."""
+        """Landmarks of the known map, by id; empty if the map is unknown."""
         return self._known or {}
 
     def sighting(

@@ -255,7 +255,7 @@ class Gravity:
 def gravity(
     motions: Sequence[MotionMeasurement], ground: FloatArray, theta: FloatArray, installation: Installation
 ) -> Gravity | None:
-    """What the newest step's specific force tells; None: nothing.
+    """Measurement of roll and pitch by the newest step's specific force; None: there is none.
 
     Args:
         motions: of the step.
@@ -346,7 +346,7 @@ def step_of(motions: Sequence[MotionMeasurement], theta: FloatArray, installatio
 def ground_factors(
     k: int, motions: Sequence[MotionMeasurement], step: GroundStep, theta: FloatArray, installation: Installation
 ) -> list[gtsam.NonlinearFactor]:
-    """How height, roll and pitch go on from keyframe k - 1 to k, and what gravity tells of them at k."""
+    """Factors between the ground at keyframes k - 1 and k, and the factor of gravity at k, if it was measured."""
     made = list(step_factors(k, step, theta, installation))
     seen = gravity(motions, step.after, theta, installation)
     return made if seen is None else [*made, gravity_factor(k, seen, step.after, theta, installation)]
@@ -355,7 +355,7 @@ def ground_factors(
 def step_factors(
     k: int, step: GroundStep, theta: FloatArray, installation: Installation
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """How height, roll and pitch go on from keyframe k - 1 to k, and what that tells of the IMU."""
+    """Factors between the ground at keyframes k - 1 and k, and the factor of the IMU's turn on the installation."""
     c = installation.constants
     if step.turning is not None and c:
         at = gtsam.Values()
@@ -393,7 +393,7 @@ def ground_prior(k: int, ground: FloatArray, cov: FloatArray) -> gtsam.Nonlinear
 
 
 def starting(known: InstallationEstimate, installation: Installation) -> InstallationEstimate:
-    """At a first pose: the ground there may be anything, about what was known last of roll and pitch."""
+    """Installation at a first pose: the ground's prior about a level height and the last known roll and pitch."""
     if not installation.ground:
         return known
     prior, c = installation.prior(), installation.constants

@@ -116,14 +116,14 @@ class Installation:
 
     @cached_property
     def motion_rows(self) -> IntArray:
-        """Rows of the parameters that are of no sighting: neither of a landmark nor of what sees it."""
+        """Rows of the parameters that belong neither to landmarks nor to the sensor that sees them."""
         of_sightings = {
             first + i for first, count in (*self.blocks.values(), *self.landmarks.values()) for i in range(count)
         }
         return np.array([i for i in range(len(self)) if i not in of_sightings], dtype=np.int64)
 
     def prior(self) -> InstallationEstimate:
-        """Before anything was measured."""
+        """Mean and covariance of the installation before any measurement."""
         return InstallationEstimate(self._prior_mean.copy(), self._prior_cov.copy())
 
     def beyond_gate(self, belief: InstallationEstimate) -> tuple[str, ...]:
@@ -143,7 +143,7 @@ class Installation:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Constants that are estimated, but for landmarks."""
+        """Names of the estimated constants, without landmarks."""
         return tuple(self.names[i] for i in self._gated)
 
     @cached_property
@@ -192,7 +192,7 @@ class Installation:
 
 
 def _block(name: str) -> str:
-    """Of a parameter that is one of a block; "" for a single one, which is a state if its sigma is not 0."""
+    """Name of the block that a parameter belongs to; "" for a single one, which is a state if its sigma is not 0."""
     section = name.split(".")[0]
     return name.rpartition(".")[0] if section == "map" else section if section in TIME_OFFSET else ""
 

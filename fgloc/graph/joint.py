@@ -45,7 +45,7 @@ def fuse(motions: Sequence[MotionMeasurement]) -> tuple[FloatArray, FloatArray]:
 def fuse_installed(
     motions: Sequence[MotionMeasurement],
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, float]]]:
-    """As `fuse`, with what the fused motion depends on."""
+    """Fused motion and covariance as `fuse`, and its derivatives by the parameters that it depends on."""
     first = motions[0]
     if len(motions) == 1:
         return first.motion, first.cov, dict(first.depends_on)

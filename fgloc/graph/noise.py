@@ -85,7 +85,7 @@ def sighting_whitening(cov: FloatArray) -> FloatArray:
 
 
 def covariance_problem(cov: FloatArray) -> str:
-    """What is wrong with a covariance; "" if nothing.
+    """Defect of a covariance in words; "" if there is none.
 
     Sylvester's criterion in plain floats, because this runs for every factor of every step.
     """
@@ -143,7 +143,7 @@ class FusionRules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseBudget:
-    """What one step's motion sources are worth.
+    """Weights of one step's motion sources: which are left out, and factors on the covariances of the others.
 
     Attributes:
         rejected: sources that are left out, and why.

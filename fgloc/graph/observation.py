@@ -91,7 +91,7 @@ class Batch(Protocol):
         ...
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
-        """`Linearized.shared` of one."""
+        """Return `Linearized.shared` of sighting ``i``."""
         ...
 
 
@@ -316,7 +316,7 @@ class CornerBatch:
         return np.concatenate([common, stack.J[:, :, :3] @ roots], axis=2)
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
-        """As `Linearized` has it, of one sighting."""
+        """Square root ``(8, s)`` of the covariance that sighting ``i`` shares with its image, see `Linearized`."""
         shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
         common = [shrunk, self._jitter[i] * H[:, 11:12]]
         moved = self._moved[i]
@@ -472,7 +472,7 @@ class PlanarBatch:
         return np.zeros((*stack.residual.shape, 0))
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
-        """As `Linearized` has it: the noise of these sightings has all in it."""
+        """Matrix ``(d, 0)``: the noise of these sightings has no shared part, see `Linearized`."""
         return np.zeros((len(J), 0))
 
 
@@ -502,10 +502,10 @@ class PoseBatch:
         return Stacked(residual, J, np.zeros((n, most, 0)), self._columns, np.zeros(n, dtype=np.bool_))
 
     def shared_all(self, stack: Stacked) -> None:
-        """None: these are of different dimensions."""
+        """Return None, as these measurements have different dimensions."""
 
     def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
-        """As `Linearized` has it: of the motion by which the measurement was moved to its keyframe."""
+        """Square root ``(d, s)`` of the covariance by the motion from measurement to keyframe, see `Linearized`."""
         m = self._seen[i]
         if m.motion_cov is None:
             return np.zeros((len(J), 0))

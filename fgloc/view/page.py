@@ -59,7 +59,7 @@ class PrivatePage:
                 self.wfile.write(content)
 
             def log_message(self, format: str, *args: object) -> None:
-                """Nothing: the library does not print."""
+                """Log nothing: the library does not print."""
 
         self._server = ThreadingHTTPServer((HOST, port), Handler)
         self._server.daemon_threads = True
@@ -68,7 +68,7 @@ class PrivatePage:
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """End the server."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -133,7 +133,7 @@ class Page:
         self.close()
 
     def scene(self, max_gap_s: float) -> Scene:
-        """What is shown; ``max_gap_s`` as `Scene` has it."""
+        """Scene that draws on this page; ``max_gap_s`` as `Scene` has it."""
         return Scene(self._stream, max_gap_s)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What there is to see of a run (map, robot, covariance, sightings, modes, error), live or in a file."""
+"""Scene of a run for rerun (map, robot, covariance, sightings, modes, error), live or in a file."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Scene:
             self._stream.log("map/points", balls, static=True)
 
     def add_truth(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Take in where the base truly was, in order of stamp; before the estimates that are compared with it."""
+        """Add a true position of the base, in order of stamp; before the estimates that are compared with it."""
         with self._lock:
             if self._truth and stamp_ns <= self._truth[-1][0]:
                 self._truth.clear()
@@ -141,7 +141,7 @@ class Scene:
         )
 
     def _extend(self, name: str, point: FloatArray) -> None:
-        """One more pose of a path."""
+        """Add one more pose to a path."""
         chunk, points = self._paths.get(name, (0, []))
         points.append(point)
         line = self._rr.LineStrips3D(
@@ -151,7 +151,7 @@ class Scene:
         self._paths[name] = (chunk + 1, points[-1:]) if len(points) >= _CHUNK else (chunk, points)
 
     def _draw_sightings(self, estimate: Estimate) -> None:
-        """Lines to the landmarks that were seen."""
+        """Draw lines to the landmarks that were seen."""
         start = (estimate.pose[0], estimate.pose[1], _ROBOT_M[2])
         for name, decisions in (
             ("accepted", [d for d in _of_landmarks(estimate.decisions) if d.weight > 0.0]),
@@ -190,7 +190,7 @@ def new_stream() -> RecordingStream:
 
 
 def import_rerun() -> Any:
-    """The module.
+    """Import rerun.
 
     Raises:
         OutputError: it is not installed.
