@@ -1,4 +1,4 @@
-"""A commented ``robot.yaml`` from what a recording of an unknown robot holds, and what it does not tell."""
+"""A commented ``robot.yaml`` from a recording of an unknown robot, and the settings that it does not determine."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class _Seen:
 
 
 def first_settings(bag: Path) -> RobotFile:
-    """Read a recording through and write down what it tells of the robot.
+    """Read a recording through and write the settings of the robot that it determines.
 
     Raises:
         RecordingError: nothing can be read.

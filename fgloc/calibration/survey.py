@@ -563,7 +563,7 @@ class SurveyGraph:
         return self._views
 
     def misfit(self, d: Distance) -> float:
-        """By how many sigmas a distance that is in the graph differs from its estimate by everything else.
+        """Difference [sigma] of a distance in the graph from its estimate by all other measurements.
 
         What is left of a difference r with variance S, once a measurement of variance R is in, is r R / S, and the
         variance of the value is R - R² / S.
@@ -579,7 +579,7 @@ class SurveyGraph:
         return moved_by(landmark, move)
 
     def _look_from_the_other_side(self, solver: BatchSmoother) -> dict[int, Landmark]:
-        """Markers that fit better the other way round; of those that fit both ways about alike, note the ids."""
+        """Markers that fit better in the mirrored direction; those that fit both equally are noted as undecided."""
         seen: dict[int, list[tuple[PixelMeasurement, FloatArray]]] = {}
         for frame, pose in zip(solver.frames, self._poses, strict=True):
             for m in corners_of(s.measurement for s in (*frame.sightings, *frame.rejected)):

@@ -425,7 +425,7 @@ def _unit(up: FloatArray | None) -> FloatArray:
 
 
 def _gyro(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> RateFit | None:
-    """Axis, sign, unit and lag of the gyro; the fit by the axis that tells the turn, None: none does."""
+    """Compare axis, sign, unit and lag of the gyro; the fit of the axis that measures the turn, None: none does."""
     rates = signals.rates()
     if rates is None:
         return None
@@ -520,7 +520,7 @@ def _opposite(
 
 
 def _gravity(found: Conventions, force: FloatArray, up: FloatArray) -> None:
-    """Name an IMU that does not stand upright by its accelerometer, although its gyro agrees or tells nothing."""
+    """Report an IMU that is not upright by its accelerometer, although its gyro agrees or measures no turn."""
     axis = _gravity_axis(force)
     if axis is None or math.acos(float(np.clip(axis @ up, -1.0, 1.0))) < _TILTED_RAD:
         return
@@ -597,7 +597,7 @@ def _sensor(
     landmark_map: LandmarkMap | None,
     turn_sigma: float,
 ) -> Mounting | None:
-    """Axes, mirror, scale and place of the sensor of landmarks; None: the wheels do not tell."""
+    """Mounting of the sensor of landmarks with axes, mirror and scale; None: the wheels do not determine it."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
     fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
@@ -697,7 +697,7 @@ def _along_axis(
 
 
 def _best(fits: Mapping[str, Mounting]) -> Mounting:
-    """The fit of the least misfit; of those about alike the most usual axes."""
+    """Fit with the least misfit; among nearly equal ones, that with the most usual axes."""
     least = min(m.misfit for m in fits.values())
     return next(fits[name] for name in AXES if name in fits and fits[name].misfit <= _ALIKE * least)
 

@@ -262,7 +262,7 @@ _SPARSE_S = 0.09  # images closer than this to the one before add little informa
 
 
 class Diagnosis:
-    """Collects the signals of a run, in bounded memory, whatever the estimator makes of them.
+    """Signals of a run, collected in bounded memory and independently of the estimator.
 
     Corners of markers are compared as points in the camera's axes.
 
@@ -305,7 +305,7 @@ class Diagnosis:
         self.found: tuple[Finding, ...] = ()
 
     def add(self, event: Event) -> None:
-        """Take the signals of an event, as it came: what the gate refuses may have another unit."""
+        """Store the signals of an event before the gate, which may refuse it because of another unit."""
         self._began_ns = event.received_ns if self._began_ns is None else self._began_ns
         if not self._signals.add(event):
             return

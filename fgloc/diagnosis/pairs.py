@@ -1,4 +1,4 @@
-"""Pairs of signals that tell the same thing, compared without a map and without a pose.
+"""Comparison of pairs of signals that measure the same quantity, without map and pose.
 
 Each comparison is a robust regression that gives sign, axis, scale and lag of one signal against the other, with their
 uncertainty from a jackknife over blocks of time: neighbouring errors are alike, so that the residuals of single
@@ -589,7 +589,7 @@ class BodyFit:
 
 
 def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | None:
-    """Where a body sits whose poses are given, and by what they are off, from its displacements and the wheels'.
+    """Mounting of a body with given poses, and their errors, from its displacements and the wheels'.
 
     Args:
         path: motion of the wheels.
@@ -657,7 +657,7 @@ def _at(poses: FloatArray, at: FloatArray) -> tuple[ComplexArray, FloatArray]:
 
 
 def _speed_lag(path: Path, poses: FloatArray, start: FloatArray, window_s: float) -> float:
-    """Lag by the distances, for a body whose yaw tells nothing."""
+    """Lag [s] by the distances, for a body whose yaw is no measure of it."""
     way = np.abs(np.diff([np.interp(start + d, path.times, _length(path.poses[:, :2])) for d in (0.0, 0.4)], axis=0)[0])
 
     def share(tau: float) -> float:
@@ -723,7 +723,7 @@ class MapFit:
 
 
 def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]) -> MapFit | None:
-    """Similarity between the map and the places of landmarks within short stretches; None: they do not tell.
+    """Similarity between the map and the places of landmarks within short stretches; None: undetermined.
 
     Args:
         path: motion of the wheels.

@@ -215,7 +215,7 @@ class Sanity:
         return self.watch.checked(step, measured, joined, estimate, away)
 
     def begin_anew(self) -> None:
-        """Take the next pose as it is: it was given, and the odometry does not lead there."""
+        """Restart the comparison at the next pose: it was given, and the odometry does not lead there."""
         self._segment = -1
 
     def _sightings(self, step: Step) -> Iterator[tuple[int, int, FloatArray, float]]:
@@ -260,7 +260,7 @@ class Sanity:
         return replace(verdict, simpler=None, findings=findings)
 
     def _track(self, first_ns: int, last_ns: int) -> Track | None:
-        """All between two times; where the clock jumped back, the last pass. None: nothing measured the motion."""
+        """Odometry and sightings between two times, the last pass of a clock that jumped; None: no motion known."""
         stamps = np.array(self._stamps, dtype=np.int64)
         if len(stamps) == 0:
             return None

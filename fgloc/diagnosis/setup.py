@@ -104,7 +104,7 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
 
 
 def refined(change: Change, fit: Fit) -> Change:
-    """The change with what was found of it taken into the set-up: the next fit starts there."""
+    """Change whose set-up includes the fitted values: the next fit starts there."""
     setup, values = change.setup, {name: fit.values[name][0] for name in fit.values}
     camera, extras = setup.camera, setup.extras.copy()
     for name in change.free:

@@ -119,7 +119,7 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
 
 
 class ExcerptCollector:
-    """Takes an excerpt from the events of a recording, as `read_excerpt` does.
+    """Collector of an excerpt from the events of a recording, for `read_excerpt`.
 
     Attributes:
         found: the excerpt, so far.

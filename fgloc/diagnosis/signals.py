@@ -1,4 +1,4 @@
-"""Signals of a recording that tell the same thing in different ways, collected once for the comparisons.
+"""Signals of a recording that measure the same quantities, collected once for the comparisons.
 
 A prefix of the recording is read: all but the images, in bounded memory.
 """

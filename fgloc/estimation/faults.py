@@ -183,7 +183,7 @@ class FaultAttribution:
     """
 
     def __init__(self, config: Config, estimator: Estimator) -> None:
-        """Take the estimator, whose log has the readings and sightings of the newest keyframes."""
+        """Set up for the estimator, whose log has the readings and sightings of the newest keyframes."""
         self.memory_s = config.estimator.lag_s
         self._config = config
         self._estimator = estimator
@@ -276,7 +276,7 @@ class InnovationBias:
     """The newest innovations of each source and target."""
 
     def __init__(self, probability: float, window_s: float) -> None:
-        """Take the probability with which sound measurements pass, and the silence after which what was is forgotten.
+        """Set the probability with which sound measurements pass, and the silence [s] after which all is forgotten.
 
         What is older than such a silence may be of another place. `MOST_JOINT` innovations show a bias from one sigma
         on; one of half a sigma, as a survey leaves it, passes however long it lasts.

@@ -191,7 +191,7 @@ class LandmarkModes:
         return True
 
     def _follow(self, landmark_id: int) -> None:
-        """Have a hypothesis of this landmark, instead of that of the one not seen for longest if there are too many."""
+        """Add a hypothesis of this landmark; if there are too many, it replaces the one not seen for longest."""
         row = self._rows.pop(landmark_id, None)
         if row is None:
             row = len(self._rows) if len(self._rows) < len(self._ids) else self._rows.pop(next(iter(self._rows)))

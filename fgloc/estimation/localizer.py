@@ -370,7 +370,7 @@ class Recorder:
         return np.asarray(np.outer(rates, rates) * self._clock_sigma_s**2)
 
     def unconfirmed(self, k: int, step: Step) -> Estimate | None:
-        """The pose before the sightings are enough to begin the graph with; None: they hardly tell it."""
+        """Estimate before the sightings suffice to begin the graph; None: it is too uncertain."""
         belief = self._tracking.unconfirmed()
         if belief is None:
             return None

@@ -62,7 +62,7 @@ def motion_decisions(
 def place_decision(
     k: int, stamp_ns: int, estimated: PoseWithCovariance, place: PoseWithCovariance, reason: str
 ) -> Decision:
-    """The row for a pose that sightings tell, against the predicted one; weight 0: the run did not go there."""
+    """Row of ``steps.csv`` for a pose by sightings, against the predicted one; weight 0: the run did not go there."""
     miss = se2.log(se2.between(estimated.pose, place.pose))
     nis = float(miss @ np.linalg.solve(estimated.cov + place.cov, miss))
     weight = 1.0 if reason in (JUMP, OVERRULED) else 0.0

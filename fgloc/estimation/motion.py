@@ -185,7 +185,7 @@ class MotionSources:
         return readings
 
     def _at_rest(self, step: Step, wheels: MotionMeasurement | None) -> bool:
-        """Whether the wheels stand, as far as encoders tell, no command moves them, and the gyro agrees."""
+        """Whether the robot rests by its wheels and gyro; False for commands in place of wheels."""
         if self.gyro is None or not self.gyro.at_rest or wheels is None or self._wheels.from_commands:
             return False
         return bool(wheels.cov[0, 0] <= self._known_rest * step.dt + 1e-11)

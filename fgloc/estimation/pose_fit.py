@@ -58,7 +58,7 @@ def fit_pose(
 
 
 def _kernel(m: LandmarkMeasurement) -> float:
-    """Where the Cauchy kernel begins in the fit of a pose [sigma]."""
+    """Constant k of the Cauchy kernel in the fit of a pose [sigma]."""
     return m.cauchy_k
 
 

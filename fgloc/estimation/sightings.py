@@ -240,7 +240,7 @@ class Association:
         predicted: PoseWithCovariance,
         judged: Judged,
     ) -> Judged:
-        """Where the prediction excludes little: of sightings that exclude each other, the most that agree.
+        """Verdicts with the largest set of compatible sightings accepted, where the prediction is uncertain.
 
         Between as many as that, those of the least NIS.
 
@@ -307,7 +307,7 @@ class Association:
         return corrected[1], sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])
 
     def _gate(self, dof: int) -> float:
-        """Bound of the NIS of a sighting; NaN where there is nothing to hold it against."""
+        """Bound of the NIS of a sighting with ``dof`` degrees of freedom; NaN for 0."""
         return chi2_bound(self._config.estimator.gate_probability, dof) if dof > 0 else math.nan
 
     def _seen_too_seldom(self, m: LandmarkMeasurement) -> str:

@@ -112,7 +112,7 @@ class Tracking:
     def gate_initial_pose(
         self, accepted: list[LandmarkFactor], rejected: list[LandmarkFactor], decisions: list[Decision]
     ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
-        """Judge a given first pose by what `Association.judge` makes of sightings; while it holds, accept none of them.
+        """Judge a given first pose by the verdicts of `Association.judge`; while it contradicts them, accept none.
 
         One that agrees with a contradicted pose does so by accident, and would drag it along.
         """
@@ -128,14 +128,14 @@ class Tracking:
         return [], [*rejected, *accepted], marked
 
     def record_fix(self, by_sightings: bool = True) -> None:
-        """The estimated pose is confirmed; ``by_sightings``: by accepted sightings."""
+        """Note that the estimated pose is confirmed; ``by_sightings``: by accepted sightings."""
         self._fix_s = self._clock_s
         if by_sightings:
             self.lost = False
             self._search.forget()
 
     def record_conflict(self, predicted: PoseWithCovariance, place: PoseWithCovariance) -> None:
-        """Sightings agree on another place than the given one."""
+        """Note that sightings agree on another place than the given one."""
         self.initial_pose_conflict = se2.between(predicted.pose, place.pose)
 
     def kidnapped_cov(self, contradicting: int, belief: PoseWithCovariance) -> FloatArray:
@@ -196,7 +196,7 @@ class Tracking:
         return self._search.collect(step, motions, sightings, readings)
 
     def unconfirmed(self) -> PoseWithCovariance | None:
-        """Where the robot is by the sightings so far, before they are enough to check one another.
+        """Pose by the sightings so far, before they are enough to check one another; None: it is too uncertain.
 
         Reported once the pose is known well enough to judge a sighting by it.
         """

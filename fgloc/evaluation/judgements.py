@@ -229,7 +229,7 @@ def gravest(found: Iterable[Judgement], count: int) -> list[Judgement]:
 
 
 def episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[Judgement]:
-    """Judgements that rows of ``steps.csv`` make, by time; the trajectory tells what an episode did to the pose."""
+    """Judgements of rows of ``steps.csv``, by time; their effect on the pose is taken from the trajectory."""
     return [judgement for judgement, _ in _episodes(decisions, trajectory)]
 
 

@@ -337,7 +337,7 @@ Panel = tuple[float, Callable[[Axes], None]]  # height in rows, and what draws i
 
 
 def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: IntArray | None = None) -> Figure:
-    """The timeline of a run; panels of which there is nothing to show are left out.
+    """Plot the timeline of a run, without empty panels.
 
     Args:
         result: the run.

@@ -183,7 +183,7 @@ class TimeAxis:
         axes.set_xlim(float(self._time(self.places[0] - margin)), float(self._time(self.places[-1] + margin)))
 
     def draw_cuts(self, axes: Axes, told: bool) -> None:
-        """Mark the cuts; `told`: say how long they are."""
+        """Mark the cuts of the axis; `told`: with their lengths."""
         for start, end in self.cuts:
             axes.axvspan(start, end, facecolor="white", edgecolor=GREY, hatch="\\\\\\", alpha=0.5, lw=0, zorder=0.4)
             if told:
@@ -193,7 +193,7 @@ class TimeAxis:
                 axes.annotate(f"{end - start:.0f} s cut", **at, **look, bbox=box)  # type: ignore[arg-type]
 
     def place(self, time: FloatArray | float) -> FloatArray:
-        """Where times ``(n,)`` [s] are drawn, in seconds outside the cuts."""
+        """Places ``(n,)`` of times ``(n,)`` [s] on the axis, in seconds outside the cuts."""
         return _piecewise(time, self.knots, self.places)
 
     def _time(self, place: FloatArray | float) -> FloatArray:

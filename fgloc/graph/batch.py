@@ -50,7 +50,7 @@ def with_deep_stack(work: Callable[[], _T]) -> _T:
 def initial_values(
     frames: list[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
-    """Where the batch starts: poses, landmarks and installation as the incremental estimator has them."""
+    """Initial values of the batch: poses, landmarks and installation as the incremental estimator has them."""
     return values_at(frames, [frame.belief.pose for frame in frames], accepted, factors)
 
 
@@ -249,7 +249,7 @@ class BatchSmoother:
         config: BatchConfig,
         gate_probability: float,
     ) -> None:
-        """Take the log, whose filtered beliefs are the initial values.
+        """Solve the log; its filtered beliefs are the initial values.
 
         Raises:
             EstimatorError: the log is empty.

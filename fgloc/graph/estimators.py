@@ -105,7 +105,7 @@ class Estimator(ABC):
         return self._take(frame)
 
     def predict(self, motions: Sequence[MotionMeasurement]) -> PoseWithCovariance:
-        """Where the robot is expected after the motions of one step (information-weighted), before any sighting.
+        """Predicted pose after the motions of one step (information-weighted), before any sighting.
 
         Raises:
             EstimatorError: not started, or no motion.
@@ -120,7 +120,7 @@ class Estimator(ABC):
         return predicted
 
     def level(self, motions: Sequence[MotionMeasurement]) -> None:
-        """While no pose is known, follow roll and pitch by what gravity tells of this step."""
+        """Update roll and pitch by gravity over a step, while no pose is known."""
         if self.installation.ground:
             self.factors.estimated = levelled(self.installed, motions, self.installation)
 
@@ -585,7 +585,7 @@ class IncrementalEstimator(Estimator):
             self._build_again()
 
     def _build_again(self) -> None:
-        """Take the log up as it is now, in a new window."""
+        """Build a new window from the log as it is now."""
         newest = self.log.keyframes[self._k]
         initial = newest.belief
         try:

@@ -47,7 +47,7 @@ def of_ground(pose: int) -> int:
 
 
 def insert_installation(k: int, theta: FloatArray, constants: int, values: gtsam.Values) -> None:
-    """Where a factor of keyframe k is linear: the installation ``(n,)``, the last rows of which may be its own."""
+    """Insert keyframe k's point of linearization: the installation ``(n,)``, whose last rows may be its own ground."""
     if constants:
         values.insert(INSTALLATION, theta[:constants])
     if len(theta) > constants:

@@ -72,7 +72,7 @@ class Installation:
         effects: Mapping[str, Sequence[str]] | None = None,
         length: Sequence[str] = (),
     ) -> None:
-        """Take prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
+        """Set prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
         Args:
             parameters: prior sigmas; one of 0 is left out but in a block that holds others (there it is a state that
@@ -153,7 +153,7 @@ class Installation:
         return np.array([i for i in own if self.sigmas[i] > _HELD], dtype=np.int64)
 
     def with_sigmas(self, held: Iterable[str], freed: Mapping[str, float]) -> Installation:
-        """The same parameters, some taken as exact at what was given, some free together in one direction.
+        """Copy with some parameters held as exact at their given values, some free together in one direction.
 
         Args:
             held: constants that are taken as exact.
@@ -171,7 +171,7 @@ class Installation:
         return other
 
     def measured(self, row: FloatArray, value: float, sigma: float) -> None:
-        """Take a measurement of the parameters into the prior.
+        """Update the prior by a measurement of the parameters.
 
         Args:
             row: ``(n,)`` derivative of what was measured by the parameters.

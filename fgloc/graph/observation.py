@@ -96,7 +96,7 @@ class Batch(Protocol):
 
 
 def landmark_block(installation: Installation, landmark_id: int, rows: int) -> int:
-    """Where the state of a landmark begins, if it has as many rows; else -1."""
+    """First row of a landmark's state, if that has at least ``rows``; else -1."""
     first, count = installation.landmarks.get(landmark_id, (-1, 0))
     return first if count >= rows else -1
 
