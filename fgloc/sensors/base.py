@@ -1,4 +1,4 @@
-"""What a sensor is to the rest of fgloc: streams of events, measurements by pose, and a section of ``robot.yaml``.
+"""Interfaces of a sensor: streams of events, measurements as functions of the pose, a section of ``robot.yaml``.
 
 A sensor in one file of another package has a subclass of each of `SensorEvent`, `PoseMeasurement`, `Section` and
 `Failure`, and one class like `Sensor`, which the package declares as an entry point of the group ``fgloc.sensors``.
@@ -56,7 +56,7 @@ class Signal:
 
     @classmethod
     def of_samples(cls, times_s: FloatArray, values: FloatArray) -> Signal:
-        """From samples ``(c, n)``, joined by straight lines."""
+        """Make a signal of samples ``(c, n)``, joined by straight lines."""
         integrals = np.zeros(values.shape)
         np.cumsum(0.5 * (values[:, 1:] + values[:, :-1]) * np.diff(times_s), axis=1, out=integrals[:, 1:])
         return cls(times_s, integrals)
@@ -81,7 +81,7 @@ class Signal:
 
 
 def of_stamps(stamps: Sequence[int], values: FloatArray, origin_ns: int) -> Signal | None:
-    """From samples ``(c, n)`` at stamps [ns], joined by straight lines; None if they are fewer than two."""
+    """Signal of samples ``(c, n)`` at stamps [ns], joined by straight lines; None with fewer than two samples."""
     return Signal.of_samples(seconds(stamps, origin_ns), values) if len(stamps) > 1 else None
 
 
@@ -94,32 +94,32 @@ def seconds(stamps: Sequence[int], origin_ns: int) -> FloatArray:
 
 
 def nanoseconds(stamp: Any) -> int:
-    """Of a ``builtin_interfaces/Time``."""
+    """Time [ns] of a ``builtin_interfaces/Time``."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def xyz(v: Any) -> FloatArray:
-    """A vector or point ``(3,)``."""
+    """Array ``(3,)`` of a message's vector or point."""
     return np.array((v.x, v.y, v.z), dtype=float)
 
 
 def xyzw(q: Any) -> FloatArray:
-    """A quaternion ``(4,)``."""
+    """Array ``(4,)`` of a message's quaternion: x, y, z, w."""
     return np.array((q.x, q.y, q.z, q.w), dtype=float)
 
 
 def vector(values: Any) -> FloatArray:
-    """Numbers ``(n,)``."""
+    """Float array ``(n,)`` of a message's numbers."""
     return np.asarray(values, dtype=float)
 
 
 def matrix(values: Any, n: int) -> FloatArray:
-    """Numbers ``(n, n)``, row by row."""
+    """Float array ``(n, n)`` of a message's numbers, which are stored row by row."""
     return np.asarray(values, dtype=float).reshape(n, n)
 
 
 def byte_array(values: Any) -> NDArray[np.uint8]:
-    """Bytes ``(n,)``."""
+    """Array ``(n,)`` of a message's bytes."""
     return np.asarray(values, dtype=np.uint8)
 
 
@@ -128,7 +128,7 @@ def byte_array(values: Any) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, slots=True)
 class FirstLook:
-    """What a recording of an unknown robot holds.
+    """Content of a recording of an unknown robot, from which a sensor's first settings are made.
 
     Attributes:
         roles: topic by role.
@@ -145,7 +145,7 @@ class FirstLook:
 
 @dataclass(frozen=True, slots=True)
 class FirstSection:
-    """Lines of ``robot.yaml``, and sentences on what the recording does not tell."""
+    """Lines of a section of ``robot.yaml``, and sentences on values that the recording does not determine."""
 
     lines: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
@@ -153,7 +153,7 @@ class FirstSection:
 
 @dataclass(frozen=True, slots=True)
 class FirstSettings:
-    """How a sensor takes part: the events it wants to see, and what it makes of them."""
+    """Contribution of a sensor to the first settings: the events it needs, and the function that makes its section."""
 
     events: tuple[type[Event], ...]
     section: Callable[[FirstLook], FirstSection]
@@ -199,7 +199,7 @@ class Stream(NamedTuple):
     findings: Callable[[], Collector] = TimingOnly
 
     def validate(self, checks: FieldChecks) -> Callable[[Any], Event | str]:
-        """What judges the events of one run."""
+        """Return the function that checks the events of one run."""
         if self.validator is not None:
             return self.validator(checks)
         check = self.check
@@ -215,7 +215,7 @@ def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
 
 
 class RawMistake(NamedTuple):
-    """What a recording shows to be wrong with the settings of a sensor.
+    """Mistake in the settings of a sensor, as a recording shows it.
 
     Attributes:
         sentence: for the user.
@@ -234,7 +234,7 @@ Joiner = Callable[[Event, int], Event]
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """How far the robot turned over a step.
+    """Turn of the robot over a step, with variances.
 
     Attributes:
         yaw: [rad], rid of the bias.
@@ -250,7 +250,7 @@ class Turn:
 
 
 class Rank(IntEnum):
-    """Where a parameter of the installation stands in the state."""
+    """Rank of a parameter of the installation in the order of the state."""
 
     GAIN = 0
     CLOCK = 1
@@ -286,18 +286,18 @@ class FoundRow(NamedTuple):
 
 
 class InstallationState:
-    """What a run has found of the installation, for the settings that it makes of it."""
+    """Estimate of the installation by a run, from which sensors make settings."""
 
     def __init__(self, found: InstallationFound) -> None:
         self.index = {name: i for i, name in enumerate(found.names)}
         self.mean, self.cov, self.prior = found.mean, found.cov, found.prior_cov
 
     def value(self, name: str) -> float:
-        """Value of a parameter; 0 if it is no state."""
+        """Value of a parameter; 0 if it is not in the state."""
         return float(self.mean[self.index[name]]) if name in self.index else 0.0
 
     def setting(self, name: str, given: float, found: float, gains: Mapping[str, float]) -> Iterator[Setting]:
-        """A setting that depends on parameters with these derivatives; none if it depends on none of the state."""
+        """Yield a setting that depends on parameters with these derivatives; nothing if none is in the state."""
         gains = {key: g for key, g in gains.items() if key in self.index}
         if gains:
             rows, g = [self.index[key] for key in gains], np.array(list(gains.values()))
@@ -324,7 +324,7 @@ class MotionInstallation:
 
 @dataclass(frozen=True, slots=True)
 class BuiltIn:
-    """What a sensor of fgloc itself brings: as much of `Sensor` as it shares with those of other packages.
+    """Description of a sensor of fgloc itself: the counterpart of `Sensor`, which those of other packages implement.
 
     Attributes:
         name: of its rows in ``steps.csv``, and in the counts.
@@ -357,7 +357,7 @@ class BuiltIn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:
-    """What a sensor may know of the run before it begins.
+    """Facts of a run that a sensor is given before the run begins.
 
     Attributes:
         config: all settings; the sensor's own ones are in `section`.
@@ -400,12 +400,12 @@ class Sensor(Protocol):
         ...
 
     def measure(self, event: Any) -> Iterable[LandmarkMeasurement]:
-        """What one event (that passed its check) measured, at its own stamp."""
+        """Measurements of one event that has passed its check, at the event's own stamp."""
         ...
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """See above."""
+        """Notes for the user, one sentence each."""
         ...
 
 
@@ -425,13 +425,13 @@ class WheelJoints(Section):
 
     @property
     def measured(self) -> bool:
-        """Whether the geometry is known."""
+        """Whether radii and track are known."""
         return None not in (self.left_radius, self.right_radius, self.track)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """What a channel may need to know of the robot.
+    """Facts of the robot that a channel may need.
 
     Attributes:
         joints: of the wheels; None: not known.
@@ -477,7 +477,7 @@ class EventInput:
     """Base of the classes whose methods make a sensor's events; `Live` is all of them together."""
 
     def _deliver(self, event: Event) -> None:
-        """Take an event that was made."""
+        """Pass on an event that one of the methods has made."""
         raise NotImplementedError
 
     def _when(self, role: str, stamp_ns: int) -> When:
@@ -486,5 +486,5 @@ class EventInput:
 
 
 def with_values(config: Config, section: str, values: Mapping[str, Any]) -> Config:
-    """Settings with other values in one section."""
+    """Return the settings with some values of one section replaced."""
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})

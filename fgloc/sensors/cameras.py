@@ -406,7 +406,7 @@ def _project(K: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _pixel_jacobian(K: FloatArray, point: FloatArray) -> FloatArray:
-    """Of the pixel by the point in the camera ``(2, 3)``."""
+    """Derivative ``(2, 3)`` of the pixel by the point in the camera's frame."""
     x, y, z = point
     return np.asarray(K[:2, :2] @ np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]]))
 

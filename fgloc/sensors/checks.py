@@ -100,7 +100,7 @@ def _indefinite(r: list[float], diagonal: list[float]) -> bool:
 
 
 class FieldChecks:
-    """What the validators of one run share: bounds, notes, what was rejected, and which landmarks are known.
+    """Shared state of the validators of one run: bounds, notes, counts of rejected parts, and ids of known landmarks.
 
     Attributes:
         config: bounds.
@@ -124,7 +124,7 @@ class FieldChecks:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Which ids were ignored."""
+        """Note for the user on ids that were ignored, as the map does not have them; empty if there are none."""
         if not self._unknown:
             return ()
         ids = ", ".join(str(i) for i in sorted(self._unknown)[:_SHOWN_IDS])
@@ -132,7 +132,7 @@ class FieldChecks:
         return (f"sightings of ids that are not in the map are ignored: {ids}{more}",)
 
     def note(self, text: str) -> None:
-        """Tell the user once."""
+        """Add a note for the user."""
         self._note(text)
 
     def sift(self, event: E, judge: Callable[[str, Any], Sighting | str]) -> E | str:
@@ -167,7 +167,7 @@ class FieldChecks:
         return True
 
     def quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
-        """Reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
+        """Check a quaternion: reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
         verdict = judge_quaternion(quaternion, self.config.quaternion_tolerance)
         if isinstance(verdict, str):
             return verdict
@@ -178,7 +178,7 @@ class FieldChecks:
     def covariance(
         self, topic: str, what: str, cov: FloatArray, axes: Sequence[int], name: str, changes: Changes
     ) -> str:
-        """Reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
+        """Check a covariance: reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
         raw = cov.tobytes()
         key = (topic, what)
         last = self._covs.get(key)
@@ -202,28 +202,28 @@ _UNIT_TOLERANCE = 0.05
 
 
 class Collector(Protocol):
-    """Takes in the events of one topic and tells what is wrong with them."""
+    """Collects the events of one topic and reports what is wrong with them."""
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong; ``seconds`` ``(n,)`` are the receive times from the recording's start."""
+        """Faults that were found, one sentence each; ``seconds``: receive times ``(n,)`` from the recording's start."""
 
 
 class TimingOnly:
-    """Nothing but the timing is checked."""
+    """Collector without checks of its own, for topics of which only the timing is checked."""
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Ignore the event."""
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """Nothing."""
+        """Return no faults."""
         return []
 
 
 class Table:
-    """Rows of floats, compact."""
+    """Table of floats that grows row by row, stored compactly."""
 
     def __init__(self, width: int) -> None:
         self._width = width
@@ -239,22 +239,22 @@ class Table:
 
 
 def finite_rows(rows: FloatArray) -> NDArray[np.bool_]:
-    """Which rows hold neither NaN nor infinity."""
+    """Mask ``(n,)`` of the rows that hold neither NaN nor infinity."""
     return np.asarray(np.isfinite(rows).all(axis=1))
 
 
 def count(mask: NDArray[np.bool_]) -> str:
-    """How many of how many."""
+    """Number of true entries and of all entries, as in "3 of 10"."""
     return f"{int(mask.sum())} of {mask.size}"
 
 
 def times(n: int) -> str:
-    """Once, or n times."""
+    """Number of times as text: "once", or "3 times"."""
     return "once" if n == 1 else f"{n} times"
 
 
 def spikes(topic: str, name: str, unit: str, values: FloatArray, bound: float, seconds: FloatArray) -> list[str]:
-    """Values beyond a bound, with the largest."""
+    """Sentence on values beyond a bound, with the largest; empty if there are none."""
     beyond = values > bound
     if not beyond.any():
         return []
@@ -266,13 +266,13 @@ def spikes(topic: str, name: str, unit: str, values: FloatArray, bound: float, s
 
 
 def unit_length(topic: str, quaternions: FloatArray) -> list[str]:
-    """Quaternions ``(n, 4)`` that are not of unit length."""
+    """Sentence on quaternions ``(n, 4)`` that are not of unit length; empty if all are."""
     off = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > _UNIT_TOLERANCE
     return [f"{topic}: {count(off)} have a quaternion that is not of unit length."] if off.any() else []
 
 
 class RawChecks:
-    """Images without data; remembers sizes and frame."""
+    """Checks of a topic of images: empty images and changing sizes; also keeps sizes and frame."""
 
     def __init__(self) -> None:
         self._empty = 0
@@ -281,7 +281,7 @@ class RawChecks:
         self.sizes: Counter[tuple[int, int]] = Counter()
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, RawEvent)
         self._count += 1
         self.frame_id = self.frame_id or event.frame_id
@@ -290,7 +290,7 @@ class RawChecks:
             self.sizes[event.size] += 1
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         found = []
         if self._empty:
             found.append(f"{topic}: {self._empty} of {self._count} images are empty and will be skipped.")
@@ -301,7 +301,7 @@ class RawChecks:
 
 
 class SightingsChecks:
-    """Which markers were seen, and where."""
+    """Checks of a topic of sightings: gaps, ids that are seen rarely, and ranges outside the gate's bounds."""
 
     def __init__(self) -> None:
         self.ids: Counter[int] = Counter()
@@ -311,7 +311,7 @@ class SightingsChecks:
         self._ranges = Table(1)
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, SightingsEvent)
         self._filled.append(bool(event.sightings))
         self.frame_id = self.frame_id or event.frame_id
@@ -322,7 +322,7 @@ class SightingsChecks:
                 self._ranges.add(distance)
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         found = []
         if not self.ids:
             return [f"{topic}: none of its {len(self._filled)} messages holds a sighting."]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class CommandInput(EventInput):
-    """What the robot is commanded."""
+    """Method that makes the events of commanded velocities."""
 
     def command(self, stamp_ns: int, v: float, omega: float) -> None:
         """Forward speed [m/s] and yaw rate [rad/s] that the robot was commanded."""
@@ -27,17 +27,17 @@ class CommandInput(EventInput):
 
 
 def from_twist(message: Any, when: When) -> Event:
-    """From ``geometry_msgs/Twist``."""
+    """Event of a ``geometry_msgs/Twist``."""
     return ControlEvent(*when, float(message.linear.x), float(message.angular.z))
 
 
 def from_twist_stamped(message: Any, when: When) -> Event:
-    """From ``geometry_msgs/TwistStamped``."""
+    """Event of a ``geometry_msgs/TwistStamped``."""
     return from_twist(message.twist, when)
 
 
 def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:
-    """Commands within the gate's bounds."""
+    """Validator of commands: finite, and within the gate's bounds."""
     bounds = checks.config
 
     def validate(event: ControlEvent) -> Event | str:
@@ -51,18 +51,18 @@ def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:
 
 
 class CommandChecks:
-    """Commands against the gate's bounds."""
+    """Checks of a topic of commands against the gate's bounds."""
 
     def __init__(self) -> None:
         self._rows = Table(2)
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, ControlEvent)
         self._rows.add(event.v, event.omega)
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         rows = np.abs(self._rows.array())
         found = spikes(topic, "yaw rate", "rad/s", rows[:, 1], config.gate.max_yaw_rate, seconds)
         found += spikes(topic, "speed", "m/s", rows[:, 0], config.gate.max_speed, seconds)
@@ -72,7 +72,7 @@ class CommandChecks:
 
 
 def carried(carriage: Carriage) -> Callable[[Event], Event]:
-    """In the air the wheels are commanded to stand, or to spin."""
+    """Return the function that replaces commands while the robot is carried: to stand, or to spin the wheels."""
 
     def tell(event: Event) -> Event:
         assert isinstance(event, ControlEvent)

@@ -55,16 +55,16 @@ class LandmarkSensor:
 
     @property
     def rejections(self) -> Counter[str]:
-        """See above."""
+        """Number of sightings that were not used, by reason; see the class."""
         return self._context.rejections
 
     @property
     def sees_corners(self) -> bool:
-        """Whether sightings are corners in images."""
+        """Whether there is a camera, so that sightings may be corners in images."""
         return self._context.camera is not None
 
     def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
-        """What one message measured of the landmarks.
+        """Measurements of the landmarks in one message.
 
         Raises:
             CameraError: marker corners, but no camera.
@@ -73,7 +73,7 @@ class LandmarkSensor:
         return tuple(self._measure[type(event)](event))
 
     def known(self, measurements: Iterable[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
-        """Those of another package's sensor whose landmark the map has, and those of none."""
+        """Measurements but for those of landmarks that the map does not have, which are counted as rejected."""
         landmark_map, kept = self._context.landmark_map, []
         for m in measurements:
             if m.of_landmark and (landmark_map is None or m.landmark_id not in landmark_map):
@@ -85,7 +85,7 @@ class LandmarkSensor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionSensors:
-    """What measures motion.
+    """Sensors of the robot's motion.
 
     Attributes:
         wheels: wheel odometry.
@@ -106,7 +106,7 @@ class MotionSensors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSensors:
-    """What measures where the robot is.
+    """Sensors of the robot's pose.
 
     Attributes:
         landmarks: sightings of the map's landmarks.
@@ -131,13 +131,13 @@ class MotionCompensation:
     """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn."""
 
     def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
-        """Take the sensors, and what each image's stamp is off by on its own (sigma [s])."""
+        """Take the sensors, and the sigma ``jitter_s`` [s] of the stamp of each single image."""
         self._landmarks, self._jitter_s = poses.landmarks, jitter_s
         self._wheels, self._gyro, self._attitude = motion.wheels, motion.gyro, motion.attitude
         self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
 
     def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
-        """All sightings of a step as if made at its end.
+        """Measurements of a step, moved to its end.
 
         Args:
             step: the newest one.
@@ -171,7 +171,7 @@ class MotionCompensation:
         return measured
 
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
-        """``T_keyframe_then`` for another time, with its covariance."""
+        """Motion ``T_keyframe_then`` ``(3,)`` to another time, with its covariance ``(3, 3)``."""
         motion, cov = self._wheels.motion_between(step, step.stamp_ns, at_ns)
         if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
             turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
@@ -179,7 +179,7 @@ class MotionCompensation:
         return motion, cov
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
-        """Of the base at a time near the step's end."""
+        """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end."""
         twist = self._wheels.twist(step, at_ns)
         if self._gyro is not None and step.inertial:
             twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]

@@ -1,4 +1,4 @@
-"""What all failures of sensors share: when they are active, what they may know, and how they pass events on."""
+"""Base of the failures of sensors: when they are active, what they know of the run, and how they pass events on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fgloc.types import Event, LandmarkMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a failure may know of the run that it corrupts.
+    """Facts of the run that a failure corrupts.
 
     Attributes:
         start_ns: receive time of the recording's first message.
@@ -155,11 +155,11 @@ class EventFailure(Failure):
 
     @abstractmethod
     def targets(self) -> tuple[type[Event], ...]:
-        """Kinds of events that it takes."""
+        """Classes of the events that the failure changes."""
 
     @abstractmethod
     def begin(self, scene: Scene) -> Change:
-        """What it does to one event (None: drops it), with the state of one run."""
+        """Return the function that changes one event (None: drops it), with the state of one run."""
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The corrupted events, in order of receive time."""

@@ -52,7 +52,7 @@ class ImuEvent(InertialEvent):
 
 
 def from_imu(m: Any, when: When) -> Event:
-    """From ``sensor_msgs/Imu``."""
+    """Event of a ``sensor_msgs/Imu``."""
     return ImuEvent(
         *when,
         m.header.frame_id,
@@ -94,18 +94,18 @@ def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
 
 
 class ImuChecks:
-    """Gyro and accelerometer for plausibility."""
+    """Checks of a topic of IMU messages: yaw rates within the gate's bound, and gravity near 9.81 m/s²."""
 
     def __init__(self) -> None:
         self._rows = Table(6)
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, ImuEvent)
         self._rows.add(*event.angular_velocity, *event.linear_acceleration)
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         rows = self._rows.array()
         found = []
         finite = finite_rows(rows)
@@ -122,7 +122,7 @@ class ImuChecks:
 
 
 class GyroInput(EventInput):
-    """What an IMU reports."""
+    """Method that makes the events of an IMU."""
 
     def imu(
         self,
@@ -142,7 +142,7 @@ LEVELS = ("gyro.level_x_rad", "gyro.level_y_rad")  # tilt about x and y that the
 
 
 def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
-    """With their priors; on uneven ground also of what tells roll and pitch."""
+    """Parameters of the gyro with their priors; on uneven ground also biases, tilts and levels."""
     scale = Parameter("gyro.scale", config.gyro.scale_sigma if "gyro" in sources else 0.0, effects=("turn",))
     if config.estimator.ground == "flat" or "gyro" not in sources:
         return (scale,)
@@ -152,12 +152,12 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
 
 
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
-    """Rows of ``metrics.json``."""
+    """Rows of ``metrics.json`` on the gyro."""
     return (FoundRow("gyro.scale", "gyro.scale", 1.0, -1.0),)
 
 
 def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
-    """Lines of ``robot.yaml``."""
+    """Settings of the gyro, as a run has estimated them."""
     scale = config.gyro.scale
     yield from state.setting("gyro.scale", scale, scale * (1.0 + state.value("gyro.scale")), {"gyro.scale": scale})
 
@@ -213,7 +213,7 @@ class Gyro:
 
     @property
     def at_rest(self) -> bool:
-        """Whether over the last step, and for a while, it has shown nothing but its bias beside wheels that stand."""
+        """Whether the wheels have stood, and the gyro has measured nothing but its bias, for more than 0.3 s."""
         return self._standing_s > _AT_REST_S
 
     def fork(self) -> Gyro:
@@ -255,23 +255,23 @@ class Gyro:
         return Turn(yaw, noise + drift, noise, self._config.yaw_per_sqrt_s**2)
 
     def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
-        """Yaw rates [rad/s] at these times, rid of the bias: of the neighbors, weighted."""
+        """Yaw rates ``(n,)`` [rad/s] at these times, interpolated between the neighboring messages, bias removed."""
         times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
         rates = np.array([event.angular_velocity for event in events]) @ self._up
         at = np.array([(stamp - stamps_ns[0]) * 1e-9 for stamp in stamps_ns])
         return np.asarray(np.interp(at, times, rates) - self.bias)
 
     def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
-        """Of a motion whose turn is this gyro's, by what the gyro is off by."""
+        """Derivatives ``(3,)`` of a motion whose turn is this gyro's, by parameter of the gyro."""
         return _derivatives(motion)
 
     def turned(self, yaw: float, seconds: float) -> None:
-        """The robot went on by a step over which `measure` gave this turn [rad]."""
+        """Add the turn [rad] of a step, as `measure` gave it, to the turn since the last fix."""
         self._turned += yaw
         self._turned_s += seconds
 
     def fix(self, yaw: float, variance: float, apart_s: float = 0.0) -> None:
-        """Take in the yaw at the end of the last step, as fixes determine it; the turn between two corrects the bias.
+        """Add a fix of the yaw at the end of the last step; the turn between two fixes corrects the bias.
 
         Args:
             yaw: [rad].
@@ -288,7 +288,7 @@ class Gyro:
         self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
 
     def forget_fix(self) -> None:
-        """The robot may have been turned without data since the last fix."""
+        """Forget the last fix, since which the robot may have been turned without data."""
         self._anchor, self._turned, self._turned_s = None, 0.0, 0.0
 
     def _watch_rest(self, rate: float, dt: float, wheels: ArrayLike | None) -> None:
@@ -387,7 +387,7 @@ _GRAVITY = 9.81  # m/s²
 
 
 def _rate(events: Sequence[InertialEvent], origin_ns: int, mounting: Mounting) -> Signal | None:
-    """Yaw rate [rad/s], its bias taken out."""
+    """Signal of the yaw rate [rad/s] with its bias removed; None without events."""
     if not events:
         return None
     rates = np.concatenate([e.angular_velocity for e in events]).reshape(-1, 3)
@@ -429,7 +429,7 @@ class ImuBias(EventFailure):
         return (ImuEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Add."""
+        """Return the function that adds the biases to a message."""
         rates, accelerations = np.array([0.0, 0.0, self.yaw_rate]), np.array(self.acceleration)
 
         def bias(event: Event) -> Event:
@@ -449,7 +449,7 @@ _TILT_RAD = 0.12  # largest tilt at which it is held
 
 
 def carried(carriage: Carriage) -> Callable[[Event], Event]:
-    """The IMU is shaken in the air. It is taken to be level."""
+    """Return the function that shakes the IMU while the robot is carried; the IMU is taken to be level."""
     hands = {(a, b): _Hands(a, b, carriage) for a, b in carriage.intervals}
 
     def tell(event: Event) -> Event:
@@ -461,7 +461,7 @@ def carried(carriage: Carriage) -> Callable[[Event], Event]:
 
 
 class _Hands:
-    """What the hands do to the IMU in one interval."""
+    """Motion that hands add to the IMU in one interval: lift, tilt, sway and bounce."""
 
     def __init__(self, start_s: float, end_s: float, carriage: Carriage) -> None:
         rng = carriage.scene.rng
@@ -471,7 +471,7 @@ class _Hands:
         self._phase = rng.uniform(0.0, 2.0 * math.pi, 3)
 
     def shake(self, event: ImuEvent, t: float) -> ImuEvent:
-        """The message with the hands' motion added."""
+        """Message with the motion of the hands added."""
         s = min(t - self.start_s, self.end_s - t) / self._rise_s  # 0 on the floor, 1 up
         up, rate, rises = _minimum_jerk(s)
         sign = 1.0 if t - self.start_s < self.end_s - t else -1.0

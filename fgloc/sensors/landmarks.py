@@ -1,4 +1,4 @@
-"""From sightings, in whatever form a sensor reports them, to measurements that become factors."""
+"""Conversion of sightings, in whatever form a sensor reports them, into measurements that become factors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _S = TypeVar("_S", bound=Sighting)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SightingContext:
-    """What the sensors that see landmarks share in one run.
+    """Shared state of the sensors that see landmarks in one run.
 
     Attributes:
         config: all settings.
@@ -60,7 +60,7 @@ class SightingContext:
         return usable
 
     def landmark(self, landmark_id: int) -> Landmark | None:
-        """Of the known map, which has it; None without a map."""
+        """Landmark of the known map by its id; None without a map."""
         return None if self.landmark_map is None else self.landmark_map.landmarks[landmark_id]
 
     def reject(self, reason: str) -> None:
@@ -68,7 +68,7 @@ class SightingContext:
         self.rejections[f"sightings.{reason}"] += 1
 
     def range_bearing_cov(self, distance: float) -> FloatArray:
-        """Of range and bearing ``(2, 2)`` at this distance [m], as configured."""
+        """Covariance ``(2, 2)`` of range [m] and bearing [rad] at a distance [m], as configured."""
         section = self.config.landmarks
         sigma = section.range_sigma_m + section.range_sigma_per_m * distance
         return np.diag([sigma**2, section.bearing_sigma_rad**2])

@@ -60,7 +60,7 @@ def read_cov(item: Item, turned: bool) -> FloatArray | None:
 
 
 def sigma_fields(landmark: Landmark) -> list[str]:
-    """What `read_cov` reads back, as ``key: value``; sigmas where nothing is correlated."""
+    """Covariance of a landmark as ``key: value`` for `read_cov`; by sigmas where nothing is correlated."""
     cov = landmark.cov
     if cov is None:
         return []

@@ -30,15 +30,15 @@ class MarkerPose(Sighting):
     cov: FloatArray  # (6, 6) ROS order; zeros if the message gives none
 
     def place(self) -> FloatArray | None:
-        """Its position."""
+        """Position ``(3,)`` [m] of the marker in the sensor frame."""
         return self.position
 
     def distance(self) -> float | None:
-        """Of that position."""
+        """Distance of the marker from the sensor [m]."""
         return float(np.linalg.norm(self.position))
 
     def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
-        """On each coordinate of its position."""
+        """Marker pose with Gaussian noise on each coordinate of its position."""
         if not (sigma := sigmas["position_m"]):
             return self
         return replace(self, position=self.position + rng.normal(0.0, sigma, 3))
@@ -55,7 +55,7 @@ _ID = re.compile(r"(?:^|[^0-9A-Za-z])(\d+)$")  # "7", "tag36h11:7", "marker_7"; 
 
 
 def from_aruco(m: Any, when: When) -> Event:
-    """From ``aruco_msgs/MarkerArray``."""
+    """Event of a ``aruco_msgs/MarkerArray``."""
     frame = m.header.frame_id or next((marker.header.frame_id for marker in m.markers), "")
     return MarkerPosesEvent(*when, frame, tuple(_marker_pose(int(marker.id), marker.pose) for marker in m.markers))
 
@@ -73,7 +73,7 @@ def from_detections(m: Any, when: When) -> Event:
 
 
 def _marker_pose(marker_id: int, pose: Any) -> MarkerPose:
-    """From a PoseWithCovariance."""
+    """Marker pose of a ``geometry_msgs/PoseWithCovariance``."""
     return MarkerPose(marker_id, xyz(pose.pose.position), xyzw(pose.pose.orientation), matrix(pose.covariance, 6))
 
 
@@ -118,7 +118,7 @@ class MarkerPoseMeasurer:
         self._context = context
 
     def __call__(self, event: MarkerPosesEvent) -> Iterator[LandmarkSighting]:
-        """Those of one message."""
+        """Measurements of one message."""
         made = (self._marker_pose(event.stamp_ns, seen) for seen in self._context.usable(event.sightings))
         return (m for m in made if m is not None)
 

@@ -44,12 +44,12 @@ class LandmarkMeasurement(Protocol):
 
     @property
     def model(self) -> Model:
-        """How it is evaluated."""
+        """Model by which residual and Jacobians are computed."""
         ...
 
     @property
     def stamp_ns(self) -> int:
-        """Time at which it was made."""
+        """Time of the measurement [ns]."""
         ...
 
     @property
@@ -79,7 +79,7 @@ class LandmarkMeasurement(Protocol):
 
     @property
     def counted_as(self) -> str:
-        """Under which name it is counted where it is rejected."""
+        """Name under which the measurement is counted if it is rejected."""
         ...
 
     @property
@@ -142,7 +142,7 @@ class LandmarkMeasurement(Protocol):
         ...
 
     def scaled(self, factor: float) -> Self:
-        """With the covariance of the residual times a factor."""
+        """Copy with the covariance of the residual multiplied by a factor."""
         ...
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
@@ -178,7 +178,7 @@ class LandmarkSighting(LandmarkMeasurement, Protocol):
     """Measurement of a landmark of the map."""
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """With the motion at the exposure, by which the residual depends on the clock.
+        """Copy with the motion at the exposure, by which the residual depends on the clock.
 
         Args:
             twist: ``(3,)`` of the base [m/s, m/s, rad/s].
@@ -188,7 +188,7 @@ class LandmarkSighting(LandmarkMeasurement, Protocol):
         ...
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """As seen from a base that is tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)``; of corners only."""
+        """Copy for a base tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)`` [rad/s]; only corners change."""
         ...
 
     def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
@@ -239,7 +239,7 @@ class PixelMeasurement:
 
     @property
     def row_id(self) -> int:
-        """The landmark."""
+        """Id of the landmark."""
         return self.landmark_id
 
     @property
@@ -248,11 +248,11 @@ class PixelMeasurement:
         return 1.0 / self.sigma_px**2
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s, jitter_s=jitter_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """As seen from a tilted base; see `LandmarkSighting.tilted`."""
+        """Copy as seen from a tilted base; see `LandmarkSighting.tilted`."""
         camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
         return replace(self, camera=camera, tilting=rates)
 
@@ -268,7 +268,7 @@ class PixelMeasurement:
         return replace(self, camera=camera, motion_cov=ad @ spread @ ad.T, twist=ad @ self.twist)
 
     def scaled(self, factor: float) -> Self:
-        """With the variance of the corners times a factor."""
+        """Copy with the variance of the corners multiplied by a factor."""
         return replace(self, sigma_px=math.sqrt(factor) * self.sigma_px)
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
@@ -280,7 +280,7 @@ class PixelMeasurement:
         """None: markers need a known map to be seen by their corners."""
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """None but other ids; see `misread`."""
+        """No alternatives but other ids; see `misread`."""
         return ()
 
     def misread(self, others: Sequence[tuple[int, FloatArray]]) -> list[PixelMeasurement]:
@@ -357,7 +357,7 @@ class PointMeasurement:
 
     @property
     def row_id(self) -> int:
-        """The landmark."""
+        """Id of the landmark."""
         return self.landmark_id
 
     @property
@@ -366,11 +366,11 @@ class PointMeasurement:
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """The same: ranges are taken to be in the plane."""
+        """The sighting itself: ranges are taken to be in the plane."""
         return self
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
@@ -383,11 +383,11 @@ class PointMeasurement:
         return replace(self, range_m=r, bearing_rad=bearing, cov=self.cov + added, twist=ad @ self.twist)
 
     def scaled(self, factor: float) -> Self:
-        """With the covariance times a factor."""
+        """Copy with the covariance multiplied by a factor."""
         return replace(self, cov=self.cov * factor)
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
-        """None: the poses on a ring are searched among hypotheses, see `fgloc.estimation.beacons`."""
+        """No poses: those on a ring are searched among hypotheses, see `fgloc.estimation.beacons`."""
         return ()
 
     def landmark_from(self, pose: FloatArray) -> FloatArray:
@@ -396,11 +396,11 @@ class PointMeasurement:
         return se2.compose(pose, local)[:2]
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """None."""
+        """No alternatives."""
         return ()
 
     def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
-        """None: the sensor's own association is taken as it is."""
+        """No other readings: the sensor's own association is taken as it is."""
         return ()
 
     def in_base(self) -> tuple[FloatArray, FloatArray]:
@@ -475,7 +475,7 @@ class FrameMeasurement:
 
     @property
     def row_id(self) -> int:
-        """The landmark."""
+        """Id of the landmark."""
         return self.landmark_id
 
     @property
@@ -484,11 +484,11 @@ class FrameMeasurement:
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """With the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """The same: poses are taken to be in the plane."""
+        """The sighting itself: poses are taken to be in the plane."""
         return self
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
@@ -498,7 +498,7 @@ class FrameMeasurement:
         return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
 
     def scaled(self, factor: float) -> Self:
-        """With the covariance times a factor."""
+        """Copy with the covariance multiplied by a factor."""
         return replace(self, cov=self.cov * factor)
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
@@ -510,11 +510,11 @@ class FrameMeasurement:
         return se2.compose(pose, self.pose)
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """None."""
+        """No alternatives."""
         return ()
 
     def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
-        """None: the detector's association is taken as it is."""
+        """No other readings: the detector's association is taken as it is."""
         return ()
 
     def in_base(self) -> tuple[FloatArray, FloatArray]:
@@ -605,7 +605,7 @@ class PoseMeasurement(ABC):
 
     @property
     def bias_key(self) -> Hashable | None:
-        """Source and target."""
+        """Source and target, of which measurements are tested for a common bias."""
         return self.source, self.target
 
     @property
@@ -620,7 +620,7 @@ class PoseMeasurement(ABC):
         return replace(self, T_keyframe_then=se2.compose(motion, self.T_keyframe_then), motion_cov=moved)
 
     def scaled(self, factor: float) -> Self:
-        """With the covariance times a factor."""
+        """Copy with the covariance multiplied by a factor."""
         return replace(self, cov=self.cov * factor)
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
@@ -633,7 +633,7 @@ class PoseMeasurement(ABC):
         return None
 
     def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
-        """None; see `alternatives`."""
+        """No other readings; see `alternatives`."""
         return ()
 
     def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -646,10 +646,10 @@ class PoseMeasurement(ABC):
 
 
 def corners_of(measurements: Iterable[LandmarkMeasurement]) -> list[PixelMeasurement]:
-    """Those that are corners, for surveys of markers and checks of the floor."""
+    """Measurements that are corners, for surveys of markers and checks of the floor."""
     return [m for m in measurements if isinstance(m, PixelMeasurement)]
 
 
 def points_of(measurements: Iterable[LandmarkMeasurement]) -> list[PointMeasurement]:
-    """Those that are range and bearing, for hypotheses on rings."""
+    """Measurements that are range and bearing, for hypotheses on rings."""
     return [m for m in measurements if isinstance(m, PointMeasurement)]

@@ -26,11 +26,11 @@ class RangeBearing(Sighting):
     bearing_rad: float
 
     def distance(self) -> float | None:
-        """The range."""
+        """Range [m] of the landmark."""
         return self.range_m
 
     def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
-        """On range and bearing."""
+        """Sighting with Gaussian noise on range and bearing."""
         range_m, bearing_rad = sigmas["range_m"], sigmas["bearing_rad"]
         if not (range_m or bearing_rad):
             return self
@@ -49,7 +49,7 @@ class RangeBearingEvent(SightingsEvent):
 
 
 def from_landmark_array(m: Any, when: When) -> Event:
-    """From ``landmark_msgs/LandmarkArray``."""
+    """Event of a ``landmark_msgs/LandmarkArray``."""
     sightings = tuple(RangeBearing(int(k.id), float(k.range), float(k.bearing)) for k in m.landmarks)
     return RangeBearingEvent(*when, m.header.frame_id, sightings)
 
@@ -84,7 +84,7 @@ def validator(checks: FieldChecks) -> Callable[[RangeBearingEvent], Event | str]
 
 
 class RangeBearingInput(EventInput):
-    """What a sensor of landmarks measures."""
+    """Method that makes the events of ranges with bearings."""
 
     def ranges(self, stamp_ns: int, landmarks: Iterable[tuple[int, float, float]], frame_id: str = BASE) -> None:
         """Landmarks by id, range [m] and bearing [rad], counter-clockwise from the sensor's x axis."""
@@ -103,7 +103,7 @@ class RangeBearingMeasurer:
         self._context = context
 
     def __call__(self, event: RangeBearingEvent) -> Iterator[PointMeasurement]:
-        """Those of one message."""
+        """Measurements of one message."""
         made = (self._range_bearing(event.stamp_ns, seen) for seen in self._context.usable(event.sightings))
         return (m for m in made if m is not None)
 

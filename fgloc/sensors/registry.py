@@ -86,7 +86,7 @@ def usual_names(role: str) -> tuple[str, ...]:
 
 
 def role_of_event(event: Event) -> str | None:
-    """Role of a sensor's event; None if it is of none."""
+    """Role of a sensor's event; None if no sensor has it."""
     return _role_by_class(sensors()).get(type(event))
 
 
@@ -127,7 +127,7 @@ def failures() -> tuple[type[Section], ...]:
 
 
 def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
-    """What becomes of the events of a robot that is carried, by class; those of other classes are left as they are."""
+    """Functions that change the events of a carried robot, by class; events of other classes are left as they are."""
     made: dict[type[Event], Callable[[Event], Event]] = {}
     for sensor in BUILT_IN:
         if sensor.carried is not None:
@@ -136,7 +136,7 @@ def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
 
 
 def title_of(name: str) -> str:
-    """Of a sensor, in sentences."""
+    """Title of a sensor in sentences; its name if it has none."""
     return next((sensor.title for sensor in BUILT_IN if sensor.name == name and sensor.title), name)
 
 
@@ -147,7 +147,7 @@ def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Paramet
 
 
 def first_settings() -> tuple[FirstSettings, ...]:
-    """What the sensors write into the first settings of an unknown robot."""
+    """Contributions of the sensors to the first settings of an unknown robot."""
     return tuple(sensor.first_settings for sensor in BUILT_IN if sensor.first_settings is not None)
 
 
@@ -158,7 +158,7 @@ def detected_kinds() -> tuple[str, ...]:
 
 
 def measurers(context: SightingContext) -> dict[type, Callable[[Any], Iterator[LandmarkSighting]]]:
-    """What makes measurements of the sightings of one run, by class of event."""
+    """Functions that make measurements of the sightings of one run, by class of event."""
     made: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = {}
     for sensor in BUILT_IN:
         if sensor.measures is not None:
@@ -172,7 +172,7 @@ def landmark_kinds() -> tuple[str, ...]:
 
 
 def joiner_of(event: Event) -> Callable[[], Joiner] | None:
-    """What joins the events of a topic on to those before a cut; None if they count nothing."""
+    """Factory of the function that continues a topic across a cut; None if its events count nothing."""
     return next((s.joined for s in BUILT_IN if any(type(event) is stream.event for stream in s.streams)), None)
 
 

@@ -117,7 +117,7 @@ class Split(Section):
 
 
 class ModelCard(Section):
-    """Everything but the weights.
+    """Description of a learned model: everything but its weights.
 
     ``naive``: the robot moves as commanded. A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later: a
     first-order lag plus Δt times a network. ``lag`` has no network, ``arx`` a linear one, ``rate`` no lag: its network
@@ -163,7 +163,7 @@ class ModelCard(Section):
 
     @property
     def family(self) -> Family:
-        """What the model is like from outside."""
+        """Family of the model: naive, velocity or displacement."""
         return FAMILIES[self.kind]
 
     @property
@@ -233,7 +233,7 @@ EventsOf = Callable[[type[MotionEvent]], Sequence[MotionEvent]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """What was measured around a step. Times are seconds since ``origin_ns``.
+    """Signals measured around a step; their times are seconds since ``origin_ns``.
 
     Attributes:
         origin_ns: time zero.
@@ -244,12 +244,12 @@ class Signals:
     by_name: Mapping[str, Signal] = field(default_factory=dict)
 
     def named(self, name: str) -> Signal | None:
-        """By the name that a card's inputs use."""
+        """Signal of a channel, by the name that a card's inputs use; None if it is not known."""
         return self.by_name.get(name)
 
 
 class SignalReader:
-    """Keeps of the steps' events what a model reads, for as long as it looks back, and makes signals of it.
+    """Keeps the events that a model reads, as far back as it reads them, and makes signals of them.
 
     Steps that do not continue the last one, by stamp or segment, begin anew: before the first event of a signal its
     first value is taken to have held.
@@ -265,7 +265,7 @@ class SignalReader:
 
     @property
     def back_ns(self) -> int:
-        """How far before a step the events reach that are read; 0: none are read."""
+        """Time before a step [ns] for which events are read; 0: none are read."""
         return self._back_ns if self._wanted else 0
 
     def fork(self, events: Mapping[type[MotionEvent], Sequence[MotionEvent]]) -> SignalReader:
@@ -275,7 +275,7 @@ class SignalReader:
         return forked
 
     def read(self, step: Step, gyro_bias: float = 0.0) -> Signals | str:
-        """Signals over the step and what the model wants before it; else the name of the first one with a hole."""
+        """Signals over the step and the time before it that the model reads; else the name of the first with a gap."""
         if not self._wanted:
             return Signals(step.start_ns)
         continued = self._reached == (step.segment, step.start_ns)

@@ -153,7 +153,7 @@ class CommandHistory:
     """
 
     def __init__(self, commands: tuple[ControlEvent, ...], origin_ns: int | None = None) -> None:
-        """Integrate.
+        """Integrate the commands over time.
 
         Args:
             commands: at least one, in order of stamp.
@@ -329,7 +329,7 @@ class MotionPrediction:
 
 
 class MotionModel(Protocol):
-    """What the localizer knows of a learned model: its card, its calibration against the wheels, its predictions."""
+    """Interface of a learned model: its card, its calibration against the wheels, and its predictions."""
 
     card: ModelCard
     joint: JointCalibration | None
@@ -432,7 +432,7 @@ def follow(track: CommandHistory | None, commands: tuple[ControlEvent, ...]) -> 
 
 
 def sub_steps(duration: float, longest_s: float) -> int:
-    """How many equal parts, no longer than the longest."""
+    """Number of equal parts of a duration [s], none of which is longer than ``longest_s``."""
     return max(1, math.ceil(duration / longest_s - 1e-6))
 
 
@@ -535,7 +535,7 @@ def _noise(card: ModelCard) -> NoiseDensity:
 
 
 def _prediction(twists: FloatArray, noise: NoiseDensity, dt: float, velocity: FloatArray) -> MotionPrediction:
-    """Of body twists ``(n, 3)``, each held for dt."""
+    """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance."""
     variances = np.array([noise_density(noise, v, omega) for v, omega in twists[:, ::2].tolist()])
     return MotionPrediction(*composed((twists * dt).tolist(), (variances * dt).tolist()), velocity)
 
@@ -616,7 +616,7 @@ class DisplacementModel:
         return np.asarray(pooled)
 
     def _inputs(self, track: CommandHistory, start: float, dt: float, n: int) -> tuple[FloatArray, Float32Array]:
-        """By the commands, one row a sub-step: twists of the calibrated kinematics times dt ``(n, 3)``, inputs."""
+        """Twists of the calibrated kinematics times dt ``(n, 3)``, and inputs by the commands, one row per sub-step."""
         plan = self._plans.get(n)
         if plan is None:
             plan = self._plans[n] = self._plan(n)
@@ -627,7 +627,7 @@ class DisplacementModel:
         return means[:n] @ self._gains, x
 
     def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
-        """Replace what the signals know better than the commands, and hand them to the network."""
+        """Fill the network's inputs from signals, and replace the twists that signals measure better than commands."""
         n, at = len(base), self._n_bins
         start = 0.0 if signals is None else (start_ns - signals.origin_ns) * 1e-9
         starts = start + dt * np.arange(n, dtype=np.float64)
@@ -644,7 +644,7 @@ class DisplacementModel:
             base *= dt
 
     def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How to ask a track once for all of n sub-steps.
+        """Linear maps by which one look-up in a track of commands serves n sub-steps.
 
         Returns:
             slope, offset: ``(m,)`` times to ask for are ``slope * dt + offset + start``.
@@ -686,7 +686,7 @@ def signal_features(signal: Signal, starts: FloatArray, dt: float, edges: FloatA
 def measured_twists(
     base: FloatArray, wheel_kinematics: Kinematics, signals: Signals, starts: FloatArray, dt: float
 ) -> None:
-    """Replace in the twists ``(n, 3)`` of sub-steps what the signals know better: wheels all, a gyro the yaw rate."""
+    """Replace the twists ``(n, 3)`` of sub-steps by measured ones: all of them by wheels, the yaw rate by a gyro."""
     limits = np.column_stack([starts, starts + dt])
     wheels, rate = signals.named("wheels"), signals.named("gyro")
     if wheels is not None:

@@ -147,7 +147,7 @@ def _network(tensors: Tensors, card: ModelCard) -> Answering:
 
 
 def _widths(card: ModelCard) -> list[int]:
-    """Of the layers, from input to output."""
+    """Widths of the network's layers, from input to output; empty for a model without a network."""
     if card.kind in ("naive", "lag"):
         return []
     if card.kind == "gru":
@@ -184,7 +184,7 @@ def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
 
 
 def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
-    """With their priors."""
+    """Parameter of the learned motion with its prior."""
     return (
         Parameter(
             "learned.scale",
@@ -197,12 +197,12 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
 
 
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
-    """Rows of ``metrics.json``."""
+    """Row of ``metrics.json`` on the learned motion."""
     return (FoundRow("learned.scale", "learned.scale", 1.0, 1.0),)
 
 
 def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
-    """Lines of ``robot.yaml``."""
+    """Setting of the learned motion's scale, as a run has estimated it."""
     scale = config.motion.scale
     now = scale * (1.0 + state.value("learned.scale"))
     yield from state.setting("motion.scale", scale, now, {"learned.scale": scale})
@@ -247,7 +247,7 @@ class LearnedMotion:
 
     @property
     def signals_back_ns(self) -> int:
-        """How far before a step the measured signals reach that the model reads; 0: it reads none."""
+        """Time before a step [ns] for which the model reads measured signals; 0: it reads none."""
         return self._reader.back_ns
 
     def fork(
@@ -297,14 +297,14 @@ class LearnedMotion:
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
     def measure_scaled(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
-        """As `measure`, for this robot: distances are ``motion.scale`` times the model's."""
+        """Predict the step for this robot, see `measure`: distances are ``motion.scale`` times the model's."""
         m, scale = self.measure(step, gyro_bias), self._scale
         if m is None or scale == 1.0:
             return m
         return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
 
     def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
-        """Of a motion of this source by what it is off by."""
+        """Derivatives ``(3,)`` of a motion of this source by its parameters."""
         return _derivatives(motion)
 
     def _unusable(self, step: Step) -> str:

@@ -39,7 +39,7 @@ _LOOKAHEAD = 4  # images that may be detected before the consumer asks for them
 
 
 class Detector(Protocol):
-    """What finds landmarks in raw data."""
+    """Interface of a detector of landmarks in raw data."""
 
     def detect(self, event: Any) -> Any:
         """The sightings of one raw event.
@@ -233,7 +233,7 @@ class MarkerDetector:
         return RememberedDetections(file, detector, known, note)
 
     def hints(self, recording: Any) -> tuple[tuple[str, ...], str | None]:
-        """What may be wrong where no marker is found; see `fgloc.sensors.markers.detector.image_hints`."""
+        """Hints on why no marker is found; see `fgloc.sensors.markers.detector.image_hints`."""
         return image_hints(recording, self)
 
     def detect(self, event: ImageEvent) -> CornersEvent:
@@ -251,12 +251,12 @@ class MarkerDetector:
         return self.read(image)[0]
 
     def read(self, image: GrayImage) -> tuple[Found, int]:
-        """What `find` finds, and how many squares there were that could have been markers."""
+        """Markers, as `find` gives them, and the number of squares that could have been markers."""
         found, squares = self._search(image, None)
         return self._refined(image, found), squares
 
     def find_within(self, image: GrayImage, box: Box) -> Found:
-        """As `find`, of a part of the image: markers in it that are wholly some ten pixels from its borders."""
+        """Markers in a part of an image, see `find`, that lie wholly some ten pixels from its borders."""
         return self._refined(image, self._search(image, box)[0])
 
     def _search(self, image: GrayImage, box: Box | None) -> tuple[Found, int]:
@@ -408,7 +408,7 @@ class TrackingDetector:
         return found
 
     def _coarsely(self, image: GrayImage, known: Found) -> Found | None:
-        """What a coarse search and a close look at some parts find; None if the whole image is to be searched."""
+        """Markers by a coarse search and a close look at some parts; None if the whole image has to be searched."""
         found, squares = self._coarse.find(image)
         missing, moved = _compare(known, found)
         if missing:
@@ -535,7 +535,7 @@ def _key(event: ImageEvent) -> bytes:
 
 
 def _read(path: Path) -> dict[bytes, Detections]:
-    """What a file holds; nothing if there is none, or none that can be read."""
+    """Detections of a file by image; empty if there is no file, or none that can be read."""
     try:
         with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
             keys, counts, ids, corners = (file[name] for name in ("keys", "counts", "ids", "corners"))
@@ -566,7 +566,7 @@ _SCANNED = 200
 
 
 def image_hints(recording: Any, detector: MarkerDetector) -> tuple[tuple[str, ...], str | None]:
-    """One sentence for each thing that would explain it: another dictionary, mirrored images, inverted prints.
+    """Hints on why no marker is found, a sentence each: another dictionary, mirrored images, inverted prints.
 
     Returns:
         The sentences; and the dictionary, if it is another one.

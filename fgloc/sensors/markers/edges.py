@@ -43,7 +43,7 @@ def detector_parameters(windows: tuple[int, int, int], smallest: float = SMALLES
 
 
 def pairs(ids: MatLike | None, corners: Sequence[MatLike]) -> Found:
-    """Id with corners of each marker."""
+    """Pairs of id and corners ``(4, 2)``, one for each marker."""
     if ids is None:
         return []
     return [(int(i), np.asarray(c, dtype=np.float64).reshape(4, 2)) for i, c in zip(ids.ravel(), corners, strict=True)]
@@ -55,7 +55,7 @@ def inside(corners: FloatArray, point: FloatArray) -> bool:
 
 
 def in_order(found: Found) -> Found:
-    """By id, then from the left."""
+    """Markers sorted by id, then from the left."""
     return sorted(found, key=lambda f: (f[0], *f[1].mean(axis=0)))
 
 

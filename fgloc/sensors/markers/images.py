@@ -30,12 +30,12 @@ class ImageEvent(RawEvent):
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height; None of a compressed image."""
+        """Width and height of the image; None if it is compressed."""
         return None if self.compressed else (self.width, self.height)
 
     @property
     def empty(self) -> bool:
-        """Whether it has no pixels."""
+        """Whether the image has no data."""
         return len(self.data) == 0
 
     def decoded_size(self) -> tuple[int, int] | None:
@@ -54,7 +54,7 @@ class MarkerCorners(Sighting):
     corners_px: FloatArray  # (4, 2) u, v in the recorded (distorted) image
 
     def noisy(self, sigmas: Mapping[str, float], rng: np.random.Generator) -> Sighting:
-        """On each coordinate of each corner."""
+        """Marker with Gaussian noise on each coordinate of its corners."""
         if not (sigma := sigmas["corner_px"]):
             return self
         return replace(self, corners_px=self.corners_px + rng.normal(0.0, sigma, self.corners_px.shape))

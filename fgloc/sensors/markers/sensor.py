@@ -41,7 +41,7 @@ _OPENCV_SHIFT_PX = -0.5
 
 
 def from_image(m: Any, when: When) -> Event:
-    """From ``sensor_msgs/Image``."""
+    """Event of a ``sensor_msgs/Image``."""
     data = byte_array(m.data)
     return ImageEvent(
         *when, m.header.frame_id, m.encoding, False, m.width, m.height, m.step, bool(m.is_bigendian), data
@@ -49,12 +49,12 @@ def from_image(m: Any, when: When) -> Event:
 
 
 def from_compressed_image(m: Any, when: When) -> Event:
-    """From ``sensor_msgs/CompressedImage``."""
+    """Event of a ``sensor_msgs/CompressedImage``."""
     return ImageEvent(*when, m.header.frame_id, m.format, True, 0, 0, 0, False, byte_array(m.data))
 
 
 def from_apriltags(m: Any, when: When) -> Event:
-    """From ``apriltag_msgs/AprilTagDetectionArray``."""
+    """Event of a ``apriltag_msgs/AprilTagDetectionArray``."""
     sightings = []
     for tag in m.detections:
         corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_OPENCV_ORDER)] + _OPENCV_SHIFT_PX
@@ -104,7 +104,7 @@ def judge_corners(corners_px: FloatArray, min_side_px: float) -> str:
 
 
 class MarkersInput(EventInput):
-    """What a camera sees."""
+    """Methods that make the events of a camera: images, or corners of markers."""
 
     def image(self, stamp_ns: int, image: NDArray[np.uint8] | bytes, frame_id: str = SENSOR) -> None:
         """An image: grey ``(h, w)``, colour ``(h, w, 3)`` in OpenCV's order (blue first), or encoded (JPEG, PNG).
@@ -179,7 +179,7 @@ class Darkness(EventFailure):
         return (ImageEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Darken, add noise, round."""
+        """Return the function that darkens an image, adds noise and rounds."""
 
         def darken(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
             noise = scene.rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.noise)
@@ -199,7 +199,7 @@ class MirroredImage(EventFailure):
         return (ImageEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Flip."""
+        """Return the function that flips an image."""
         return _on_pixels(lambda image: image[:, ::-1])
 
 
@@ -214,7 +214,7 @@ class FrameRate(EventFailure):
         return (RawEvent, SightingsEvent)
 
     def begin(self, scene: Scene) -> Change:
-        """Drop what follows the last one too soon (5 % of jitter is let through)."""
+        """Return the function that drops what follows the last message too soon (5 % of jitter is let through)."""
         last_ns: dict[str, int] = {}
         period_ns = 0.95e9 / self.max_hz
 
@@ -228,7 +228,7 @@ class FrameRate(EventFailure):
 
 
 def _on_pixels(work: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Change:
-    """Decode, change, and pass on uncompressed; what cannot be decoded stays as it is."""
+    """Return the function that changes a decoded image; an image that cannot be decoded stays as it is."""
 
     def change(event: Event) -> Event | None:
         assert isinstance(event, ImageEvent)
@@ -255,7 +255,7 @@ class CornerMeasurer:
         self._pinhole = None if context.camera is None else pinhole(context.camera)
 
     def __call__(self, event: CornersEvent) -> Iterator[LandmarkSighting]:
-        """Those of one message."""
+        """Measurements of one message."""
         if self._context.camera is None or self._pinhole is None:
             raise CameraError(
                 f"{event.topic}: marker corners, but no calibration; record sensor_msgs/CameraInfo or set camera.file"
@@ -295,7 +295,7 @@ class CornerMeasurer:
     def _single_view(
         self, event: CornersEvent, seen: MarkerCorners, camera: Camera, landmark: Landmark | None
     ) -> LandmarkSighting | None:
-        """What one view of a marker with no known place gives, with the covariance that its corners give."""
+        """Planar pose, or range and bearing, from one view of a marker that the map does not have as a square."""
         size = self._context.config.markers.default_size_m
         if size is None and landmark is None:
             raise ConfigError(
@@ -325,7 +325,7 @@ class CornerMeasurer:
 
 
 def _area(corners: FloatArray) -> float:
-    """Of a quadrilateral ``(4, 2)``."""
+    """Area [px²] of a quadrilateral ``(4, 2)``."""
     (ax, ay), (bx, by) = corners[2] - corners[0], corners[3] - corners[1]
     return 0.5 * abs(float(ax * by - ay * bx))
 

@@ -1,4 +1,4 @@
-"""What robots report of their wheels: events, their messages, and which of them can be used."""
+"""Events of wheels: odometry and joint states, their messages, and the checks of which parts can be used."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class OdometryEvent(MotionEvent):
 
     @property
     def odometer(self) -> OdometerPose | None:
-        """Its planar part."""
+        """Planar part of the odometry."""
         pose = np.array([self.position[0], self.position[1], quaternion_yaw(self.orientation)])
         return OdometerPose(self.frame_id, pose, np.array([*self.linear[:2], self.angular[2]]))
 
@@ -69,7 +69,7 @@ class JointsEvent(MotionEvent):
 
 
 def from_odometry(m: Any, when: When) -> Event:
-    """From ``nav_msgs/Odometry``."""
+    """Event of a ``nav_msgs/Odometry``."""
     return OdometryEvent(
         *when,
         m.header.frame_id,
@@ -84,7 +84,7 @@ def from_odometry(m: Any, when: When) -> Event:
 
 
 def from_joints(m: Any, when: When) -> Event:
-    """From ``sensor_msgs/JointState``."""
+    """Event of a ``sensor_msgs/JointState``."""
     return JointsEvent(*when, tuple(m.name), vector(m.position), vector(m.velocity), vector(m.effort))
 
 
@@ -172,13 +172,13 @@ _MOVED_M = 0.1  # a pose that moved further did move
 
 
 class OdometryChecks:
-    """Pose, twist and covariances against each other and against the gate's bounds."""
+    """Checks of a topic of odometry: pose, twist and covariances against each other and the gate's bounds."""
 
     def __init__(self) -> None:
         self._rows = Table(12)
 
     def add(self, event: Event) -> None:
-        """Take in one event."""
+        """Add one event."""
         assert isinstance(event, OdometryEvent)
         self._rows.add(
             *event.position[:2],
@@ -191,7 +191,7 @@ class OdometryChecks:
         )
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
-        """What is wrong."""
+        """Faults that were found, one sentence each."""
         rows = self._rows.array()
         found = []
         finite = finite_rows(rows[:, :9])
@@ -246,7 +246,7 @@ class OdometryChecks:
 
 
 class WheelsInput(EventInput):
-    """What wheels report."""
+    """Methods that make the events of wheels: odometry and joint states."""
 
     def odometry(
         self,

@@ -44,7 +44,7 @@ class WheelFailure(Failure):
 
     @abstractmethod
     def distort(self, scene: Scene) -> Distort:
-        """Reported motion of the wheels, with the state of one run."""
+        """Return the function that changes the reported speeds of the wheels, with the state of one run."""
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The corrupted events, in order of receive time."""
@@ -99,7 +99,7 @@ class WheelSlip(WheelFailure):
     )
 
     def distort(self, scene: Scene) -> Distort:
-        """Add the motion."""
+        """Return the function that adds the motion to the wheels' speeds."""
         half = 0.5 * (scene.config.wheels.track or self.track_m)
         added = np.array([self.speed - half * self.yaw_rate, self.speed + half * self.yaw_rate])
         shapes: dict[str, Callable[[float], float]] = {
@@ -118,7 +118,7 @@ class EncoderDead(WheelFailure):
     wheel: Literal["left", "right", "both"] = "both"
 
     def distort(self, scene: Scene) -> Distort:
-        """Zero the speed."""
+        """Return the function that sets the speed of the dead encoders to zero."""
         alive = {"left": [0.0, 1.0], "right": [1.0, 0.0], "both": [0.0, 0.0]}[self.wheel]
         return lambda roll: np.asarray(roll.speeds * alive)
 
@@ -130,7 +130,7 @@ class EncoderQuantized(WheelFailure):
     tick_m: float = Field(0.01, gt=0, description="m")
 
     def distort(self, scene: Scene) -> Distort:
-        """Round down the distance since the start, and give its difference."""
+        """Return the function that rounds the distance since the start down to whole ticks."""
         totals: dict[str, FloatArray] = {}
         ticks: dict[str, FloatArray] = {}
 
@@ -152,7 +152,7 @@ class WheelScaleDrift(WheelFailure):
     right_per_min: float = Field(0.01, description="share per minute")
 
     def distort(self, scene: Scene) -> Distort:
-        """Scale by the time."""
+        """Return the function that scales the speeds by the time since the recording's start."""
         rate = np.array([self.left_per_min, self.right_per_min])
         return lambda roll: np.asarray(roll.speeds * (1.0 + rate * roll.seconds / 60.0))
 
@@ -290,7 +290,7 @@ class EncoderRollover(EventFailure):
         return (JointsEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Wrap the angles."""
+        """Return the function that wraps the angles."""
 
         def wrap(event: Event) -> Event:
             assert isinstance(event, JointsEvent)
@@ -335,7 +335,7 @@ class WheelNan(EventFailure):
         return (OdometryEvent, JointsEvent)
 
     def begin(self, scene: Scene) -> Change:
-        """Fill with NaN."""
+        """Return the function that fills pose and twist, angles and rates with NaN."""
 
         def corrupt(event: Event) -> Event:
             pose = ("position", "orientation", "linear", "angular")
@@ -357,7 +357,7 @@ class WrongCovariance(EventFailure):
         return (OdometryEvent,)
 
     def begin(self, scene: Scene) -> Change:
-        """Multiply."""
+        """Return the function that multiplies the covariances."""
 
         def scale(event: Event) -> Event:
             assert isinstance(event, OdometryEvent)
@@ -367,7 +367,7 @@ class WrongCovariance(EventFailure):
 
 
 def carried(carriage: Carriage) -> Callable[[Event], Event]:
-    """Wheels in the air stand or spin, and go on from there afterwards.
+    """Return the function that lets wheels in the air stand or spin, and continues from there on the floor.
 
     Raises:
         ValueError: as `_rate`.
@@ -391,7 +391,7 @@ class JoinedWheels:
         self._last: FloatArray | None = None  # as reported
 
     def __call__(self, event: Event, shift: int) -> Event:
-        """The event as if nothing had been cut out before it; ``shift`` is how much was [ns]."""
+        """Event as if nothing had been cut out before it; ``shift`` is the length of what was cut out [ns]."""
         assert isinstance(event, JointsEvent | OdometryEvent)
         angles = isinstance(event, JointsEvent)
         now = event.position if isinstance(event, JointsEvent) else _pose(event)
@@ -417,7 +417,7 @@ def _told(event: JointsEvent | OdometryEvent, now: FloatArray) -> JointsEvent | 
 
 
 def _rate(carriage: Carriage) -> float:
-    """Rate of the wheels [rad/s] at this speed of their rims [m/s].
+    """Rate of the wheels [rad/s] in the air, from the speed of their rims.
 
     Raises:
         ValueError: the wheels spin and the configuration has no radius.
@@ -439,7 +439,7 @@ class _Held:
         self._last_ns = 0
 
     def tell(self, event: JointsEvent | OdometryEvent, lifted: bool) -> JointsEvent | OdometryEvent:
-        """The event as the wheels in the air, or on the floor again, would make it."""
+        """Event as the wheels in the air, or on the floor again, would report it."""
         angles = isinstance(event, JointsEvent)
         now = event.position if isinstance(event, JointsEvent) else _pose(event)
         dt = (event.stamp_ns - self._last_ns) * 1e-9

@@ -28,13 +28,13 @@ _LEAST_S = 0.1  # a shorter step has as large a quantization
 
 
 def is_standing(motion: FloatArray, seconds: float) -> bool:
-    """Whether a motion ``(3,)`` that wheels measured over a step of this length is none."""
+    """Whether a motion ``(3,)`` that wheels measured over a step of this length [s] counts as standing still."""
     x, y, yaw = motion
     return bool(max(math.hypot(x, y), abs(yaw)) < _QUANTIZATION * max(seconds, _LEAST_S))
 
 
 class Standing:
-    """Whether wheels have stood, step by step or, as encoders jitter between two ticks, over a second."""
+    """Detects wheels that stand, by single steps or, as encoders jitter between two ticks, over a second."""
 
     def __init__(self) -> None:
         self._steps: deque[tuple[float, FloatArray]] = deque()
@@ -66,7 +66,7 @@ class Standing:
 
 
 def commanded_to_move(step: Step) -> bool | None:
-    """Whether a command of the step, or of the second before it, is not to stand; None: there is none."""
+    """Whether a command of the step, or of the second before it, is not zero; None if there is none."""
     since = step.start_ns - _COMMANDED_NS
     recent = [c.v != 0.0 or c.omega != 0.0 for c in step.controls if c.stamp_ns >= since]
     return any(recent) if recent else None
@@ -77,7 +77,7 @@ OF_CLOCK = ("wheels.time_offset_s", "wheels.delay_s")
 
 
 def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
-    """With their priors. Without a gyro theirs is the clock that others are compared to."""
+    """Parameters of the wheels with their priors; without a gyro, other clocks are compared to that of the wheels."""
     wheels = config.wheels
     return (
         Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn"), lengthens=True),
@@ -95,7 +95,7 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
 
 
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
-    """Rows of ``metrics.json``."""
+    """Rows of ``metrics.json`` on the wheels."""
     wheels = config.wheels
     unequal = (
         FoundRow("wheels.radius_ratio", "wheels.yaw_per_m", 1.0, -wheels.track)
@@ -113,7 +113,7 @@ def _found_rows(config: Config) -> tuple[FoundRow, ...]:
 
 
 def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
-    """Lines of ``robot.yaml``."""
+    """Settings of the wheels, as a run has estimated them."""
     wheels = config.wheels
     longer, turn = 1.0 + state.value("wheels.radius"), 1.0 - state.value("wheels.track")
     pull = (turn * longer * wheels.yaw_per_m + state.value("wheels.yaw_per_m")) / longer
@@ -149,7 +149,7 @@ def derivatives(m: MotionMeasurement, change: FloatArray | None, config: WheelsC
 
 
 def _by_slowdown(m: MotionMeasurement, rho_x: float, phi: float, config: WheelsConfig) -> FloatArray:
-    """By ``slowdown``: it takes from the speed by the turning that is reported."""
+    """Derivative ``(3,)`` of a motion by ``slowdown``, which lowers the speed by the reported turning."""
     seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
     commanded = abs(phi) / seconds / config.scale_omega
     return np.array([-commanded * rho_x / max(1.0 - config.slowdown * commanded, _SLOWEST), 0.0, 0.0])
@@ -229,7 +229,7 @@ class WheelMotion:
 
     @property
     def rejections(self) -> Counter[str]:
-        """What could not be used so far, by reason."""
+        """Number of readings and steps that could not be used so far, by reason."""
         counts = Counter({"wheels.silence": self._unknown_steps} if self._unknown_steps else {})
         for track in self._all:
             counts.update(track.rejections)
@@ -237,7 +237,7 @@ class WheelMotion:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
+        """Notes for the user so far, one sentence each."""
         of_tracks = [note for track in self._all for note in track.notes.values()]
         explained = any(track.kind == self._chosen and "source" in track.notes for track in self._all)
         notes = [f"wheel motion comes from {_NAMES[self._chosen]}"] if self._chosen and not explained else []
@@ -250,7 +250,7 @@ class WheelMotion:
 
     @property
     def track_m(self) -> float | None:
-        """Distance of the wheels [m], by which left is told from right; None: not known."""
+        """Distance between the wheels [m], as configured; None: not known."""
         return self._config.track
 
     def measure(self, step: Step) -> MotionMeasurement | None:
@@ -296,7 +296,7 @@ class WheelMotion:
         return se2.inverse(motion), np.asarray(ad @ cov @ ad.T)
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
-        """Of the base ``(3,)`` [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
+        """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
         motion, _ = self.motion_between(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
         return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
 
@@ -307,7 +307,7 @@ class WheelMotion:
         wanted: Container[str] = (),
         rates: tuple[float, FloatArray] | None = None,
     ) -> dict[str, FloatArray]:
-        """Of a step's motion by what the wheels are off by.
+        """Derivatives ``(3,)`` of a step's motion by the parameters of the wheels.
 
         Args:
             step: its events.

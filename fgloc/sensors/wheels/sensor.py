@@ -308,7 +308,7 @@ FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), _firs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupMistake:
-    """What an excerpt of a recording shows to be wrong with the odometer's settings.
+    """Mistake in the odometer's settings, as an excerpt of a recording shows it.
 
     Attributes:
         kind: ``radius``, ``track``, ``odometry_frame``, ``exchanged``, ``reversed`` or ``both_reversed``.
@@ -324,7 +324,7 @@ class SetupMistake:
 
 
 def correct(mistake: SetupMistake, config: Config) -> RawMistake:
-    """What to tell the user of a mistake, and to set."""
+    """Sentence for the user on a mistake, and the settings that correct it."""
     wheels = config.wheels
     match mistake.kind:
         case "track":
@@ -363,7 +363,7 @@ def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
 
 
 def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    """Left and right exchanged, or forward and backward."""
+    """Sentence on wheels with left and right, or forward and backward, exchanged, and the settings that correct it."""
     if mistake.source == "ticks" and mistake.kind == "exchanged" and wheels.left_joint and wheels.right_joint:
         sentence = (
             "The left and the right wheel are exchanged: set wheels.left_joint: "
@@ -391,7 +391,7 @@ _WHOLE_TURN = 0.02  # share by which a range may be off one turn to be taken as 
 
 
 def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
-    """What the messages show to be wrong with the settings."""
+    """Mistakes in the settings that the messages show: wheel angles that roll over."""
     rolled = roll_over(motion, config)
     if rolled is None:
         return ()
@@ -403,7 +403,7 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:
-    """After how much the wheels' angles roll over [rad], and how often they did; None: they do not.
+    """Angle [rad] after which the wheels' angles roll over, and how often they did; None: they do not.
 
     Args:
         motion: events in order of receipt, among them joint states.

@@ -105,7 +105,7 @@ class TwistTimeline:
                 self._bridged = {start: means for start, means in self._bridged.items() if start >= self._starts[0]}
 
     def hold(self, twist: Twist, end_ns: int) -> None:
-        """What is taken to hold beyond the last piece, until ``end_ns``."""
+        """Set the twist that is assumed beyond the last piece, until ``end_ns``."""
         self._tail = twist
         self._tail_end = max(end_ns, self._end)
 
@@ -255,7 +255,7 @@ class Track:
                 self._take(event)
 
     def reset(self) -> None:
-        """A new segment: nothing before is connected with what comes."""
+        """Begin a new segment, which is not connected with what came before."""
         self.timeline = TwistTimeline()
         self._last_ns = None
         self._forget()
@@ -267,7 +267,7 @@ class Track:
         raise NotImplementedError
 
     def _true(self, twist: Twist) -> Twist:
-        """What the robot did when it reports this."""
+        """Twist of the robot for a reported one: small speeds set to zero, configured gains and slowdown applied."""
         vx, vy, w = twist
         config = self._config
         if math.hypot(vx, vy) < config.zero_speed:
@@ -290,7 +290,7 @@ class Track:
             self.timeline.extend(stamp_ns, None)
 
     def _reach(self, stamp_ns: int, held: Twist | None) -> None:
-        """This was the newest reading; ``held`` is taken to hold beyond it."""
+        """Set the stamp of the newest reading; ``held`` is assumed beyond it."""
         self._last_ns = stamp_ns
         if held is not None:
             self.timeline.hold(self._true(held), stamp_ns + self._hold_ns)
