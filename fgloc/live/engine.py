@@ -24,7 +24,7 @@ from fgloc.types import Camera, Estimate, Event, Finding, LandmarkMap, Mode, Raw
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """How one topic comes in."""
+    """Statistics of one topic as it is received."""
 
     role: str
     count: int
@@ -34,7 +34,7 @@ class TopicStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveStatus:
-    """A live run at one time."""
+    """State of a live run at one time."""
 
     running: bool = False  # its parts are built; before that it waits for what `waiting_for` names
     mode: Mode | None = None  # of the last keyframe; None: no pose yet
@@ -57,7 +57,7 @@ class LiveStatus:
 
 
 class State(Enum):
-    """Of a queued event."""
+    """State of a queued event."""
 
     WAITING = "an image whose markers are not looked for yet"
     DETECTING = "an image that the worker has"
@@ -106,7 +106,7 @@ class DetectionWorker:
 
     @property
     def queued(self) -> int:
-        """Images that wait."""
+        """Number of images that wait."""
         return len(self._images)
 
     def arrived(self, image: Queued) -> None:
@@ -118,14 +118,14 @@ class DetectionWorker:
             self.discard(waiting[0])
 
     def discard(self, image: Queued) -> None:
-        """An image is of no use any more, or was used. Hold the condition."""
+        """Remove an image that was used or is of no use any more. Hold the condition."""
         if image.state is not State.DETECTING:
             image.event, image.state = None, State.GONE
         if image in self._images:
             self._images.remove(image)
 
     def submit(self, image: Queued) -> None:
-        """Have an image's markers found. Hold the condition."""
+        """Pass an image to the worker, which finds its markers. Hold the condition."""
         self._todo.append(image)
         self._changed.notify_all()
 
@@ -183,7 +183,7 @@ _UNFOUND = (State.WAITING, State.DETECTING)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Settings:
-    """Of a live run, as `Live` has them. Can be pickled."""
+    """Settings of a live run, as `Live` has them. Can be pickled."""
 
     config: Config
     landmark_map: LandmarkMap | None
@@ -256,14 +256,14 @@ class Estimation:
             self._changed.notify_all()
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Until everything queued has been used; False if it was not in time."""
+        """Wait until everything queued has been used; False if it was not in time."""
         with self._changed:
             done = self._changed.wait_for(lambda: self._idle() or self._failed is not None, timeout_s)
             self.check_failed()
             return done
 
     def status(self) -> LiveStatus:
-        """How it fares, but for what is known of topics where they are received."""
+        """State of the run, but for the statistics of topics, which `Live` adds."""
         run, worker = self.run, self._worker
         with self._busy:
             newest, rejections, findings = run.newest, run.rejections, run.findings()
@@ -289,7 +289,7 @@ class Estimation:
             )
 
     def save(self, path: Path) -> bool:
-        """As `Live.save`."""
+        """Save the state now; False while there is none to save."""
         with self._busy:
             snapshot = self.run.snapshot()
         if snapshot is not None:
@@ -297,7 +297,7 @@ class Estimation:
         return snapshot is not None
 
     def close(self) -> None:
-        """Use what is queued, but for images, save the state, and end the threads; as `Live.close`."""
+        """Use what is queued, but for images, save the state, and end the threads; see `Live.close`."""
         with self._changed:
             closed, self._closing = self._closing, True
             self._changed.notify_all()
@@ -308,7 +308,7 @@ class Estimation:
             self.save(self._state)
 
     def check_failed(self) -> None:
-        """Raises: FglocError: what ended the estimation thread."""
+        """Raise the `FglocError` that ended the estimation thread, if there is one."""
         if self._failed is not None:
             raise self._failed
 
@@ -345,7 +345,7 @@ class Estimation:
             self._outlet.failed(failure)
 
     def _next_batch(self) -> list[Queued | PoseWithCovariance] | None:
-        """What has come in, possibly nothing when only an image is done; None at the end."""
+        """Wait for new items, and return them: none if only an image is done; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._inbox or self._image_done())
             if self._worker.error is not None:
@@ -389,7 +389,7 @@ class Estimation:
         self._outlet.built(self.run.anchors.parts)
 
     def _refuse(self, item: Queued, event: Event) -> None:
-        """An event of another topic than the one that plays its role."""
+        """Drop an event of another topic than the one that plays its role, with a note."""
         role = role_name(event)
         with self._changed:
             if not self.run.facts.is_configured(event):

@@ -47,7 +47,7 @@ from fgloc.types import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionParts:
-    """Of a run: what its motion sources are made of. Can be pickled."""
+    """Parts of a run from which its motion sources are built. Can be pickled."""
 
     config: Config
     installation: Installation  # the parameters that motions may depend on
@@ -74,18 +74,18 @@ class Anchor:
 
 
 class Outlet(Protocol):
-    """Takes what a live run finds; called in its estimation thread."""
+    """Receiver of the results of a live run; called in its estimation thread."""
 
     def built(self, parts: MotionParts) -> None:
-        """The parts of the run have been built, perhaps not for the first time."""
+        """Handle that the parts of the run have been built, perhaps not for the first time."""
         ...
 
     def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
-        """A keyframe has been estimated."""
+        """Handle the estimate of a keyframe."""
         ...
 
     def failed(self, error: FglocError) -> None:
-        """The run cannot go on."""
+        """Handle that the run cannot go on."""
         ...
 
 
@@ -114,7 +114,7 @@ class Anchors:
         )
 
     def make(self, step: Step, estimate: Estimate) -> Anchor:
-        """The anchor of the estimate that the run's last step led to."""
+        """Anchor of the estimate that the run's last step led to."""
         localizer = self._run.localizer
         estimator, installation = localizer.estimator, localizer.factors
         frame = estimator.log.keyframes.get(estimator.k)
@@ -166,7 +166,7 @@ _Events = Mapping[type[MotionEvent], Sequence[MotionEvent]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Means:
-    """What all anchors of one building of the parts are propagated by."""
+    """Parts by which all anchors are propagated until the parts of the run are built again."""
 
     joint: JointCalibration | None
     model: Any
@@ -190,7 +190,7 @@ class _Held:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LivePose:
-    """``T_map_base`` at any time: of the last keyframe at or before it, propagated by the motion sources."""
+    """Pose ``T_map_base`` at a time, propagated by the motion sources from the last keyframe at or before it."""
 
     stamp_ns: int
     pose: FloatArray  # (3,)
@@ -207,7 +207,7 @@ class Extrapolator:
     """
 
     def __init__(self, config: Config) -> None:
-        """Nothing is known before `begin` and the first anchor."""
+        """Start without parts, anchors and events."""
         self._lock = threading.Lock()  # of what is kept
         self._asked = threading.Lock()  # of what carries on
         self._config = config
@@ -221,7 +221,7 @@ class Extrapolator:
         self._newest_ns = 0
 
     def begin(self, parts: MotionParts) -> None:
-        """The parts of the run have been built, or built again: the next anchor is the first of them."""
+        """Use newly built parts of the run; earlier anchors are forgotten."""
         model = copy.deepcopy(parts.model)  # it writes into buffers of its own
         with self._lock:
             self._kept_ns = max(self._history_ns, _BEFORE_NS, parts.signals_back_ns)
@@ -231,7 +231,7 @@ class Extrapolator:
             self._anchors.clear()
 
     def add(self, event: MotionEvent) -> None:
-        """Take in a motion event that passed the gate."""
+        """Add a motion event that passed the gate."""
         with self._lock:
             for verdict, judged in self._clock.judge(event):
                 if verdict is ClockVerdict.OUTLIER:
@@ -249,7 +249,7 @@ class Extrapolator:
                 del events[: _MOST_EVENTS // 2]
 
     def anchor(self, anchor: Anchor) -> None:
-        """Propagate from here."""
+        """Propagate from this anchor from now on."""
         with self._lock:
             assert self._means is not None
             if anchor.segment != self._segment:
@@ -262,7 +262,7 @@ class Extrapolator:
                 del events[: max(bisect_right(events, self._anchors[0].stamp_ns - self._kept_ns, key=_stamp) - 1, 0)]
 
     def pose_at(self, stamp_ns: int | None) -> LivePose | None:
-        """The pose at a time; None: of the newest motion event. None is returned while no pose is known then."""
+        """Pose at a time (None: at that of the newest motion event); None while no pose is known then."""
         with self._lock:
             if not self._anchors:
                 return None
@@ -284,7 +284,7 @@ class Extrapolator:
         return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns, ground)
 
     def _step(self, anchor: Anchor, end_ns: int) -> Step:
-        """All motion events from a while before the anchor to the first one after the end."""
+        """Step from the anchor to a time, with motion events from a while before it to the first one after its end."""
         start_ns = anchor.stamp_ns
         return Step(
             0,
@@ -295,20 +295,20 @@ class Extrapolator:
         )
 
     def _past(self, held: _Held) -> _Events:
-        """What the learned motion has read of measured signals up to the anchor."""
+        """Events of the measured signals that the learned motion reads before the anchor, by class."""
         back_ns = held.means.signals_back_ns
         if not back_ns:
             return {}
         return {kind: self._window(kind, held.stamp_ns - back_ns, held.stamp_ns) for kind in self._events}
 
     def _back_ns(self, kind: type[MotionEvent]) -> int:
-        """How far before a step its events are of use: those of an inertial unit are integrated from end to end."""
+        """Time before a step [ns] for which events of a class are used; 0 for the IMU's, integrated from end to end."""
         if issubclass(kind, ControlEvent):
             return self._history_ns
         return 0 if issubclass(kind, InertialEvent) else _BEFORE_NS
 
     def _window(self, kind: type[MotionEvent], start_ns: int, end_ns: int) -> tuple[MotionEvent, ...]:
-        """In order of stamp: events inside, the last one at or before the start, the first one at or after the end."""
+        """Events inside in order of stamp, with the last one up to the start and the first one from the end on."""
         events = self._events[kind]
         first = max(bisect_right(events, start_ns, key=_stamp) - 1, 0)
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
@@ -338,7 +338,7 @@ class Extrapolator:
 
 
 def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: MotionSources) -> NoiseBudget:
-    """Without wheels that contradict the learned motion: a slip that began after the keyframe.
+    """Noise budget without the wheels if they contradict the learned motion: a slip that began after the keyframe.
 
     The test that flags slips (`MotionFaults`) sees whole steps only.
     """
@@ -359,7 +359,7 @@ def _stamp(event: Event) -> int:
 
 
 def _piece(step: Step, start_ns: int, end_ns: int) -> Step:
-    """A part of a step with all of its events but those of the IMU, which are integrated from end to end."""
+    """Part of a step with all of its events but those of the IMU, which are integrated from end to end."""
     if (start_ns, end_ns) == (step.start_ns, step.stamp_ns):
         return step
     motion = dict(step.motion)

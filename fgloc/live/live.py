@@ -49,7 +49,7 @@ class _TopicMeter:
     """
 
     def __init__(self, role: str) -> None:
-        """Nothing has come yet."""
+        """Start without messages."""
         self._role = role
         self._count = 0
         self.last_ns = 0
@@ -57,7 +57,7 @@ class _TopicMeter:
         self._delay_s = 0.0
 
     def add(self, stamp_ns: int, received_ns: int) -> None:
-        """Take in one message."""
+        """Add one message."""
         delay = (received_ns - stamp_ns) * 1e-9
         if self._count:
             interval = max(received_ns - self.last_ns, 0) * 1e-9
@@ -71,24 +71,24 @@ class _TopicMeter:
 
     @property
     def is_regular(self) -> bool:
-        """Whether it comes often enough to be missed."""
+        """Whether messages come so often that a silence is worth a note."""
         return self._role != "tf" and self._count > 2 and self._interval_s < _REGULAR_S
 
     def status(self) -> TopicStatus:
-        """As it is now."""
+        """Statistics of the topic up to now."""
         rate = 1.0 / self._interval_s if self._interval_s > 0.0 else 0.0
         return TopicStatus(self._role, self._count, rate, self._delay_s)
 
 
 @dataclass(slots=True)
 class _Publisher:
-    """Whose messages of a topic are used."""
+    """The publisher whose messages of a topic are used."""
 
     name: str
     received_ns: int
 
     def has_the_topic(self, name: str, received_ns: int) -> bool:
-        """Whether a message is of that publisher, or of one that takes its place."""
+        """Whether a message is of that publisher, or of one that replaces it after a silence."""
         if name != self.name and received_ns - self.received_ns < _SUCCESSION_NS:
             return False
         self.name, self.received_ns = name, received_ns
@@ -96,14 +96,14 @@ class _Publisher:
 
 
 class Reception:
-    """Takes every event as it arrives; used under the lock of its owner.
+    """Receives every event as it arrives; used under the lock of its owner.
 
     Attributes:
         dropped: events that are not used whatever is in them, by role.
     """
 
     def __init__(self, config: Config) -> None:
-        """Nothing has arrived."""
+        """Start without events."""
         self._selection = LiveFacts(config, None, None)
         self._gate = EventValidator(reported_bounds(config))
         self.dropped: Counter[str] = Counter()
@@ -113,7 +113,7 @@ class Reception:
         self._notes: dict[str, None] = {}  # an ordered set
 
     def receive(self, event: Event, publisher: str) -> list[Event]:
-        """The events that are to be used now: mostly this one; see `TopicClocks`."""
+        """Events that are to be used now: mostly this one; see `TopicClocks`."""
         role = role_name(event)
         if not isinstance(event, TransformEvent) and not self._is_of_its_publisher(event, publisher):
             self.dropped[role] += 1
@@ -132,23 +132,23 @@ class Reception:
         return first.has_the_topic(publisher, event.received_ns)
 
     def motion(self, event: Event) -> MotionEvent | None:
-        """An event that was received, if it is of the motion source to be used, and as the gate lets it through."""
+        """Event, as the gate lets it through, if it is of the motion source to be used; else None."""
         if not isinstance(event, MotionEvent) or not self._selection.topic_is_used(event):
             return None
         passed = self._gate.check(event)
         return passed if isinstance(passed, MotionEvent) else None
 
     def note(self, text: str) -> None:
-        """Remember a sentence for the user."""
+        """Add a note for the user."""
         self._notes.setdefault(text)
 
     def topics(self) -> Mapping[str, TopicStatus]:
-        """How each topic comes in."""
+        """Statistics of each topic, by topic."""
         return {topic: meter.status() for topic, meter in sorted(self._meters.items())}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know so far, one sentence each."""
+        """Notes for the user so far, one sentence each."""
         newest = max((meter.last_ns for meter in self._meters.values()), default=0)
         gaps = [
             f"{topic}: no message for {(newest - meter.last_ns) * 1e-9:.0f} s"
@@ -258,7 +258,7 @@ class Live(registry.SensorInput):
         self._estimation.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
-        """Have a function called with every keyframe's estimate, in the thread that has it: it should be quick.
+        """Call a function with every keyframe's estimate, in the thread that has it: it should be quick.
 
         One that raises is not called again; `status` says so.
         """
@@ -275,14 +275,14 @@ class Live(registry.SensorInput):
         model: str = "plumb_bob",
         frame_id: str = SENSOR,
     ) -> None:
-        """The camera's calibration ``(3, 3)``, ``(n,)``; see `fgloc.types.Camera` for the models. Told once."""
+        """Push the camera's calibration, once: K ``(3, 3)`` and D ``(n,)``; see `fgloc.types.Camera` for the models."""
         now = time.time_ns()
         arrays: tuple[Any, Any] = np.asarray(K, dtype=float).reshape(3, 3), np.asarray(D, dtype=float).ravel()
         topic = self._recording.topics.camera_info or "camera_info"
         self._deliver(CameraInfoEvent(now, now, topic, frame_id, width, height, model, *arrays))
 
     def transform(self, parent: str, child: str, translation: ArrayLike, rotation: ArrayLike) -> None:
-        """A fixed transform ``T_parent_child``: translation ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
+        """Push a fixed transform ``T_parent_child``: translation ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
         now = time.time_ns()
         t: FloatArray = np.asarray(translation, dtype=float)
         q: FloatArray = np.asarray(rotation, dtype=float)
@@ -316,7 +316,7 @@ class Live(registry.SensorInput):
         return self._results.poses.pose_at(stamp_ns)
 
     def status(self) -> LiveStatus:
-        """How the run fares."""
+        """State of the run."""
         status = self._estimation.status()
         with self._lock:
             topics, notes = self._reception.topics(), self._reception.notes
@@ -360,7 +360,7 @@ def _begun(process: bool | EstimationProcess, settings: Settings, results: _Resu
 
 
 class _Results:
-    """What the estimation found: poses to be asked for, and callbacks.
+    """Results of the estimation: poses at any time, and callbacks.
 
     Attributes:
         poses: at any time.
@@ -374,7 +374,7 @@ class _Results:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each."""
+        """Notes for the user, one sentence each."""
         with self._lock:
             return tuple(self._notes)
 
@@ -386,7 +386,7 @@ class _Results:
         self.poses.begin(parts)
 
     def failed(self, error: FglocError) -> None:
-        """The next call raises it."""
+        """Do nothing: the next call raises the error."""
 
     def estimated(self, anchor: Anchor, estimate: Estimate) -> None:
         self.poses.anchor(anchor)

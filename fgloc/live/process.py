@@ -82,11 +82,11 @@ class EstimationProcess:
 
     @property
     def ready(self) -> bool:
-        """Whether it has been started up: a run that begins now loses no time."""
+        """Whether the process has started up, so that a run that begins now loses no time."""
         return bool(self._connection.poll())
 
     def begin(self, settings: Settings, outlet: Outlet) -> None:
-        """Set up the run; otherwise as `Estimation`."""
+        """Set up the run; the arguments are those of `Estimation`."""
         self._most_images = settings.config.live.image_queue
         self._connection.send(settings)
         for name, work in (("send", self._send), ("receive", lambda: self._receive(outlet))):
@@ -95,7 +95,7 @@ class EstimationProcess:
             self._threads.append(thread)
 
     def put(self, events: Iterable[Event]) -> None:
-        """As `Estimation.put`."""
+        """Queue events; see `Estimation.put`."""
         with self._changed:
             for event in events:
                 self._queue(event)
@@ -107,21 +107,21 @@ class EstimationProcess:
                     self._drop(next(e for e in self._waiting if isinstance(e, Event)))
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
-        """As `Estimation.reset_pose`."""
+        """Queue a pose to go on from; see `Estimation.reset_pose`."""
         with self._changed:
             self._queue(belief)
 
     def check_failed(self) -> None:
-        """As `Estimation.check_failed`."""
+        """Raise the error that ended the run, if there is one; see `Estimation.check_failed`."""
         if self._failed is not None:
             raise self._failed
 
     def wait(self, timeout_s: float | None) -> bool:
-        """As `Estimation.wait`."""
+        """Wait until everything queued has been used; see `Estimation.wait`."""
         return bool(self._ask("wait", timeout_s).result())
 
     def status(self) -> LiveStatus:
-        """As `Estimation.status`; what is known already if the process is busy or has ended."""
+        """State of the run, see `Estimation.status`; the last known one if the process is busy or has ended."""
         notes: tuple[str, ...] = ()
         if not self._closing and self._failed is None:
             with suppress(TimeoutError, FglocError):
@@ -134,11 +134,11 @@ class EstimationProcess:
         return replace(self._status, dropped=dropped, notes=notes + self._status.notes)
 
     def save(self, path: Path) -> bool:
-        """As `Estimation.save`."""
+        """Save the state now; see `Estimation.save`."""
         return bool(self._ask("save", path).result())
 
     def close(self) -> None:
-        """As `Estimation.close`; ends the process too."""
+        """End the run and the process; see `Estimation.close`."""
         with self._changed:
             if self._closing:
                 return
@@ -178,7 +178,7 @@ class EstimationProcess:
         self._dropped[role_name(event)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:
-        """Its answer comes after all that what was put before has led to."""
+        """Call a method in the process; its answer comes after the results of everything queued before."""
         with self._changed:
             number, answer = next(self._numbers), Future[Any]()
             self._queue((number, method, arguments))
@@ -260,7 +260,7 @@ _ANSWERING = 4  # threads that answer questions
 
 
 def main() -> None:
-    """Of the child process: do what comes through the pipe."""
+    """Run the child process: serve what comes through the pipe."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager ends the parent too, which ends this one in order
     _Worker(Connection(int(sys.argv[1]))).run()
 
@@ -282,7 +282,7 @@ class _Worker:
         self._tell("failed", error)
 
     def run(self) -> None:
-        """Until the parent has what it asked of the end, or has ended itself: then nothing is left to do."""
+        """Serve the parent until the answer to `close` is sent, or the parent has ended."""
         gc.freeze()  # what was imported stays: nothing is to be collected there
         try:
             self._tell("ready")
@@ -296,7 +296,7 @@ class _Worker:
             self._tell("failed", unexpected(error, "the live run"))  # the settings cannot be used
 
     def _use(self, estimation: Estimation, pool: ThreadPoolExecutor, batch: Iterable[Any]) -> None:
-        """In order."""
+        """Pass a batch on in its order."""
         for is_event, items in groupby(batch, lambda item: isinstance(item, Event)):
             with suppress(FglocError):  # it has failed, and has told so
                 if is_event:

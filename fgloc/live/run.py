@@ -68,7 +68,7 @@ _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
 
 
 class LiveFacts:
-    """What has come in so far, as `fgloc.sensor_setup.StreamFacts` has it.
+    """Facts of the stream so far, see `fgloc.sensor_setup.StreamFacts`.
 
     A role counts as there once everything is known that its sensor is built from: for images and marker corners, the
     calibration and the mounting of the camera too.
@@ -109,20 +109,20 @@ class LiveFacts:
 
     @property
     def first(self) -> Mapping[type[Event], Event]:
-        """The first event of each kind whose role is there."""
+        """First event of each class whose role is there."""
         return {kind: event for kind, event in self._seen.items() if self.is_there(event)}
 
     def is_there(self, event: Event) -> bool:
-        """Whether all is known that is needed to use an event."""
+        """Whether everything is known that is needed to use an event."""
         role = role_of(event)
         return role is None or role in _NOT_BUILT_FROM or role in self.roles
 
     def is_news(self, event: Event) -> bool:
-        """Whether the event may tell what the run is not yet built from."""
+        """Whether the event may hold facts that the run is not yet built from."""
         return self._incomplete or type(event) not in self._seen
 
     def note(self, event: Event) -> bool:
-        """Take in an event; whether a role is there now that was not before."""
+        """Add an event to the facts; whether a role is there now that was not before."""
         if isinstance(event, TransformEvent):
             self._add_transform(event)
         else:
@@ -139,7 +139,7 @@ class LiveFacts:
         return len(self.roles) > before
 
     def waiting_for(self) -> tuple[str, ...]:
-        """What is missing, a phrase each."""
+        """Missing parts of the stream, a phrase each."""
         missing = []
         for role in role_names():
             if role in self.roles or role in _NOT_BUILT_FROM:
@@ -167,13 +167,13 @@ class LiveFacts:
 
     @property
     def frames(self) -> FrameTree:
-        """All transforms so far."""
+        """Tree of all transforms so far."""
         if self._frames is None:
             self._frames = FrameTree(t for same in self._transforms.values() for t in same)
         return self._frames
 
     def _missing(self, role: Role) -> str:
-        """What the sensor of a role cannot be built without; "" if it is all there."""
+        """Missing part without which the sensor of a role cannot be built; "" if nothing is missing."""
         in_pixels = role == "sightings" and any(
             e.in_pixels for e in self._seen.values() if isinstance(e, SightingsEvent)
         )
@@ -223,7 +223,7 @@ class OnlineRun:
     def __init__(
         self, config: Config, landmark_map: LandmarkMap | None, facts: LiveFacts, resumed: RunState | None = None
     ) -> None:
-        """Nothing has come in.
+        """Start without events.
 
         Args:
             config: all settings.
@@ -266,11 +266,11 @@ class OnlineRun:
         return parts
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:
-        """Go on from this pose at the next step."""
+        """Restart at this pose at the next step."""
         self._reset, self._resumed = belief, None
 
     def check(self, event: Event) -> Event | None:
-        """Through the gate: the event, a repaired copy, or None."""
+        """Event as the gate lets it through, perhaps a repaired copy, or None."""
         assert self.parts is not None
         passed = self.parts.gate.check(event)
         in_pixels = isinstance(event, SightingsEvent) and event.in_pixels
@@ -280,7 +280,7 @@ class OnlineRun:
         return passed
 
     def use(self, event: Event, detected: bool = False) -> Iterator[tuple[Step, Estimate | None]]:
-        """Take the next event in order; ``detected``: markers found in an image that has passed the gate."""
+        """Use the next event in order; ``detected``: markers found in an image that has passed the gate."""
         assert self.parts is not None
         if detected and isinstance(event, SightingsEvent):
             passed = self.parts.detections.check(event)
@@ -296,7 +296,7 @@ class OnlineRun:
             self._diagnose(step)
 
     def finish(self) -> Iterator[tuple[Step, Estimate | None]]:
-        """The stream has ended: its last steps."""
+        """Use the last steps at the end of the stream."""
         if self.parts is not None:
             for step in self.parts.stepper.flush():
                 yield step, self._update(step)
@@ -323,19 +323,19 @@ class OnlineRun:
         return estimate
 
     def _diagnose(self, step: Step) -> None:
-        """After the estimate was handed out: whoever waits for it does not wait for this."""
+        """Diagnose a step after its estimate was passed on, so that nothing waits for the diagnosis."""
         assert self.parts is not None
         measured = self.parts.wheels.measure(step)
         motion = None if measured is None else measured.motion
         self.parts.diagnosis.observe(step, self.parts.localizer.motion.is_carried, motion)
 
     def anchor(self, step: Step, estimate: Estimate) -> Anchor:
-        """To propagate the newest estimate from; ask before the next event is used."""
+        """Anchor from which the newest estimate is propagated; ask before the next event is used."""
         assert self.anchors is not None
         return self.anchors.make(step, estimate)
 
     def _take_over(self, parts: Assembly, state: RunState) -> None:
-        """What an earlier run found, but for the pose, which waits for the first step."""
+        """Start from the state of an earlier run, but for its pose, which waits for the first step."""
         localizer, gyro = parts.localizer, parts.localizer.motion.sources.gyro
         known = installation_of_state(state, localizer.factors.installation)
         if known is not None:
@@ -347,7 +347,7 @@ class OnlineRun:
         self._fastest = state.fastest
 
     def snapshot(self) -> RunState | None:
-        """What is to be saved; None while no pose is known."""
+        """State to be saved; None while no pose is known."""
         parts, step, estimate = self.parts, self._last_step, self.newest
         if parts is None or step is None or estimate is None or estimate.mode is Mode.UNCONFIRMED:
             return None
@@ -380,11 +380,11 @@ class OnlineRun:
 
     @property
     def rejections(self) -> Counter[str]:
-        """Everything refused so far, by reason."""
+        """Number of rejected events and parts of them, by reason."""
         return self._past_rejections + (Counter() if self.parts is None else self.parts.rejections)
 
     def comparison(self) -> Callable[[], None] | None:
-        """A comparison of the signals so far, which takes a second or two and any thread may make; None: not due."""
+        """Function that compares the signals so far, takes a second or two and may run in any thread; None: not due."""
         return None if self.parts is None else self.parts.diagnosis.comparison()
 
     def findings(self) -> tuple[Finding, ...]:

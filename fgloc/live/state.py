@@ -28,7 +28,7 @@ Row3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class OdometryState(Section):
-    """The odometry's own pose at a time: while its frame goes on, it has measured the motion in between."""
+    """The odometry's own pose at a time, from which it measures the motion while its frame goes on."""
 
     topic: str
     frame_id: str
@@ -37,7 +37,7 @@ class OdometryState(Section):
 
 
 class InstallationState(Section):
-    """What was found of the installation."""
+    """Estimate of the installation: names, mean and covariance."""
 
     names: tuple[str, ...]
     mean: tuple[FiniteFloat, ...]
@@ -45,14 +45,14 @@ class InstallationState(Section):
 
 
 class GyroState(Section):
-    """The gyro's bias [rad/s], [rad²/s²]."""
+    """Bias of the gyro [rad/s] and its variance [rad²/s²]."""
 
     bias: FiniteFloat
     bias_variance: Annotated[FiniteFloat, Field(gt=0)]
 
 
 class RunState(Section):
-    """All that is saved."""
+    """State of a run, as it is saved."""
 
     format: Literal["fgloc-live-state"] = "fgloc-live-state"
     version: Literal[1] = 1
@@ -72,14 +72,14 @@ class RunState(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resumed:
-    """A state that was read, or why none was: one sentence."""
+    """State that was read, or one sentence on why none was."""
 
     state: RunState | None
     note: str
 
 
 def fingerprint(landmark_map: LandmarkMap | None) -> str:
-    """Tells maps apart: by their ids, places and sizes."""
+    """Hash of a map's ids, places and sizes, by which maps are told apart."""
     digest = hashlib.sha256()
     if landmark_map is not None:
         for i, landmark in sorted(landmark_map.landmarks.items()):
@@ -100,7 +100,7 @@ def write_state(path: Path, state: RunState) -> None:
 
 
 def read_state(path: Path, map_fingerprint: str) -> Resumed:
-    """What an earlier run left; a file that is damaged, or not of this map, is refused and the start is fresh."""
+    """Read the state of an earlier run; a file that is damaged, or of another map, is refused with a note."""
     if not path.exists():
         return Resumed(None, "")
     remedy = "it is not used, the start is fresh, and the file will be replaced"
@@ -124,7 +124,7 @@ def read_state(path: Path, map_fingerprint: str) -> Resumed:
 
 
 def installation_of_state(state: RunState, installation: Installation) -> InstallationEstimate | None:
-    """What was found, if the parameters are still the same; the ground is that of where the robot is now: not known."""
+    """Saved estimate of the installation, but for the ground; None if the parameters are not the same."""
     saved = state.installation
     if saved.names != installation.names or not saved.names:
         return None
@@ -148,7 +148,7 @@ def row3(values: FloatArray) -> Row3:
 
 
 def _problem(state: RunState) -> str:
-    """What cannot be computed with; "" if all is well."""
+    """Reason why a state cannot be used; "" if it can."""
     if not _is_cov(np.array(state.cov)):
         return f"the covariance of the pose is none: {state.cov}"
     n = len(state.installation.names)
@@ -184,7 +184,7 @@ _STAMP_S = 0.02  # how far the odometry's pose and the saved one may be apart in
 
 
 def odometry_state(event: MotionEvent) -> OdometryState | None:
-    """What is saved of a motion event; None if it gives no pose."""
+    """Pose of a motion event as it is saved; None if the event gives no pose."""
     told = event.odometer
     if told is None or not np.isfinite(told.pose).all():
         return None
@@ -192,7 +192,7 @@ def odometry_state(event: MotionEvent) -> OdometryState | None:
 
 
 def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> tuple[PoseWithCovariance | None, str]:
-    """The pose at the first step of a new run.
+    """Pose at the first step of a new run, from the state of the last one.
 
     Args:
         state: what the last run saved.
@@ -248,7 +248,7 @@ def _by_odometry(state: RunState, step: Step, gap_s: float) -> FloatArray | None
 
 
 def _odometry_cov(state: RunState, motion: FloatArray, gap_s: float, config: Config) -> FloatArray:
-    """Covariance ``(3, 3)`` of that motion: along a path that is as long as the speed before suggests, or the chord."""
+    """Covariance ``(3, 3)`` of the motion since the state was saved, by the longer of chord and expected path."""
     errors = config.wheels
     noise = errors.noise
     speed, turn = math.hypot(*state.twist[:2]), abs(state.twist[2])

@@ -139,21 +139,21 @@ class Teller:
     """Passes sentences on, but none again that differs from an earlier one in its figures only."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        """``tell`` is given one sentence at a time."""
+        """Take the function that is given one sentence at a time."""
         self._tell = tell
         self._told: set[str] = set()
         self._waiting = ""
         self._since_s = 0.0
 
     def tell(self, *sentences: str) -> None:
-        """What is to be known at once."""
+        """Pass sentences on at once."""
         for sentence in sentences:
             if (kind := _FIGURES.sub("", sentence)) not in self._told:
                 self._told.add(kind)
                 self._tell(sentence)
 
     def waiting(self, sentence: str) -> None:
-        """What is missing now; empty if nothing is. Told when it has been so for a while."""
+        """Set the sentence on what is missing now (empty: nothing), which is passed on if it holds for a while."""
         if sentence != self._waiting:
             self._waiting, self._since_s = sentence, time.monotonic()
         if sentence and time.monotonic() - self._since_s >= _PATIENCE_S:
@@ -225,7 +225,7 @@ class Node:
         self._process.close()
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
-        """As `Live.subscribe`; call it before `run`."""
+        """Call a function with every estimate, see `Live.subscribe`; to be called before `run`."""
         self._subscribers.append(callback)
 
     def run(self, stop: threading.Event, tell: Callable[[str], None]) -> None:
@@ -267,7 +267,7 @@ class Node:
                 publishing.join()
 
     def _start(self) -> None:
-        """The topics are known: whose first messages come soon belongs to the run from its beginning."""
+        """Begin the run as soon as the topics are known, so that their first messages belong to it."""
         roles = tuple(self.intake.roles)
         self.live = Live(self._config, self._landmarks, state=self._state, roles=roles, process=self._process)
         self._take_given(self.live)
@@ -321,7 +321,7 @@ class Node:
         return notes
 
     def _publish(self) -> None:
-        """At `RATE_HZ` until the end; a turn that comes too late is left out."""
+        """Publish at `RATE_HZ` until the end; a turn that comes too late is left out."""
         period_s = 1.0 / RATE_HZ
         due = time.monotonic()
         while not self._stopping.is_set():
@@ -362,7 +362,7 @@ class Node:
 
 
 def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
-    """A status as a message and its values, for diagnostics."""
+    """Status as a message and values for diagnostics."""
     if status is None:
         return "waiting for the robot's topics", {}
     values = {"keyframes": str(status.keyframes), "update [ms]": f"{status.step_ms:.1f}"}

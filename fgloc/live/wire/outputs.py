@@ -1,4 +1,4 @@
-"""What is published: Odometry, PoseWithCovarianceStamped, /tf, diagnostics, the map as markers, and what they need."""
+"""Outputs of ``fgloc live``: Odometry, PoseWithCovarianceStamped, /tf, diagnostics and the map as markers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fgloc.types import Estimate, Event, FloatArray, Ground, LandmarkMap, Mode, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdomPose:
-    """Where the base is in the odometry frame."""
+    """Pose of the base in the odometry frame."""
 
     stamp_ns: int
     frame: str
@@ -31,10 +31,10 @@ class OdomPose:
 
 
 class OdomFrame:
-    """Follows the robot's frames as its messages tell them."""
+    """Collects the robot's frames and its odometry from messages."""
 
     def __init__(self, config: RecordingConfig) -> None:
-        """Nothing has come yet."""
+        """Start without messages."""
         self._config = config
         self._lock = threading.Lock()
         self._frames: set[str] = set()
@@ -43,7 +43,7 @@ class OdomFrame:
         self._by_tf: OdomPose | None = None
 
     def add(self, event: Event) -> None:
-        """Take in any event."""
+        """Add an event of any kind."""
         if isinstance(event, MotionEvent):
             if (told := event.odometer) is None:
                 return
@@ -94,13 +94,13 @@ class RecentPoses:
     """
 
     def __init__(self, pose_at: Callable[[int], LivePose | None]) -> None:
-        """``pose_at``: of the live run."""
+        """Take the function that gives a pose of the live run at a time."""
         self._pose_at = pose_at
         self._poses: deque[LivePose] = deque()
         self._growth = np.zeros((3, 3))  # of the covariance, in the base's axes, by the motion: m²/s, rad²/s
 
     def add(self, now: LivePose) -> None:
-        """Take in the newest pose."""
+        """Add the newest pose."""
         if self._poses and now.keyframe_ns != self._poses[-1].keyframe_ns:
             self._correct(now.keyframe_ns)
         if self._poses and now.stamp_ns <= self._poses[-1].stamp_ns:  # the clock was set back
@@ -114,7 +114,7 @@ class RecentPoses:
             self._growth = (_body_cov(now) - ad @ _body_cov(first) @ ad.T) / seconds
 
     def twist(self) -> tuple[FloatArray, FloatArray]:
-        """``(3,)`` of the base in its own axes [m/s, m/s, rad/s], and its covariance ``(3, 3)``.
+        """Twist ``(3,)`` of the base in its own axes [m/s, m/s, rad/s], and its covariance ``(3, 3)``.
 
         The covariance is that of the motion over the span, by which the pose's has grown: errors of the motion sources
         are taken to be independent from moment to moment, as the estimator takes them.
@@ -128,7 +128,7 @@ class RecentPoses:
         return twist, axes @ np.diag(np.maximum(variances, _LEAST_VARIANCE)) @ axes.T
 
     def ahead(self, stamp_ns: int) -> LivePose | None:
-        """The newest pose, propagated by the speed of the last two to a time soon after; None if there is none."""
+        """Newest pose, propagated to a time soon after by the twist between the last two; None if it cannot be."""
         if len(self._poses) < 2 or not 0 < stamp_ns - self._poses[-1].stamp_ns <= _AHEAD_NS:
             return None
         before, last = self._poses[-2], self._poses[-1]
@@ -139,7 +139,7 @@ class RecentPoses:
         return replace(last, stamp_ns=stamp_ns, pose=pose, cov=se2.rotate_cov(cov, float(pose[2])))
 
     def at(self, stamp_ns: int) -> FloatArray | None:
-        """Pose ``(3,)`` at a time, if it is among these."""
+        """Pose ``(3,)`` at a time; None if it is outside of the poses that are kept."""
         if not self._poses[0].stamp_ns <= stamp_ns <= self._poses[-1].stamp_ns:
             return None
         stamps = np.array([p.stamp_ns for p in self._poses], dtype=np.int64)
@@ -176,7 +176,7 @@ def _body_cov(pose: LivePose) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BaseState:
-    """Where the base is and how it moves."""
+    """Pose and twist of the base at a time."""
 
     stamp_ns: int
     pose: FloatArray  # (3,) T_map_base

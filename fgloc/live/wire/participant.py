@@ -137,7 +137,7 @@ _domains_lock = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """A topic that someone else publishes."""
+    """Topic that another participant publishes."""
 
     topic: str
     message_type: str  # "pkg/msg/Name"
@@ -145,7 +145,7 @@ class Publication:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One message as it came in."""
+    """One message as it was received."""
 
     topic: str
     message_type: str
@@ -159,7 +159,7 @@ OnSample = Callable[[Sample], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reader:
-    """Of one topic, and whom its messages are delivered to."""
+    """Reader of one topic, with the function that its messages are delivered to."""
 
     reader: Any
     unread: Any  # the condition that it has unread messages
@@ -180,7 +180,7 @@ class Writer:
 
     @property
     def readers(self) -> int:
-        """How many readers there are."""
+        """Number of matched readers."""
         return len(self._writer.get_matched_subscriptions())
 
     def flush(self, timeout_s: float) -> None:
@@ -253,7 +253,7 @@ class Participant:
         del self._waiting, self._changed, self._found, self._participant, self._domain
 
     def publications(self) -> tuple[Publication, ...]:
-        """What others publish now, by name.
+        """Topics that others publish now, sorted by name.
 
         Raises:
             WireError: a message of a topic that is read could not be taken in.
@@ -342,7 +342,7 @@ class Participant:
             self._deliver()
 
     def _deliver(self) -> None:
-        """What waits in all readers, in the order of writing.
+        """Deliver the messages that wait in all readers, in the order of writing.
 
         Taken again until nothing more has come: a reader's newest message would else overtake older ones of readers
         that were looked at before it.
@@ -368,7 +368,7 @@ class Participant:
 
 
 def _loopback(domain: int) -> Domain:
-    """The domain's settings, which all its participants in this process share."""
+    """Settings of a loopback domain, which all its participants in this process share."""
     from cyclonedds.domain import Domain
 
     with _domains_lock:
@@ -389,7 +389,7 @@ class WireClock:
     """Follows /clock from its first message on."""
 
     def __init__(self, participant: Participant) -> None:
-        """Subscribe."""
+        """Subscribe to /clock."""
         self._messages = participant.messages
         self._lock = threading.Lock()
         self._simulated_ns: int | None = None
@@ -397,16 +397,16 @@ class WireClock:
 
     @property
     def simulated(self) -> bool:
-        """Whether there is a /clock."""
+        """Whether a message of /clock has been received."""
         return self._simulated_ns is not None
 
     def now_ns(self) -> int:
-        """The time. Simulation time stands still between messages, as in ROS."""
+        """Time now [ns]; simulation time stands still between messages, as in ROS."""
         with self._lock:
             return time.time_ns() if self._simulated_ns is None else self._simulated_ns
 
     def received_ns(self, sample: Sample) -> int:
-        """When a message came.
+        """Receive time of a message [ns].
 
         That is when it was written, which neither the network nor a busy processor delays, if its writer has our clock:
         simulation time (as `fgloc play` has it; other players and simulators write by the machine's clock), or the

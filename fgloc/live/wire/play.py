@@ -63,22 +63,22 @@ class Player:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each."""
+        """Notes for the user, one sentence each."""
         return (*self._storage.notes, *self._notes)
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Time from the first message to the last [s]."""
         start, end = self._storage.span_ns
         return (end - start) * 1e-9
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """What is published."""
+        """Topics that are published, sorted."""
         return tuple(sorted(topic for topic, _ in self._writers))
 
     def wait_for_readers(self, timeout_s: float, stop: threading.Event | None = None) -> bool:
-        """Wait until readers have come and no more come; meanwhile /clock stands at the start. Whether any came."""
+        """Wait until readers have come and no more come, and return whether they did; meanwhile /clock stands still."""
         stop = stop or threading.Event()
         began = changed = time.monotonic()
         known = 0
