@@ -1,1 +1,1 @@
-"""See CONTRIBUTING.md."""
+"""Events to steps: validation, clocks, and keyframes."""

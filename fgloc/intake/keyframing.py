@@ -315,7 +315,7 @@ class KeyframeBuilder:
     # --- steps out ---
 
     def _candidate(self) -> int | None:
-        """When the next keyframe is due; None if nothing calls for one."""
+        """Stamp at which the next keyframe is due [ns]; None if nothing calls for one."""
         last = self._last_ns
         if last is None:
             stamps = [buffer.stamps[0] for buffer in self._motion.values() if buffer.stamps]

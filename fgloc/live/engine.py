@@ -362,7 +362,7 @@ class Estimation:
         return done or self._worker.error is not None
 
     def _take(self, item: Queued | PoseWithCovariance) -> None:
-        """Take an event through the gate, or hold it until the parts are built."""
+        """Pass an event through the gate, or hold it until the parts are built."""
         if isinstance(item, PoseWithCovariance):
             return self.run.reset_pose(item)
         event, facts = item.event, self.run.facts

@@ -221,7 +221,7 @@ class Live(registry.SensorInput):
     # --- in ---
 
     def push(self, event: Event, publisher: str = "") -> tuple[Event, ...]:
-        """Take an event, in order of receipt. Never waits for estimation or detection.
+        """Push an event, in order of receipt; never waits for estimation or detection.
 
         Args:
             event: any that a recording has.

@@ -153,7 +153,7 @@ class LiveFacts:
         return tuple(missing)
 
     def complete(self, waited_s: float, patience_s: float) -> bool:
-        """Whether the parts of the run can be built: all that is expected is there, or was waited for long enough."""
+        """Whether the run can be built: a motion source is there, and all that is expected, or the wait is over."""
         if not _MOTION & set(self.roles):
             return False
         if self.expected is not None and self.expected <= set(self.roles):

@@ -297,7 +297,7 @@ class Messages:
 
     @classmethod
     def of_channel(cls, channel: Channel, ros1: bool) -> Messages:
-        """With the definitions that a recording embeds for one of its channels; those of ROS 1 as ROS 2 has them."""
+        """Message types by the definitions that a recording embeds for a channel; those of ROS 1 as ROS 2 has them."""
         store = Decoder(ros1, [(channel.message_type, channel.definition)]).store
         if ros1 and _HEADER in store.fielddefs:
             constants, fields = store.fielddefs[_HEADER]

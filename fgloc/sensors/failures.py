@@ -189,7 +189,7 @@ def by_receipt(events: Iterator[tuple[int, Event]]) -> Iterator[Event]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carriage:
-    """How a robot is carried: each sensor defines what it then measures (`BuiltIn.carried`).
+    """Intervals and manner in which a robot is carried; each sensor defines what it then measures (`BuiltIn.carried`).
 
     Attributes:
         intervals: from when until when it is in the air [s].

@@ -61,7 +61,7 @@ def from_aruco(m: Any, when: When) -> Event:
 
 
 def from_detections(m: Any, when: When) -> Event:
-    """From ``vision_msgs/Detection3DArray``.
+    """Event of a ``vision_msgs/Detection3DArray``.
 
     Things whose id holds no number are no markers; a message of nothing else is an error.
     """

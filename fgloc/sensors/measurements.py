@@ -32,7 +32,7 @@ _LEVEL = np.zeros(2)
 
 
 class Model(Enum):
-    """How residual and Jacobians of many measurements are computed in one call; see `fgloc.graph.observation`."""
+    """Form of the residual, by which many measurements are computed in one call; see `fgloc.graph.observation`."""
 
     CORNERS = "corners"  # of markers in an image
     PLANAR = "planar"  # of landmarks in the base's plane: points, or poses of markers

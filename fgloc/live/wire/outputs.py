@@ -204,7 +204,7 @@ class Outputs:
         }
 
     def readers(self, name: str) -> int:
-        """How many readers one of our own topics has: "odometry", "pose" or "map"."""
+        """Number of readers of one of fgloc's own topics: "odometry", "pose" or "map"."""
         return self._writers[OWN + name].readers
 
     def odometry(self, state: BaseState, base_frame: str) -> None:

@@ -81,7 +81,7 @@ class Lag(Section):
 
 
 class ErrorMemory(Section):
-    """How the errors of neighboring steps go together, axis by axis.
+    """Correlation of the errors of neighboring steps, axis by axis.
 
     The model's densities are those of long windows, because a chain of steps composes them as if independent. Of each
     density a share is slow, an Ornstein-Uhlenbeck rate: over a window shorter than its time constant less of it has

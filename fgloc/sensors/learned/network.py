@@ -226,7 +226,7 @@ MAX_GAIN = 0.95
 
 
 class JointCalibration:
-    """How the errors of wheel odometry (W) and of learned motion (N) go together.
+    """Correlation of the errors of wheel odometry (W) and of learned motion (N).
 
     Kept as the dimensionless ``R = L_n⁻¹ C L_w⁻ᵀ`` with the Cholesky factors of N and W, so that a calibration from
     long windows serves a step of any length and any predicted covariance: ``C = L_n R L_wᵀ`` of that step.
@@ -454,7 +454,7 @@ class NaiveModel:
         velocity: FloatArray | None,
         signals: Signals | None = None,
     ) -> MotionPrediction | None:
-        """See `MotionModel.predict`."""
+        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
         duration = duration_of(commands, start_ns, end_ns)
         track = self._track = follow(self._track, commands)
         n = sub_steps(duration, self.card.dt_s)
@@ -492,7 +492,7 @@ class VelocityModel:
         velocity: FloatArray | None,
         signals: Signals | None = None,
     ) -> MotionPrediction | None:
-        """See `MotionModel.predict`."""
+        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
         duration = duration_of(commands, start_ns, end_ns)
         track = self._track = follow(self._track, commands)
         start = (start_ns - track.origin_ns) * 1e-9
@@ -580,7 +580,7 @@ class DisplacementModel:
         velocity: FloatArray | None,
         signals: Signals | None = None,
     ) -> MotionPrediction | None:
-        """See `MotionModel.predict`."""
+        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
         duration = duration_of(commands, start_ns, end_ns)
         track = self._track = follow(self._track, commands)
         n = sub_steps(duration, self.card.dt_s)

@@ -172,7 +172,7 @@ def suggest(look: Callable[[str], tuple[list[int], int]]) -> str | None:
 
 
 def _evidence_bits(dictionary: cv2.aruco.Dictionary) -> float:
-    """How surprising it is [bits] that a random square reads as one of the markers."""
+    """Negative binary logarithm of the probability that a random square reads as one of the markers [bits]."""
     bits = int(dictionary.markerSize) ** 2
     wrong = int(0.6 * dictionary.maxCorrectionBits)  # OpenCV's default error correction rate
     accepted = sum(math.comb(bits, k) for k in range(wrong + 1))

@@ -234,7 +234,7 @@ class Codes:
         self._samples = np.array([[x.ravel(), y.ravel(), np.ones(x.size)] for x, y in grids]).swapaxes(0, 1)
 
     def read(self, image: GrayImage, squares: FloatArray) -> list[tuple[int, int, int]]:
-        """Which squares are markers: index, id, and by how many places their corners are to be rolled.
+        """Squares that are markers: their indices, ids, and the places by which their corners are to be rolled.
 
         Args:
             image: gray levels.

@@ -432,7 +432,7 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
 
 
 def _jumps(angles: FloatArray) -> list[float]:
-    """By how much [rad] each jump differs from the steps beside it."""
+    """Difference [rad] of each jump from the steps beside it."""
     steps = np.diff(angles)
     if len(steps) < 3:
         return []

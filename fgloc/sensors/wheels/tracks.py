@@ -60,7 +60,7 @@ class TwistTimeline:
 
     @property
     def start_ns(self) -> int | None:
-        """When the timeline begins; None if it holds nothing."""
+        """Stamp at which the timeline begins [ns]; None if it holds nothing."""
         return self._starts[0] if self._starts else None
 
     def begin(self, stamp_ns: int) -> None:
@@ -373,7 +373,7 @@ class OdometryTrack(Track):
         self._reach(event.stamp_ns, (self._mode == "twist" and twist) or self._moving or twist)
 
     def _connect(self, seconds: float, pose: Pose | None, twist: Twist | None) -> Twist | None:
-        """The twist between the last message and this one; None if neither twists nor poses tell."""
+        """Twist between the last message and this one; None if neither twists nor poses give it."""
         both = self._twist is not None and twist is not None
         mean = mean_twist(self._twist, twist) if seconds <= self._config.hold_s else None
         moved = self._between_poses(pose, mean, seconds)
@@ -553,7 +553,7 @@ class TicksTrack(Track):
         self._reach(event.stamp_ns, self._moving)
 
     def _turned(self, angles: tuple[float, float] | None, seconds: float) -> Twist | None:
-        """The twist that turned the wheels from the last message's angles to these; None if they cannot tell."""
+        """Twist that turned the wheels from the last message's angles to these; None if the angles do not give it."""
         if angles is None or self._angles is None or seconds > MAX_GAP_S:
             return None
         left, right = angles[0] - self._angles[0], angles[1] - self._angles[1]
