@@ -120,13 +120,13 @@ class MessageWriter:
 
 
 def xyz_fields(values: Sequence[float]) -> dict[str, float]:
-    """Fields of a vector or point."""
+    """Fields x, y, z of a message's vector or point."""
     x, y, z = (float(value) for value in values)
     return {"x": x, "y": y, "z": z}
 
 
 def flat_cov(cov: ArrayLike | None) -> Any:
-    """A covariance ``(6, 6)`` as messages have it; zeros for None."""
+    """Covariance ``(6, 6)`` as an array ``(36,)`` of a message; zeros for None."""
     return np.zeros(36) if cov is None else np.asarray(cov, dtype=float).reshape(36)
 
 

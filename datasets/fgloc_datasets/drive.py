@@ -108,7 +108,7 @@ def convert(
 
 
 def robot_settings() -> dict[str, Any]:
-    """The contents of ``robot.yaml``."""
+    """Content of ``robot.yaml``."""
     return {
         "recording": {
             "topics": {"command": "/cmd_vel", "joints": "/joint_states", "imu": "/imu", "truth": "/truth"},
@@ -136,7 +136,7 @@ def robot_settings() -> dict[str, Any]:
 
 
 def _read(source: Path) -> dict[str, FloatArray]:
-    """Columns by name."""
+    """Columns of the CSV file by name, ordered by window and row."""
     try:
         with source.open(encoding="utf-8", newline="") as file:
             names = next(csv.reader(file), [])
@@ -160,7 +160,7 @@ def _stamps(table: dict[str, FloatArray]) -> IntArray:
 
 
 def _starts(table: dict[str, FloatArray]) -> IntArray:
-    """Rows with which windows begin."""
+    """Indices of the rows with which windows begin."""
     return np.flatnonzero(np.diff(table["window"], prepend=-1.0))
 
 

@@ -201,7 +201,7 @@ def frames(run: Run) -> Iterator[slice]:
 
 
 def robot_settings(c: Calibration) -> dict[str, Any]:
-    """The contents of ``robot.yaml``."""
+    """Content of ``robot.yaml``."""
     noise = {name: getattr(c, name) for name in Calibration.__dataclass_fields__ if "_per_sqrt_" in name}
     return {
         "recording": {
@@ -492,7 +492,7 @@ def _relative(poses: FloatArray, begin: IntArray, end: IntArray) -> FloatArray:
 
 
 def _densities(errors: FloatArray, basis: FloatArray) -> FloatArray:
-    """Densities ``(7,)`` under which the errors are likeliest (Gaussian), weakly drawn to 0.02 where nothing tells."""
+    """Densities ``(7,)`` under which Gaussian errors are likeliest, weakly drawn to 0.02 where the errors show none."""
 
     def cost(log_density: FloatArray) -> float:
         cov = np.tensordot(np.exp(2.0 * log_density), basis, 1) + 1e-10 * np.eye(3)

@@ -162,7 +162,7 @@ def _pairs(stamps_ns: IntArray, ids: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _place(odometry: Trajectory, at_ns: IntArray, points: FloatArray, q: FloatArray) -> FloatArray:
-    """Landmarks in the odometry frame ``(n, 2)``."""
+    """Positions ``(n, 2)`` [m] of sighted landmarks in the odometry frame."""
     x, y, yaw, scale, latency = q
     in_base = _turned(scale * points, yaw) + np.array([x, y])
     pose = _poses(odometry, at_ns - int(latency * 1e9))
@@ -170,7 +170,7 @@ def _place(odometry: Trajectory, at_ns: IntArray, points: FloatArray, q: FloatAr
 
 
 def _base(body: FloatArray, q: FloatArray) -> FloatArray:
-    """``T_map_base`` of ``T_map_body`` ``(n, 3)`` for a body at q in the base."""
+    """Poses ``T_map_base`` ``(n, 3)`` from ``T_map_body`` ``(n, 3)``, for a body at q in the base."""
     x, y, yaw = q
     heading = body[:, 2] - yaw
     return np.column_stack([body[:, :2] - _turned(np.tile([x, y], (len(body), 1)), heading), heading])
@@ -277,7 +277,7 @@ def date_bursts(received_ns: IntArray) -> IntArray:
 
 
 def robot_settings(mounting: Mounting, body: Body) -> dict[str, Any]:
-    """The contents of ``robot.yaml``."""
+    """Content of ``robot.yaml``."""
     return {
         "recording": {
             "topics": _TOPICS,

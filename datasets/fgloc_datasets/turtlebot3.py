@@ -67,7 +67,7 @@ def convert(source: Path, out: Path, storage: str = "mcap", landmarks: Path | No
 
 
 def robot_settings(topics: set[str]) -> dict[str, Any]:
-    """The contents of ``robot.yaml`` for a recording with these topics."""
+    """Content of ``robot.yaml`` for a recording with these topics."""
     roles = {role: topic for role, topic in _ROLES.items() if topic in topics}
     recording: dict[str, Any] = {"topics": {**roles, "truth": "none"}, "base_frame": "base_footprint"}
     if "sightings" in roles:
@@ -96,7 +96,7 @@ def robot_settings(topics: set[str]) -> dict[str, Any]:
 def convert_and_tell(
     source: Path, out: Path, storage: str, landmarks: Path | None
 ) -> tuple[Path, Counter[str], list[str]]:
-    """As `convert`; also what was left out, by topic and type, and notes on the map."""
+    """Convert a recording, see `convert`; return also what was left out, by topic and type, and notes on the map."""
     beside = source.parent / _MAP_FILE
     if landmarks is None and source.name == _MAPPED_BAG and beside.is_file():
         landmarks = beside

@@ -40,7 +40,7 @@ class RenderError(FglocError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """When an image is taken (the middle of the exposure) and how; known before the robot is there."""
+    """Time (the middle of the exposure) and settings of an image, known before the robot is there."""
 
     stamp_s: float
     exposure_s: float
@@ -51,7 +51,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One image and when it was taken (the middle of the exposure)."""
+    """One image and its time (the middle of the exposure)."""
 
     stamp_s: float
     exposure_s: float
@@ -164,7 +164,7 @@ def exposures(scene: Scene, log: Log) -> Iterator[Exposure]:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """When the shutter opens and what the automatic exposure has set."""
+    """Opening time of the shutter, and the settings of the automatic exposure."""
 
     start_s: float
     exposure_s: float
@@ -234,7 +234,7 @@ def _sense(image: NDArray[np.float32], noise: float, gain: float, rng: np.random
 
 
 def occluded(scene: Scene) -> list[tuple[set[int], float, float]]:
-    """Marker ids, start and end of each occlusion."""
+    """Ids of the occluded markers, start and end [s] of each occlusion."""
     rng = channel_rng(scene.seed, "occlusions")
     ids = np.array(list(scene.landmarks.landmarks))
     out = []
@@ -257,7 +257,7 @@ class CornerDetector:
     """Finds markers in shots, in order."""
 
     def __init__(self, scene: Scene, log: Log) -> None:
-        """Take the markers where they hang."""
+        """Take the markers at their true places."""
         camera = scene.scenario.camera
         assert camera is not None
         self._log, self._camera = log, camera

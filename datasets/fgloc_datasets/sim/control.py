@@ -62,7 +62,7 @@ def make_function(kind: ControlKind, robot: Robot, length_s: float, rng: np.rand
 
 
 class Driver:
-    """What the robot is told at each time; it turns the robot back before walls.
+    """Commands of the robot over time; near walls it is turned back.
 
     The control function is open loop. Near a wall, and only while heading for it, the driver takes over, turns towards
     the middle of the room and gives back control: the recorded commands are those that were sent.

@@ -41,7 +41,7 @@ _EPOCH_S = EPOCH_NS // 1_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Channels:
-    """What is drawn of a bag; times in seconds from its start."""
+    """Signals of a bag that are drawn; times in seconds from its start."""
 
     truth: FloatArray  # (n, 4) t, x, y, yaw
     odometry: FloatArray  # (n, 3) t, x, y
@@ -152,7 +152,7 @@ def _slip(c: _Channels) -> Figure:
 
 
 def _true_twist(c: _Channels) -> FloatArray:
-    """``(n, 2)``: forward speed and yaw rate, from differences of the true poses."""
+    """Forward speed [m/s] and yaw rate [rad/s] ``(n, 2)``, from differences of the true poses."""
     seconds, yaw = c.truth[:, 0], np.unwrap(c.truth[:, 3])
     vx, vy = (np.gradient(c.truth[:, i], seconds) for i in (1, 2))
     return np.column_stack([np.cos(yaw) * vx + np.sin(yaw) * vy, np.gradient(yaw, seconds)])

@@ -33,18 +33,18 @@ class MountedCamera(Section):
 
     @property
     def matrix(self) -> FloatArray:
-        """K ``(3, 3)``."""
+        """Camera matrix K ``(3, 3)``."""
         f, (cx, cy) = self.focal_px, self.principal_px
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
 
     @property
     def rotation(self) -> FloatArray:
-        """``(3, 3)`` R_base_cam of the optical frame."""
+        """Rotation R_base_cam ``(3, 3)`` of the optical frame."""
         return optical_rotation(self.rpy)
 
 
 class TrueCamera(MountedCamera):
-    """The camera and its clock."""
+    """True mounting and lens of the camera, and the offset of its clock."""
 
     time_offset_s: float = 0.0  # stamp minus the middle of the exposure, on average
 
@@ -58,13 +58,13 @@ class Wheels(Section):
 
 
 class TrueWheels(Wheels):
-    """The wheels and their clock."""
+    """True radii and track of the wheels, and the offset of their clock."""
 
     time_offset_s: float = 0.0  # stamp minus the time of the reading
 
 
 class TrueImu(Section):
-    """What the IMU measures: ``gyro_scale`` times the rates in axes turned by ``rpy`` [rad] in the base frame."""
+    """True IMU: it measures ``gyro_scale`` times the rates, in axes turned by ``rpy`` [rad] in the base frame."""
 
     rpy: Vector3 = (0.0, 0.0, 0.0)
     gyro_scale: float = 1.0
@@ -72,7 +72,7 @@ class TrueImu(Section):
 
 
 class Marker(Section):
-    """A marker where it hangs."""
+    """True place of a marker."""
 
     id: int
     position: Vector3  # m
@@ -81,12 +81,12 @@ class Marker(Section):
 
 
 class TrueMap(Section):
-    """All markers where they hang."""
+    """True places of all markers."""
 
     landmarks: tuple[Marker, ...]
 
     def landmark_map(self) -> LandmarkMap:
-        """The same as a map, without a dictionary."""
+        """The true places as a map, without a dictionary."""
         return LandmarkMap(
             {
                 m.id: Landmark(m.id, np.array(m.position), quaternion_matrix(m.quaternion), m.size)
@@ -96,7 +96,7 @@ class TrueMap(Section):
 
 
 class Believed(Section):
-    """What was written in camera_info, tf_static and robot.yaml."""
+    """Installation as camera_info, tf_static and robot.yaml have it."""
 
     camera: MountedCamera | None
     wheels: Wheels
@@ -172,7 +172,7 @@ def survey(installation: Installation | None, seed: int, landmarks: LandmarkMap)
 
 
 def camera_jitter_s(installation: Installation | None, seed: int, n: int) -> FloatArray:
-    """By how much the stamps ``(n,)`` of images are late beyond the constant offset [s]."""
+    """Delay ``(n,)`` [s] of the images' stamps beyond the constant offset."""
     return _normal(seed, installation or Installation(), "camera_jitter_s", n)
 
 

@@ -51,7 +51,7 @@ class Log:
     ticks: int
 
     def part(self, rows: slice) -> Log:
-        """Some rows; the commands are all there."""
+        """Some rows of the log, with all commands."""
         parts = {name: getattr(self, name)[rows] for name in _PER_TICK}
         return Log(**parts, commands=self.commands, ticks=len(parts["stamps_s"]))
 
@@ -69,7 +69,7 @@ _PER_TICK = (
 
 
 class Controller(Protocol):
-    """What drives the robot."""
+    """Source of the robot's commands."""
 
     def command(self, t: float, pose: tuple[float, float, float]) -> Command | None:
         """Command at time t [s], asked in order of time; the true pose is x, y [m], yaw [rad]. None ends the run."""
@@ -77,7 +77,7 @@ class Controller(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a scenario and a seed make: model, ground, markers, and how all was installed."""
+    """Simulated world of a scenario and a seed: model, ground, markers, and the installation."""
 
     scenario: Scenario  # its robot with the radii and track that it really has
     seed: int

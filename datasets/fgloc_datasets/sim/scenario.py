@@ -151,7 +151,7 @@ class Installation(Section):
 
     @classmethod
     def as_installed(cls) -> Installation:
-        """What a careful person leaves: tape measure and spirit level, checkerboard, data sheet, no common clock.
+        """Errors of a careful installation: tape measure and spirit level, checkerboard, data sheet, no common clock.
 
         A checkerboard seldom reaches the image's corners: k1 and k2 stay uncertain by some thousandths. 0.005 of each
         is 0.15 px half way to the corner of a camera of 640 x 480 at 525 px, where boards were seen, and 1.3 px in it.

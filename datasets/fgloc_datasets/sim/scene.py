@@ -64,7 +64,7 @@ def make_map(world: World, seed: int) -> LandmarkMap:
 
 
 def _facing(yaw_deg: float, elevation_deg: float, roll_deg: float) -> FloatArray:
-    """``(3, 3)`` of a marker whose normal has this yaw and elevation, turned about it."""
+    """Rotation ``(3, 3)`` of a marker whose normal has this yaw and elevation, turned about it."""
     turn = rpy_matrix(0.0, -math.radians(elevation_deg), math.radians(yaw_deg))
     upright = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its right, up and normal, facing x
     return np.asarray(turn @ upright @ rpy_matrix(0.0, 0.0, math.radians(roll_deg)))
@@ -222,18 +222,18 @@ _CASTER_RADIUS_M = 0.02
 
 
 def wheel_names(robot: Robot) -> tuple[str, ...]:
-    """Joint names, left and right in turn."""
+    """Joint names of the wheels, left and right in turn."""
     ends = ("",) if robot.kind == "diff_drive" else ("front_", "rear_")
     return tuple(f"{end}{side}_wheel_joint" for end in ends for side in ("left", "right"))
 
 
 def camera_rotation(camera: Camera) -> FloatArray:
-    """``(3, 3)`` R_base_cam of the optical frame."""
+    """Rotation R_base_cam ``(3, 3)`` of the optical frame."""
     return optical_rotation(np.radians(camera.rpy_deg))
 
 
 def optical_rotation(rpy: Sequence[float] | FloatArray) -> FloatArray:
-    """``(3, 3)`` rotation of the optical frame whose forward looking body axes are turned by roll, pitch, yaw [rad]."""
+    """Rotation ``(3, 3)`` of an optical frame whose forward looking body axes are turned by roll, pitch, yaw [rad]."""
     return np.asarray(rpy_matrix(*rpy) @ OPTICAL_TO_BODY)
 
 
@@ -250,7 +250,7 @@ def render_size(camera: Camera) -> tuple[int, int, float]:
 
 
 def intrinsics(camera: Camera) -> FloatArray:
-    """K ``(3, 3)``; the middle of the first pixel is (0, 0)."""
+    """Camera matrix K ``(3, 3)``; the middle of the first pixel is (0, 0)."""
     f = camera.focal_px
     return np.array([[f, 0.0, camera.width / 2 - 0.5], [0.0, f, camera.height / 2 - 0.5], [0.0, 0.0, 1.0]])
 

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 class Rows(Generic[T]):
-    """Message by message, in order: from a finished log all are computed at once, else those that can be."""
+    """Values of messages in order, computed in blocks as far as the log reaches."""
 
     def __init__(self, log: Log, ticks: IntArray, make: Callable[[int, int], T]) -> None:
         """Compute nothing yet.
@@ -74,7 +74,7 @@ _GRAVITY = np.array([0.0, 0.0, 9.81])
 def odometry(
     log: Log, robot: Robot, every: int, messages: slice = slice(0, None), before: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """What the robot's driver makes of its encoders every ``every`` ticks.
+    """Odometry of the robot's driver, computed from the encoders every ``every`` ticks.
 
     Args:
         log: of the run.
@@ -238,13 +238,13 @@ def geodetic(enu: FloatArray, origin: tuple[float, float, float]) -> FloatArray:
 
 
 def _fix_ticks(log: Log, rate_hz: float) -> IntArray:
-    """Rows of the log at a rate."""
+    """Rows ``(n,)`` of the log at a rate [Hz]."""
     wanted = np.arange(log.stamps_s[0] + 1.0 / rate_hz, log.stamps_s[-1], 1.0 / rate_hz)
     return np.asarray(np.unique(np.searchsorted(log.stamps_s, wanted).clip(max=len(log.stamps_s) - 1)))
 
 
 def _points(log: Log, ticks: IntArray, offset: tuple[float, float, float]) -> FloatArray:
-    """Places ``(n, 3)`` in the map of a point of the base."""
+    """Positions ``(n, 3)`` [m] in the map of a point of the base."""
     turned = np.array([quaternion_matrix(q) @ np.array(offset) for q in log.quaternions[ticks]])
     return np.asarray(log.positions[ticks] + turned)
 
@@ -438,7 +438,7 @@ def _fixes(scene: Scene, gnss: Gnss, log: Log, bag: BagWriter) -> Iterator[Messa
 
 
 def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
-    """What the installer believes of where camera and IMU are: the IMU is level."""
+    """Static transforms of camera and IMU, as the installer believes them: the IMU is level."""
     camera = scene.installed.believed.camera
     assert camera is not None
     mounted = {
@@ -453,7 +453,7 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
 
 
 def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
-    """Images and what is believed of their lens."""
+    """Messages of images, each with the believed calibration of the camera."""
     camera = scene.scenario.camera
     assert camera is not None
     quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
@@ -470,7 +470,7 @@ def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
 
 def _corners(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
-    """The corners that a detector finds in the images, and what is believed of their lens; nothing is rendered."""
+    """Messages of corners that a detector finds without rendering, each with the believed calibration of the camera."""
     detector, arrive = CornerDetector(scene, log), _Arrival(scene, log)
     for shot in shots(scene, log):
         stamp, received = arrive.of(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s)
@@ -483,7 +483,7 @@ def _corners(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
 
 class _Arrival:
-    """Stamps and receive times of a camera's messages: in order, and the clock of the stamps may be late."""
+    """Stamps and receive times of a camera's messages, in order; the clock of the stamps may be late."""
 
     def __init__(self, scene: Scene, log: Log) -> None:
         camera, installed = scene.scenario.camera, scene.installed.camera
@@ -520,7 +520,7 @@ def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> It
 
 
 def _ticks(log: Log, rate_hz: float) -> tuple[int, IntArray]:
-    """A message every so many ticks, and all of the ticks."""
+    """Number of ticks between messages at a rate [Hz], and the ticks ``(n,)`` of the messages."""
     every = round(1.0 / rate_hz / TICK_S)
     return every, np.arange(0, len(log.stamps_s), every)
 
@@ -530,7 +530,7 @@ def _stamps(seconds: FloatArray) -> list[int]:
 
 
 def _received(scene: Scene, channel: str, stamps: list[int]) -> list[int]:
-    """When messages arrive: after a latency, never overtaking."""
+    """Receive times [ns] of messages: after a latency, never overtaking."""
     least, mean = getattr(scene.scenario.latency, channel)
     rng = channel_rng(scene.seed, f"latency of {channel}")
     late: IntArray = np.array(stamps) + np.round(1e9 * (least + rng.exponential(mean, len(stamps)))).astype(np.int64)

@@ -49,7 +49,7 @@ _NOW = "/now"  # topic of the events that only tell how late it is
 
 
 class FailingSensors:
-    """Events in order of receipt go in, those that are left come out.
+    """Applies failures to the events of a drive, in order of receipt.
 
     Attributes:
         landmark_map: what the robot is given for a map.
@@ -80,7 +80,7 @@ class FailingSensors:
         self._out = corrupt(failures, "recorded", self._arriving(), scenes)
 
     def after(self, events: Iterable[Event], now_ns: int) -> Iterator[Event]:
-        """What is left of events received up to now, and what was held back until now."""
+        """Events received up to now, after the failures, and events that were held back until now."""
         self._waiting.extend(events)
         self._now_ns = now_ns
         for event in self._out:
@@ -90,7 +90,7 @@ class FailingSensors:
                 return
 
     def _arriving(self) -> Iterator[Event]:
-        """What waits; then the time, again and again: failures that hold events back let go of them by it."""
+        """Yield the waiting events, then times without end, by which failures that hold events back release them."""
         while True:
             if self._waiting:
                 yield self._waiting.popleft()
@@ -136,37 +136,37 @@ _CHANGES: dict[PoseName, dict[str, Any]] = {
 
 
 class PoseSource(Protocol):
-    """Takes the robot's messages as they arrive, and tells its pose."""
+    """Interface of an estimator that takes the robot's messages as they arrive and gives its pose."""
 
     def push(self, event: Event) -> None:
-        """Take an event, in order of receipt."""
+        """Add an event, in order of receipt."""
 
     def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
         """Pose ``(3,)`` (None: not known) and the standard deviation of its position in the worst direction [m]."""
 
     def close(self) -> None:
-        """End."""
+        """End the estimation."""
 
 
 class TruePose:
-    """The pose itself, for comparison."""
+    """The true pose, for comparison."""
 
     def push(self, event: Event) -> None:
-        """Nothing is needed."""
+        """Ignore the event."""
 
     def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
-        """The truth."""
+        """The true pose, with sigma 0."""
         return truth, 0.0
 
     def close(self) -> None:
-        """Nothing is to be ended."""
+        """Do nothing: there is nothing to end."""
 
 
 class LivePose:
     """The pose of a `Live`: everything that has arrived is used before it is asked, so that runs can be repeated."""
 
     def __init__(self, config: Config, landmark_map: LandmarkMap | None, roles: set[str], heeds_sigma: bool) -> None:
-        """Start it.
+        """Start the live run.
 
         Args:
             config: as on the robot.
@@ -178,11 +178,11 @@ class LivePose:
         self._live = Live(config, landmark_map, roles=roles)
 
     def push(self, event: Event) -> None:
-        """Take an event."""
+        """Add an event."""
         self._live.push(event)
 
     def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
-        """The newest pose, carried on to the stamp."""
+        """Newest pose, propagated to the stamp; None where the robot is lost."""
         if not self._live.wait(_PATIENCE_S):
             raise EstimatorError(f"the live run did not use its events within {_PATIENCE_S:.0f} s")
         known = self._live.pose_at(stamp_ns)
@@ -192,14 +192,14 @@ class LivePose:
         return known.pose, sigma
 
     def close(self) -> None:
-        """End its threads."""
+        """End the threads of the live run."""
         self._live.close()
 
 
 def pose_source(
     name: PoseName, config: Config, landmark_map: LandmarkMap, sees: str, start: tuple[float, float, float]
 ) -> PoseSource:
-    """A source by name.
+    """Source of the pose by its name.
 
     Args:
         name: "truth"; "fgloc", and the same without its learned motion, without that and the gyro, or with constant
@@ -239,7 +239,7 @@ _COLUMNS = ("t", "x", "y", "yaw", "sigma", "v", "omega", "state", "true_x", "tru
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How well a path was followed.
+    """Measures of how well a path was followed.
 
     Attributes:
         track_mm: mean distance of the true path from the waypoints' curve, over the length of the true path.
@@ -262,7 +262,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Followed:
-    """One drive.
+    """Trajectory, commands and score of one drive.
 
     Attributes:
         times_s: ``(n,)`` of the commands.
@@ -363,13 +363,13 @@ ROLES: dict[str, Role] = {
 
 
 def seen_by(corners: bool) -> Sees:
-    """What the camera sends: corners of markers, or images."""
+    """Kind of the camera's messages: corners of markers, or images."""
     return "corners" if corners else "images"
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What is to be driven.
+    """Settings of one drive.
 
     Attributes:
         scenario: robot, room, sensors, installation; its control is not used.
@@ -444,7 +444,7 @@ def _drive(drive: Drive, scene: Scene, bag_folder: Path) -> Followed:
 
 
 class Written:
-    """Writes messages in the order of receipt, as time goes by."""
+    """Writes the messages of a run in the order of receipt, as time goes by."""
 
     def __init__(self, channels: Sequence[Iterator[Message]]) -> None:
         """Take the channels of a run."""
@@ -452,7 +452,7 @@ class Written:
         self._next = next(self._messages, None)
 
     def until(self, now_ns: int) -> None:
-        """All that has been received by now."""
+        """Write all messages that have been received by now."""
         while self._next is not None and self._next[0] <= now_ns:
             self._next[1]()
             self._next = next(self._messages, None)
@@ -462,13 +462,13 @@ class Arrivals:
     """Messages on their way to the estimator."""
 
     def __init__(self, config: Config) -> None:
-        """Nothing is on its way."""
+        """Start without messages."""
         self._config = config.recording
         self._queue: list[tuple[int, int, Event]] = []
         self._order = count()
 
     def take(self, topic: str, message_type: str, content: Any, received_ns: int) -> None:
-        """A message that was written to the bag."""
+        """Add the events of a message that was written to the bag."""
         role = ROLES.get(topic)
         if role is None and not topic.startswith("/tf"):
             return
@@ -478,13 +478,13 @@ class Arrivals:
             heapq.heappush(self._queue, (event.received_ns, next(self._order), event))
 
     def until(self, now_ns: int) -> Iterator[Event]:
-        """What has arrived by now, in order."""
+        """Yield the events that have arrived by now, in order."""
         while self._queue and self._queue[0][0] <= now_ns:
             yield heapq.heappop(self._queue)[2]
 
 
 class ClosedLoop:
-    """A `Controller`: at each command it takes what has arrived, asks for the pose, and asks the follower.
+    """`Controller` that at each command uses the events that have arrived, gets the pose, and asks the follower.
 
     Attributes:
         rows: one for each command: time [s]; the pose x, y, yaw (NaN: none) and its sigma; v and omega.
@@ -508,7 +508,7 @@ class ClosedLoop:
         self.states: list[State] = []
 
     def command(self, t: float, pose: tuple[float, float, float]) -> Command | None:
-        """The follower's command for what is known now; None some time after it has arrived."""
+        """Command of the follower for the events known now; None some time after it has arrived."""
         now_ns = stamp_ns(t)
         self._written.until(now_ns)
         for event in self._sensors.after(self._arrivals.until(now_ns), now_ns):

@@ -116,7 +116,7 @@ def load_path(what: str) -> WaypointPath:
 
 
 class State(StrEnum):
-    """What the follower does."""
+    """State of the follower."""
 
     FOLLOWING = "following"
     SLOWED = "slowed"  # the pose is uncertain
@@ -198,12 +198,12 @@ class Pursuit:
         return v, math.copysign(min(abs(omega), s.max_omega), omega)
 
     def _since_last(self, t: float, yaw: float) -> tuple[float, float]:
-        """Time [s] since the last command, and what the robot has turned in it [rad]."""
+        """Time [s] since the last command, and the turn of the robot in it [rad]."""
         before, self._last = self._last or (t, yaw), (t, yaw)
         return max(t - before[0], 1e-3), math.remainder(yaw - before[1], math.tau)
 
     def _left_to_look(self, turned: float, position_sigma_m: float) -> float:
-        """How far the robot is still to turn round [rad]: once, at first, if it does not know its place well."""
+        """Turn [rad] that is left of the one look round at the start, which only a robot unsure of its place makes."""
         if self._looked_rad is None:
             self._looked_rad = 0.0 if position_sigma_m > self._settings.look_sigma_m else math.tau
         elif self._looked_rad < math.tau - _LOOKED_RAD:
@@ -237,7 +237,7 @@ class Pursuit:
         return 0.0, self._settings.search_omega
 
     def _nearest(self, pose: FloatArray) -> int:
-        """Nearest point of the curve, not before the last one and not beyond the next half metre.
+        """Index of the nearest point of the curve, not before the last one and within the next 0.3 m.
 
         So the robot stays on its branch where the path crosses itself.
         """
@@ -247,7 +247,7 @@ class Pursuit:
         return self.progress + int(np.argmin(np.hypot(*(part - pose[:2]).T)))
 
     def _ahead(self, pose: FloatArray, reach: float) -> int:
-        """First point of the curve from here on that is so far away from the robot."""
+        """Index of the first point of the curve from here on that is at least so far from the robot [m]."""
         far = np.hypot(*(self._curve.points[self.progress :] - pose[:2]).T) >= reach
         return self.progress + int(np.argmax(far)) if far.any() else len(self._curve.points) - 1
 
