@@ -39,7 +39,7 @@ _FIT_WINDOW_S = 2.0
 
 
 class MeanTwists(Protocol):
-    """Commands, or wheels that stand in their place."""
+    """Interface of commands, or of wheels in their place: means of v and ω."""
 
     def means(self, limits_s: FloatArray) -> FloatArray:
         """Mean (v, ω) ``(..., m - 1, 2)`` between limits ``(..., m)``."""
@@ -208,7 +208,7 @@ def _distinct(parts: list[FloatArray]) -> tuple[FloatArray, NDArray[np.intp]]:
 
 
 def _noise_bases(rollout: Rollout) -> list[FloatArray]:
-    """What one unit of each squared density, in the order of `NoiseDensity`, adds to the covariances of the steps."""
+    """Covariances ``(n, 3, 3)`` of the steps by one unit of each squared density, in the order of `NoiseDensity`."""
     distance, yaw = np.hypot(rollout.motions[:, 0], rollout.motions[:, 1]), np.abs(rollout.motions[:, 2])
     amounts = {"m": distance, "rad": yaw, "s": np.full(len(yaw), rollout.step_s)}
     axes = {"x": [0], "y": [1], "xy": [0, 1], "yaw": [2]}
@@ -241,7 +241,7 @@ _STEP_S = 0.2
 def adapted(
     tensors: Tensors, card: ModelCard, runs: list[Run], config: AdaptationConfig, window_s: float | None = None
 ) -> ModelCard:
-    """The card with the kinematics that are most probable after these runs; the weights fit it unchanged.
+    """Card with the kinematics that are most probable after these runs; the weights stay unchanged.
 
     Args:
         tensors: the model's weights.
@@ -278,7 +278,7 @@ def adapted(
 
 
 def _whitened(rollout: Rollout, window_s: float) -> FloatArray:
-    """Errors over windows side by side, in units of what the model expects."""
+    """Errors ``(n,)`` over windows side by side, whitened by the covariances that the model predicts."""
     k, _ = rollout.starts(window_s, window_s)
     every, _ = rollout.starts(window_s)
     picked = np.isin(every, k)

@@ -128,7 +128,7 @@ class AdaptationConfig(Section):
 
     @property
     def sigmas(self) -> tuple[float, float, float]:
-        """Of the gain of v, the gain of ω and the pull."""
+        """Prior sigmas of the gain of v, the gain of ω and the pull."""
         return self.scale_sigma, self.scale_sigma, self.yaw_per_m_sigma
 
 

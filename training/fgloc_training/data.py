@@ -90,7 +90,7 @@ class SensorRecord:
 
     @property
     def joints(self) -> WheelJoints | None:
-        """The wheels by name and size; None if there are no joints."""
+        """Names and sizes of the wheels' joints; None if there are no joint states."""
         if not self._stamps(JointsEvent):
             return None
         w = self.wheels
@@ -103,7 +103,7 @@ class SensorRecord:
         )
 
     def step(self, start_ns: int, end_ns: int, history_s: float = 0.0) -> Step:
-        """All messages around a time, as the localizer would get them."""
+        """Step with all messages around a time, as the localizer would get them."""
         return Step(
             index=0,
             segment=0,
@@ -118,7 +118,7 @@ class SensorRecord:
         )
 
     def gyro_bias(self, stamp_ns: int) -> float:
-        """What was known of the gyro's bias [rad/s] 10 s before a time, as after 10 s of dead reckoning."""
+        """Bias of the gyro [rad/s] as it was known 10 s before a time, as after 10 s of dead reckoning."""
         if not len(self._biases):
             return 0.0
         return float(self._biases[max(0, int(np.searchsorted(self._stamps(ImuEvent), stamp_ns, "right")) - 1)])
@@ -136,7 +136,7 @@ class SensorRecord:
         return self._buffers[kind].window(stamps[0], stamps[-1]) if stamps else ()
 
     def _gyro_biases(self, config: GyroConfig, truth: tuple[NDArray[np.int64], FloatArray] | None) -> FloatArray:
-        """What the localizer's own filter knew of the bias some time before each IMU message."""
+        """Bias [rad/s] that the localizer's own filter knew some time before each IMU message ``(n,)``."""
         stamps = self._stamps(ImuEvent)
         if not stamps:
             return np.zeros(0)
@@ -218,12 +218,12 @@ class Run:
 
     @property
     def commands(self) -> tuple[ControlEvent, ...]:
-        """In order of stamp."""
+        """Commands in order of stamp."""
         return self.sensors.commands
 
     @property
     def times(self) -> FloatArray:
-        """``(n,)`` s since the origin."""
+        """Times ``(n,)`` [s] of the samples since the origin."""
         return np.asarray(np.arange(len(self.poses)) * self.dt_s, dtype=float)
 
     def starts(self, steps: int, stride: int = 1) -> NDArray[np.int64]:

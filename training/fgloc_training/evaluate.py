@@ -119,7 +119,7 @@ _SHARES = np.linspace(0.0, 0.999, 200)
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Of one source at one horizon. The covariance's figures are None for a source that gives none."""
+    """Figures of one source at one horizon; those of the covariance are None for a source that gives none."""
 
     horizon_s: float
     windows: int
@@ -175,7 +175,7 @@ def growth(rollouts: list[Rollout]) -> list[Figures]:
 
 
 def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
-    """The figures a card keeps, by name."""
+    """Figures of the card by name."""
     out: dict[str, float] = {}
     for figures in growth(rollouts):
         name = f"{figures.horizon_s:.0f}s"
@@ -187,7 +187,7 @@ def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
 
 
 def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]]:
-    """Rollouts of the models by name, and of what they have to beat.
+    """Rollouts of the models by name, and of the baselines.
 
     That is: commands as given; scaled and delayed as the first model knows; wheel odometry if every run has it.
     """
@@ -200,7 +200,7 @@ def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]
 
 
 def calibration_curve(rollouts: list[Rollout], horizon_s: float, shares: FloatArray) -> FloatArray:
-    """Which share of errors lies inside the ellipsoids that should hold these shares of them."""
+    """Share of the errors inside the ellipsoids that should hold the given shares of them."""
     values = np.concatenate([nis(r.errors(horizon_s), r.end_covs(horizon_s)) for r in rollouts])
     return np.asarray((values[:, None] < chi2.ppf(shares, 3)).mean(axis=0))
 
@@ -211,7 +211,7 @@ def _coverage(values: FloatArray) -> tuple[float, float, float]:
 
 
 def table(rows: list[tuple[str, Figures]]) -> str:
-    """The figures of each source and horizon as text."""
+    """Table of each source's and horizon's figures, as text."""
     lines = [
         f"{'source':<20}{'s':>4}{'n':>6}{'drift %':>9}{'ATE m':>8}{'yaw MAE':>9}{'yaw end':>9}{'NIS/3':>7}  1/2/3σ"
     ]
@@ -253,7 +253,7 @@ def draw(folder: Path, found: dict[str, list[Rollout]], rows: list[tuple[str, Fi
 def compare(
     model: Path, bags: list[Path], against: list[Path]
 ) -> tuple[dict[str, list[Rollout]], list[tuple[str, Figures]]]:
-    """Free rollouts of a model, of what it is compared with, and of the wheels; and their figures by horizon.
+    """Free rollouts of a model, of models to compare and of the baselines; and their figures by horizon.
 
     Raises:
         ModelError: a model cannot be read.

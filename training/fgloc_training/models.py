@@ -53,7 +53,7 @@ class Trunk(nn.Module):
     """
 
     def __init__(self, n_bins: int, n_inputs: int, hidden: tuple[int, ...]) -> None:
-        """Set up.
+        """Make the cell and the layers.
 
         Args:
             n_bins: age bins, of two commands each, with which the inputs begin, youngest first.
@@ -78,7 +78,7 @@ class Trunk(nn.Module):
         return self.layers(torch.cat([state, x[..., 2 * self._n_bins :]], dim=-1))
 
     def weights(self) -> dict[str, Tensor]:
-        """Of the cell, by the names of the model file."""
+        """Weights of the cell, by the names of the model file."""
         names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         return {f"gru.{name}": getattr(self.cell, f"{name}_l0") for name in names}
 
@@ -119,7 +119,7 @@ def variance_net(net: nn.Sequential, mean: Tensor, std: Tensor, neighbors: list[
 
 
 def at_start_variance(head: nn.Linear) -> nn.Linear:
-    """The last layer, started from the same variance everywhere."""
+    """Initialize the last layer so that the variance is the same everywhere."""
     with torch.no_grad():
         head.weight.zero_()
         head.bias.copy_(torch.log(torch.tensor(_START_SIGMAS) ** 2))
@@ -301,7 +301,7 @@ def _linear(net: nn.Sequential) -> list[nn.Linear]:
 
 
 class NaiveNet(nn.Module):
-    """v = u: nothing to learn."""
+    """Model without weights: the velocities are the commanded ones, v = u."""
 
     mean: Tensor
     std: Tensor
@@ -315,7 +315,7 @@ class NaiveNet(nn.Module):
             self.register_buffer(name, torch.zeros(0))
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
-        """None."""
+        """No layers."""
         return []
 
 

@@ -26,7 +26,7 @@ from fgloc_training.models import DisplacementNet, MotionNet, Samples, relative
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """How one stage of training went: losses of the batches, and scores on what validates."""
+    """Course of one stage of training: losses of the batches, and scores on the validation recordings."""
 
     losses: list[float] = field(default_factory=list)
     scores: list[tuple[int, float]] = field(default_factory=list)  # after this many iterations
@@ -34,19 +34,19 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The file of one stage of one network; without a path nothing is kept."""
+    """Checkpoint file of one stage of one network; without a path nothing is saved."""
 
     path: Path | None = None
 
     def save(self, state: dict[str, Any]) -> None:
-        """Replace what is kept, atomically."""
+        """Replace the checkpoint, atomically."""
         if self.path is None:
             return
         with atomic_file(self.path, binary=True) as file:
             torch.save(state, file)
 
     def load(self) -> dict[str, Any] | None:
-        """What was kept last; None if there is nothing.
+        """Last saved checkpoint; None if there is none.
 
         Raises:
             ModelError: the file is damaged.
@@ -62,12 +62,12 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoints:
-    """All stages of one model. Another configuration, split or recording has other files, so none is mistaken."""
+    """Checkpoints of one model; each configuration, split and set of recordings has files of its own."""
 
     folder: Path | None = None
 
     def of(self, config: TrainConfig, split: Split, runs: dict[str, Run], member: int, stage: str) -> Checkpoint:
-        """The stage's place."""
+        """Checkpoint of a stage."""
         if self.folder is None:
             return Checkpoint()
         digest = hashlib.sha256((config.model_dump_json() + split.model_dump_json()).encode())
@@ -154,7 +154,7 @@ _MOST_GRADIENT = 5.0  # norm above which the gradient is clipped
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How long a descent goes on and how often it is judged."""
+    """Settings of a descent."""
 
     name: str
     iterations: int
@@ -197,7 +197,7 @@ def descend(
 
 
 class _Descent:
-    """Everything that changes while it goes on.
+    """State of a descent: module, optimizer, schedule, and the best weights so far.
 
     Attributes:
         curve: losses and scores so far.
@@ -215,7 +215,7 @@ class _Descent:
         self.curve = Curve()
 
     def resume(self, kept: dict[str, Any] | None) -> int:
-        """Go on where an earlier descent was stopped; the next iteration."""
+        """Restore a saved descent, and return its next iteration."""
         if kept is None:
             return 1
         self._module.load_state_dict(kept["module"])
@@ -228,7 +228,7 @@ class _Descent:
         return int(kept["iteration"]) + 1
 
     def step(self, loss_of_batch: Callable[[torch.Generator], Tensor]) -> None:
-        """One iteration."""
+        """Make one iteration."""
         loss = loss_of_batch(self._rng)
         self._optimizer.zero_grad()
         loss.backward()
@@ -239,7 +239,7 @@ class _Descent:
         self.curve.losses.append(float(loss.detach()))
 
     def judge(self, iteration: int, score: float) -> None:
-        """Note a score; the least one so far marks the best state."""
+        """Add a score; the least one so far marks the best state."""
         self.curve.scores.append((iteration, score))
         self._waited += 1
         if score < self._best:
@@ -251,7 +251,7 @@ class _Descent:
         return self._plan.patience is not None and self._waited >= self._plan.patience
 
     def state(self, iteration: int) -> dict[str, Any]:
-        """What `resume` goes on from."""
+        """State of the descent, which `resume` restores."""
         return {
             "iteration": iteration,
             "module": self._module.state_dict(),

@@ -26,7 +26,7 @@ _WANTED_S = 600.0  # of driving in all, that training takes to know a robot
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a recording holds for training."""
+    """Facts of a recording that matter for training."""
 
     bag: Path
     duration_s: float
@@ -55,7 +55,7 @@ def look(bag: Path, config: Config) -> Found:
 
 
 def missing(found: Sequence[Found]) -> list[str]:
-    """What should still be recorded, in sentences."""
+    """Recordings that are still needed, one sentence each."""
     sentences = []
     total = sum(f.duration_s for f in found)
     if total < _WANTED_S:
@@ -118,7 +118,7 @@ def _relative(path: Path, file: Path) -> str:
 
 
 def _names(bags: Iterable[Path]) -> list[str]:
-    """A name for each: of the file, or of the folder around a bag that is called bag; numbered if they repeat."""
+    """Name for each bag: of its file, or of the folder around a bag called bag or rosbag2; numbered if they repeat."""
     names: list[str] = []
     for bag in bags:
         path = bag.resolve()
@@ -145,7 +145,7 @@ class Controls:
     limits: SpeedLimits | None
 
     def missing(self) -> list[str]:
-        """What the recordings say too little of, in words; nothing if no limits are known."""
+        """Ranges of speed of which the recordings hold too little, a phrase each; empty if no limits are known."""
         if self.limits is None:
             return []
         found = []
@@ -168,7 +168,7 @@ class Controls:
 
 
 def controls(runs: list[Run], limits: SpeedLimits | None) -> Controls:
-    """Count what was commanded while there was a truth.
+    """Count the seconds for which speeds were commanded while there was a truth.
 
     Args:
         runs: those that train.

@@ -108,7 +108,7 @@ def roll_wheels(run: Run, step_s: float) -> Rollout:
 
 
 def roll_kinematics(kinematics: Kinematics, run: Run, step_s: float) -> Rollout:
-    """The calibrated kinematics alone: what stands in for wheel odometry where there is none."""
+    """Rollout of the calibrated kinematics alone, in place of wheel odometry where there is none."""
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         start, end = ((t - run.origin_ns) * 1e-9 for t in (start_ns, end_ns))

@@ -40,7 +40,7 @@ _SEEDS_APART = 1_000  # between the members of an ensemble
 def train_member(
     config: TrainConfig, split: Split, runs: dict[str, Run], member: int, checkpoints: Checkpoints
 ) -> tuple[MotionNet, dict[str, Curve]]:
-    """One network and how its stages went; the members of an ensemble differ by their seed."""
+    """Train one network; the members of an ensemble differ by their seed."""
     optimization = config.optimization.model_copy(update={"seed": config.optimization.seed + _SEEDS_APART * member})
     training, validation = ([runs[name] for name in names] for names in (split.train, split.validation))
     kept = {stage: checkpoints.of(config, split, runs, member, stage) for stage in ("mean", "variance")}
@@ -162,7 +162,7 @@ def tensors_of(nets: list[MotionNet]) -> Tensors:
 
 
 def _widths(net: MotionNet) -> tuple[int, ...]:
-    """Of the hidden layers as `tensors_of` stacks them."""
+    """Widths of the hidden layers as `tensors_of` stacks them; empty for a model without any."""
     kind, hidden = net.config.kind, net.config.hidden
     if kind in ("naive", "lag", "arx"):
         return ()
@@ -289,7 +289,7 @@ def train_uncalibrated(
 
 
 def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tuple[Rollout, Rollout]]:
-    """Of the model and of wheel odometry, or of the model's kinematics where there is none, over each run."""
+    """Rollouts over each run of the model and of wheel odometry, or of the model's kinematics where there is none."""
     model = load_model(path)
 
     def wheels(run: Run) -> Rollout:
@@ -303,7 +303,7 @@ def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tupl
 def cross_rollouts(
     config: TrainConfig, split: Split, runs: dict[str, Run], path: Path, made_by: str, checkpoints: Checkpoints
 ) -> list[tuple[Rollout, Rollout]]:
-    """Over each training recording, by a model that left it out. These models are not kept."""
+    """Rollouts over each training recording by a model that left it out; these models are not kept."""
     found, scratch = [], path.with_name(path.name + ".fold")
     for name in split.train:
         fold = split.model_copy(update={"train": tuple(n for n in split.train if n != name)})
@@ -314,7 +314,7 @@ def cross_rollouts(
 
 
 def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: CalibrationConfig) -> ModelCard:
-    """The card with covariances that hold on these rollouts, and their correlation with the wheels' stand-in."""
+    """Calibrate the card's covariances on these rollouts, and their correlation with the wheels' stand-in."""
     rollouts, wheels = [learned for learned, _ in held_out], [kinematics for _, kinematics in held_out]
     if card.family != "displacement":
         noise = fit_noise(rollouts, config)
@@ -331,7 +331,7 @@ def calibrate(card: ModelCard, held_out: list[tuple[Rollout, Rollout]], config: 
 
 
 def leave_one_out(names: list[str]) -> list[Split]:
-    """A split per recording left out: it tests, the next one validates, the rest train."""
+    """Splits, one per recording left out: it tests, the next one validates, the rest train."""
     splits = []
     for i, name in enumerate(names):
         other = names[(i + 1) % len(names)]
@@ -348,7 +348,7 @@ def train_on_all(
     made_by: str,
     checkpoints: Checkpoints = _NOTHING_KEPT,
 ) -> ModelCard:
-    """A model from every recording, calibrated and judged by the models that left one out."""
+    """Train a model on every recording, calibrated and judged by the models that left one out."""
     split = Split(train=tuple(runs), validation=())
     card = train(config, split, runs, path, made_by, checkpoints)
     scale = np.exp(np.mean([np.log(c.variance_scale) for c in folds], axis=0))
@@ -377,7 +377,7 @@ CHECKPOINTS = ".checkpoints"
 
 @dataclass(frozen=True, slots=True)
 class Reporter:
-    """Where messages go: `say` those on each finished model, `warn` those on what looks wrong."""
+    """Functions for messages: `say` for those on each finished model, `warn` for those on what looks wrong."""
 
     say: Callable[[str], None]
     warn: Callable[[str], None]
@@ -427,7 +427,7 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
 def _train_all(
     config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, reporter: Reporter
 ) -> None:
-    """The model of the configuration's split, or one for each recording left out, and one of all."""
+    """Train the model of the configuration's split, or one for each recording left out, and one of all."""
     trained = list(runs) if config.split is None else config.split.train
     found = controls([runs[name] for name in trained], config.limits)
     draw_controls(out / "controls.png", found)
@@ -447,7 +447,7 @@ def _train_all(
 
 
 def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
-    """The split of recordings as one of the runs that they are made of."""
+    """Split of the runs that the recordings of a split consist of."""
 
     def names(recordings: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(name for recording in recordings for name in parts[recording])
