@@ -1,4 +1,4 @@
-"""What a sweep costs and survives: ``python -m benchmarks.ablation``.
+"""Cost and robustness of a sweep: ``python -m benchmarks.ablation``.
 
 Short jobs replay the odometry of the bundled recording alone, so that the engine's own work shows. Records are compared
 whole but for the times that a run took. Workers and the driver are killed with SIGKILL.

@@ -1,4 +1,4 @@
-"""What adaptive weights are worth: ``python -m benchmarks.adaptive [--quick] [--split validation]``.
+"""Benefit of adaptive weights: ``python -m benchmarks.adaptive [--quick] [--split validation]``.
 
 Simulated recordings of the suite's scenarios (see `benchmarks.adaptive_recordings`), failures of the ablations, and
 MRCLAM 6 with failures injected. Of one case are run, on the same events: ours; *fixed*, the same graph with constant
@@ -37,7 +37,7 @@ from fgloc_datasets.sim.camera import RenderError
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A way of weighing."""
+    """Way of weighing: changes of the configuration, and how it is run."""
 
     changes: dict[str, Any]
     oracle: bool = False
@@ -65,7 +65,7 @@ Found = dict[Key, list[Figures]]
 
 
 def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
-    """All rows; a quick run has one seed and two cases."""
+    """Rows of the benchmark; a quick run has one seed and two cases."""
     cases, variants = (QUICK_CASES, QUICK_VARIANTS) if quick else (tuple(CASES), tuple(VARIANTS))
     seeds = SEEDS[split][:1] if quick else SEEDS[split]
     try:
@@ -106,7 +106,7 @@ def _run_group(seed: int, cases: Sequence[str], variants: Sequence[str], split: 
 
 
 def rows(found: Found) -> Iterator[Row]:
-    """The table."""
+    """Rows of the table."""
     yield _over(found, "none.over_fixed", "none", "fixed")
     for name in ("slip", "mu01"):
         for peer in ("oracle", "fixed", "nominal"):
@@ -169,7 +169,7 @@ def _cost(found: Found) -> Row:
 
 
 def _peers(found: Found) -> Iterator[Row]:
-    """Ours over each peer, and over the best of them in the case where that is worst for us."""
+    """Ratios of fgloc over each peer, and over the best of them in the case where that is worst for fgloc."""
     worst: list[float] = []
     for name in CASES:
         compared = [_over(found, f"peers.{name}.over_{peer}", name, peer) for peer in PEERS]
@@ -190,7 +190,7 @@ def _online(figures: Figures) -> float:
 
 
 def _over(found: Found, row_id: str, name: str, peer: str) -> Row:
-    """Ours over a peer in the same case, online."""
+    """Ratio of fgloc over a peer in the same case, online."""
     return _ratio(row_id, found.get((name, "ours")), found.get((name, peer)))
 
 

@@ -77,7 +77,7 @@ class Recorded:
 
 
 def cache_folder() -> Path:
-    """Where recordings are kept."""
+    """Folder in which recordings are kept."""
     user = os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")
     return Path(os.environ.get("FGLOC_BENCHMARK_CACHE", Path(user) / "fgloc" / "benchmarks"))
 
@@ -115,7 +115,7 @@ def prepare(floors: Sequence[Floor], split: Split, seeds: Sequence[int], change:
 
 
 def job(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> Job:
-    """What is to be recorded, and in which folder of the cache."""
+    """Recording to be made, and its folder in the cache."""
     made = scenario(floor, split, change)
     key = hashlib.sha256(describe(made, seed, True).encode()).hexdigest()[:12]
     return Job(made, seed, f"{floor}_{split}_{seed}_{key}", split)
@@ -167,7 +167,7 @@ def load(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> R
 
 
 def slip_intervals(recorded: Recorded, least_s: float = 0.1, join_s: float = 0.3) -> list[tuple[float, float]]:
-    """When wheels slipped, by the simulator [s from the start]; closer than ``join_s`` is one, short ones go."""
+    """Intervals of slip by the simulator [s from the start]; closer than ``join_s`` is one, short ones are left out."""
     out: list[tuple[float, float]] = []
     for t, slips in zip(recorded.slip_s.tolist(), recorded.slipping.tolist(), strict=True):
         if slips:
@@ -204,7 +204,7 @@ def _sources(names: tuple[str, ...]) -> bytes:
 
 
 def _sightings(folder: Path, dictionary: str, events: Iterator[Event]) -> dict[int, CornersEvent]:
-    """Detected corners by the image's stamp; detected once, then read."""
+    """Detected corners by the image's stamp; detected once, then read from a file."""
     made = hashlib.sha256(cv2.__version__.encode() + _sources(tuple(_DETECTOR))).hexdigest()[:12]
     path = folder / f"corners_{made}.npz"
     if not path.is_file():
@@ -248,7 +248,7 @@ def _replaced(events: Iterator[Event], found: dict[int, CornersEvent]) -> Iterat
 
 
 def _slip(bag: Path, start_ns: int) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Stamps [s from the start], twist differences and flags of the simulator's word on slip."""
+    """Stamps [s from the start], differences of the twist and flags of slip, by the simulator."""
     stamps, twists, flags = [], [], []
     with AnyReader([bag]) as reader:
         wanted = [c for c in reader.connections if c.topic in ("/truth/slip", "/truth/slipping")]

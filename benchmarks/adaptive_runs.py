@@ -125,7 +125,7 @@ def cell(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replayed:
-    """What came of one run of a recording with failures.
+    """Results of one run of a recording with failures.
 
     Attributes:
         online: the estimates as they were made, with all decisions.
@@ -230,7 +230,7 @@ def failure(described: dict[str, Any]) -> Failure:
 
 
 def carried_interval(recorded: Recorded) -> Interval:
-    """What is cut out of a drive so that the robot is carried away [s].
+    """Interval [s] that is cut out of a drive, so that the robot seems to be carried away.
 
     Raises:
         ValueError: the robot stays too near to where it is.

@@ -1,4 +1,4 @@
-"""What one run shows of the adaptive weights: errors, honesty, detected slip, named markers, the way back."""
+"""Scores of one run with adaptive weights: errors, consistency, detected slip, named markers, recovery."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _STAYS_S = 1.0  # ... if it stays so for this long
 
 @dataclass(frozen=True, slots=True)
 class Slips:
-    """What the slip detector did in one run.
+    """Detections of the slip detector in one run.
 
     Attributes:
         delays_s: from the true onset to the flag, of each slip that was found.
@@ -49,7 +49,7 @@ class Slips:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figures:
-    """One run. Where no pose was ever found the errors are infinite."""
+    """Figures of one run; where no pose was ever found the errors are infinite."""
 
     seed: int
     ate_m: float  # mean distance from the truth, online
@@ -111,7 +111,7 @@ def score(
 
 
 def slips(recorded: Recorded, online: RunResult) -> Slips:
-    """Compare the flags with the simulator's word on slip."""
+    """Slips found and missed, and false alarms, by the flags and the simulator's slip."""
     rises = flags(recorded, online.decisions)
     true = slip_intervals(recorded)
     delays, found, missed = [], [], []
@@ -130,7 +130,7 @@ def slips(recorded: Recorded, online: RunResult) -> Slips:
 
 
 def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float, float]]:
-    """When the wheels were rejected, because other motion sources contradicted them [s from the start].
+    """Times [s from the start] at which the wheels were rejected, as other motion sources contradicted them.
 
     A flag counts from the step that raised it, not from the earlier ones that it revised.
     """
@@ -152,7 +152,7 @@ def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float
 
 
 def found_again(recorded: Recorded, online: RunResult, kidnapped_s: float, events: Sequence[Event]) -> float:
-    """From the first marker in view after the robot was carried away until the estimate is right and stays so [s].
+    """Time [s] from the first marker after the robot was carried away until the estimate is right and stays so.
 
     If that never happens: until the end of the run; 0 if it sees no marker any more.
     """

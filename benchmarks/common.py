@@ -1,4 +1,4 @@
-"""What the benchmarks share: rows, the printed table, ``--quick`` and ``--json``."""
+"""Parts that all benchmarks share: rows, the printed table, ``--quick`` and ``--json``."""
 
 from __future__ import annotations
 

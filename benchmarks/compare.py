@@ -1,4 +1,4 @@
-"""Which rows of a benchmark changed: ``python -m benchmarks.compare OLD.json NEW.json``.
+"""Changed rows of a benchmark: ``python -m benchmarks.compare OLD.json NEW.json``.
 
 Both files come from ``python -m benchmarks.NAME --json FILE``. A row changed if its values differ by more than what
 their spreads explain: three standard errors of the difference, from both spreads and both numbers of runs. Rows without
@@ -33,7 +33,7 @@ def read_rows(path: Path) -> dict[str, Row]:
 
 
 def verdict(old: Row | None, new: Row | None) -> str:
-    """How a row changed: "" within its spread, "changed", "new", "gone", "not run now" or "run now"."""
+    """Change of a row: "" within its spread, "changed", "new", "gone", "not run now" or "run now"."""
     if old is None or new is None:
         return "new" if old is None else "gone"
     before, after = old["value"], new["value"]

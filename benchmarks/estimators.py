@@ -1,4 +1,4 @@
-"""Smoother or filter, for whom: ``python -m benchmarks.estimators [--quick] [--json FILE] [--split test]``.
+"""Smoother against filter: ``python -m benchmarks.estimators [--quick] [--json FILE] [--split test]``.
 
 The fixed-lag smoother and the Kalman filter of pose and installation (`estimator.kind: ekf`), online, in the failures
 of `benchmarks.installed`, on the same recordings. Rows: ``CASE.{fixed_lag,ekf}.{ate_mm,nees_over_3}``, means over the
@@ -28,7 +28,7 @@ _QUICK = ("none", "frozen")
 
 
 def measure(quick: bool, split: Split = "validation") -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     for case in CASES:
         if quick and case not in _QUICK:
             yield from not_run([f"{case}.update_ratio"], "left out of a quick run")

@@ -15,7 +15,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
 def write_metadata(folder: Path) -> None:
-    """What pip writes of the examples' package: name, version and entry points, as its pyproject.toml has them."""
+    """Write the metadata of the examples' package as pip does: name, version and entry points of its pyproject.toml."""
     project = tomllib.loads((EXAMPLES / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     info.mkdir()

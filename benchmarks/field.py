@@ -208,7 +208,7 @@ def _ates(
 
 
 def measure(quick: bool, only: Sequence[str] = (), page: Path | None = None) -> Iterator[Row]:
-    """All rows; a quick run has three recordings."""
+    """Rows of the benchmark; a quick run has three recordings."""
     chosen = [r for r in RECORDINGS if r.name in (only or (QUICK if quick else [x.name for x in RECORDINGS]))]
     if not DATA.is_dir():
         yield from not_run(["field.worse", "field.traps_found"], f"no {DATA}; set FGLOC_REAL_DATA")

@@ -1,4 +1,4 @@
-"""What `benchmarks.field` compares with, on the same messages: odometry alone, and a textbook's iSAM2.
+"""Baselines of `benchmarks.field`, on the same messages: odometry alone, and a textbook's iSAM2.
 
 Messages are read naively, as their headers have them: stamps of the header (receive times where a topic's header clock
 is minutes off), sightings in the axes of their frame (optical if the frame's name says so), sensor at the base. The

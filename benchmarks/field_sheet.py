@@ -1,4 +1,4 @@
-"""Answer sheet of `benchmarks.field`: what a recording is to tell by itself, and what is sound in it.
+"""Answer sheet of `benchmarks.field`: peculiarities of each recording that are to be found, and what is sound in it.
 
 A trap is found if a finding of a run in ``metrics.json`` has its code, or if it, ``init`` or ``info`` says its
 sentence, and the figure, if it has one, is within the tolerance of what was measured by hand (signs are not compared: a lag is
@@ -78,7 +78,7 @@ class Sound:
 
 
 def found(trap: Trap, o: Outcome) -> bool:
-    """Whether ``init``, ``info`` or a run's findings tell a peculiarity, with its figure."""
+    """Whether ``init``, ``info`` or a run's findings name a peculiarity, with its figure."""
     for finding in (*o.findings("batch"), *o.findings("online")):
         coded = bool(trap.code) and re.fullmatch(trap.code, finding["code"]) is not None
         if (coded and (trap.figure is None or _near(trap, finding.get("value")))) or _said(trap, finding["text"]):
@@ -103,7 +103,7 @@ def false_findings(recording: str, o: Outcome) -> list[str]:
 
 
 def _lines(text: str) -> Iterator[str]:
-    """Lines as they were before they were wrapped: a line that begins with a space goes on with the one before."""
+    """Lines as they were before they were wrapped: a line that begins with a space continues the one before."""
     return iter(re.sub(r"\n\s+", " ", text).splitlines())
 
 

@@ -48,7 +48,7 @@ class Wanted:
 
 
 def wanted() -> Iterator[Wanted]:
-    """All rows."""
+    """Rows of the benchmark."""
     for case in ("flat30", "flat20"):
         yield Wanted(f"{case}.track_mm", ((case, "fgloc"),), _mean("track_mm", "mm"))
         yield Wanted(f"{case}.truth.track_mm", ((case, "truth"),), _mean("track_mm", "mm"))
@@ -70,7 +70,7 @@ def wanted() -> Iterator[Wanted]:
 def measure(
     quick: bool, split: Split = "test", jobs: int | None = None, corners: bool = False, seeds: int | None = None
 ) -> Iterator[Row]:
-    """All rows; a quick run has one seed and one case, others all or the first ``seeds``."""
+    """Rows of the benchmark; a quick run has one seed and one case, others all or the first ``seeds``."""
     drawn = SEEDS[split][: 1 if quick else seeds]
     rows = list(wanted())
     todo = [w for w in rows if not quick or all(case in _QUICK for case, _ in w.needs)]

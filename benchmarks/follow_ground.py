@@ -41,7 +41,7 @@ _FLAT_TOO = ("slope", "level")
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Of one drive; NaN: not measured."""
+    """Figures of one drive; NaN: not measured."""
 
     track_mm: float = float("nan")
     ate_mm: float = float("nan")  # in space

@@ -86,7 +86,7 @@ def _driven(cell: Cell) -> Driven:
 
 @cache
 def source_hash(benchmark: Path = Path(__file__)) -> str:
-    """Of fgloc, with its simulator, and of a benchmark's module."""
+    """Hash of fgloc's sources and of a benchmark's module."""
     made = hashlib.sha256()
     parts = [_ROOT / "fgloc"]
     files = sorted(p for part in parts for p in part.rglob("*") if p.suffix in (".py", ".safetensors", ".yaml"))

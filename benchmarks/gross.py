@@ -44,7 +44,7 @@ _VALUE = re.compile(r"\(\?#(\S+) (\S+)\)")  # in a pattern: the bounds of its gr
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one run said: its first sentence, exit code and processor time; and ``fgloc info``'s first line."""
+    """First sentence, exit code and processor time of one run; and the first line of ``fgloc info``."""
 
     first: str
     code: int

@@ -87,7 +87,7 @@ def _mirror(landmarks: Settings) -> None:
 
 
 def _swap_ids(landmarks: Settings) -> None:
-    """Of two markers, most often seen in the validation and in the test recordings alike: on opposite walls."""
+    """Exchange the ids of two markers on opposite walls, most often seen in validation and test recordings alike."""
     first, second = landmarks["landmarks"][7], landmarks["landmarks"][9]
     first["id"], second["id"] = second["id"], first["id"]
 

@@ -1,4 +1,4 @@
-"""What MRCLAM's commands leave open: rows of `benchmarks.identification`, and why its one-step errors have long tails.
+"""Limits of MRCLAM's commands: rows of `benchmarks.identification`, and why its one-step errors have long tails.
 
 The latency of each clear change of the turn command (the command steady for 0.4 s before and after) follows from the
 yaw that the robot turned around it. It spreads evenly over a quarter of a second, unrelated to the latency before, to
@@ -43,7 +43,7 @@ def measure(recorded: dict[str, mrclam.Run]) -> Iterator[Row]:
 
 
 def _latencies(run: mrclam.Run, times: FloatArray) -> FloatArray:
-    """Of each clear change of the turn command [s]."""
+    """Latency [s] of each clear change of the turn command."""
     truth_s, yaw = (run.truth_ns - run.commands_ns[0]) * 1e-9, np.unwrap(run.truth[:, 2])
     told, found = run.commands[:, 1], []
     for i in np.flatnonzero(np.abs(np.diff(told)) > _CLEAR):
@@ -68,7 +68,7 @@ def _turned(times: FloatArray, told: FloatArray, period_s: float, rng: np.random
 
 
 def _apart(drawn: FloatArray, horizon_s: float) -> FloatArray:
-    """How far the draws' turns over windows are from their mean ``(draws, m)``."""
+    """Differences ``(draws, m)`` of the draws' turns over windows from their mean."""
     steps = round(horizon_s / _GRID_S)
     starts = np.arange(0, drawn.shape[1] - steps, round(1.0 / _GRID_S))
     turns = drawn[:, starts + steps] - drawn[:, starts]

@@ -1,4 +1,4 @@
-"""As installed: ``python -m benchmarks.installed [--quick] [--json FILE] [--split validation] [--rows PREFIX,...]``.
+"""Installations: ``python -m benchmarks.installed [--quick] [--json FILE] [--split validation] [--rows PREFIX,...]``.
 
 Simulated recordings in which map, camera, clocks and wheels are not quite as written, with failures of the ablations
 (`benchmarks.installed_recordings`). Values are means over the seeds and spreads their standard deviations, with these

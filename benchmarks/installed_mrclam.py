@@ -40,7 +40,10 @@ IDS = (
 
 
 def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
-    """All rows; a quick run takes one robot. There is one split: no robot's settings have seen its own run."""
+    """Rows of the benchmark; a quick run takes one robot.
+
+    There is one split, as no robot's settings have seen its own run: ``split`` is not used.
+    """
     del split
     source = DATA / "mrclam6"
     if not source.is_dir():
@@ -53,7 +56,7 @@ def measure(quick: bool, split: Split = "test") -> Iterator[Row]:
 
 
 def rows(found: Mapping[int, Mapping[str, float]]) -> Iterator[Row]:
-    """The table of what `localized` gave of each robot."""
+    """Rows of the figures that `localized` gave for each robot."""
     yield _mean("mrclam.first_pose_s", [f["first_pose_s"] for f in found.values()], "s")
     for mode in _MODES:
         yield _mean(f"mrclam.{mode}.ate_mean_m", [f[f"{mode}.ate_mean_m"] for f in found.values()], "m")
@@ -76,7 +79,7 @@ def _robot(robot: int) -> Mapping[str, Any]:
 
 
 def localized(robot: int) -> dict[str, float]:
-    """One robot, online and smoothed from the same replay."""
+    """Figures of one robot, online and smoothed from the same replay."""
     with tempfile.TemporaryDirectory() as scratch:
         bag = mrclam.convert(DATA / "mrclam6", robot, Path(scratch) / "robot")
         robot_yaml = find_beside(bag, "robot.yaml")

@@ -36,18 +36,18 @@ class Take:
 
 
 def installed(made: Scenario) -> Scenario:
-    """All errors of a careful installation, and none besides."""
+    """The scenario with all errors of a careful installation, and none besides."""
     robot = made.robot.model_copy(update={"radius_scale": (1.0, 1.0)})
     return made.model_copy(update={"robot": robot, "installation": Installation.as_installed()})
 
 
 def long(made: Scenario) -> Scenario:
-    """The same with a longer drive."""
+    """The scenario as `installed` has it, with a longer drive."""
     return installed(made).model_copy(update={"duration_s": FOUND_S})
 
 
 def map5mm(made: Scenario) -> Scenario:
-    """Markers hang some millimetres from where the map has them."""
+    """The scenario with markers that hang some millimetres from where the map has them."""
     return made.model_copy(update={"installation": Installation(marker_position_m=_MAP_M)})
 
 

@@ -64,12 +64,12 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """For files and for the reader."""
+        """Name of the cell, for files and tables."""
         return f"{self.case}{'_plain' if self.plain else ''}_{folder(self.take)}_{self.take.variant}"
 
 
 def floor(case: str) -> Floor:
-    """On which floor a case is driven."""
+    """Floor on which a case is driven."""
     return FAILURES[case].floor
 
 
@@ -98,7 +98,7 @@ def _run_group(cells: Sequence[Cell]) -> dict[Cell, Scores]:
 
 
 def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """What a cell gave: from the cache, or made now and put there."""
+    """Result of a cell: from the cache, or made now and put there."""
     path = cache_folder() / "installed" / f"{name}_{_sources()}.json"
     if path.is_file():
         return dict(json.loads(path.read_text(encoding="utf-8")))
@@ -129,7 +129,7 @@ def _sources() -> str:
 
 
 def run_cell(cell: Cell) -> Scores:
-    """Replay and score a case; what fails has its reason."""
+    """Scores of a case that is replayed now; of a failed run the reason."""
     recorded = load(cell.take)
     try:
         chain = [failure(described) for described in FAILURES[cell.case].chain(recorded)]

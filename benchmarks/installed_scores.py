@@ -1,4 +1,4 @@
-"""What one run shows of an installation: errors, honesty, refused sightings, and what it found of the truth.
+"""Scores of one run on an installation: errors, consistency, refused sightings, and found values against the truth.
 
 **What a run found of the installation** is a mapping of names to values with their sigmas. The names, and what the
 truth has under them, are those of `truth_values`; a run may have any part of them.
@@ -63,12 +63,12 @@ class Scores:
     batch_failed: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """What `from_json` reads."""
+        """Scores as values for JSON, which `from_json` reads."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Scores that were kept."""
+        """Scores from values of JSON."""
         told = dict(content)
         for name in ("online", "batch"):
             told[name] = None if told[name] is None else Errors(**told[name])
@@ -106,7 +106,7 @@ def errors(result: RunResult, config: Config, unknown_ns: tuple[int, int] | None
 
 
 def carried(given: Sequence[Event], lifted_ns: int) -> tuple[int, int]:
-    """From when the robot was carried away until the first image after it that shows a marker."""
+    """Stamps [ns] at which the robot was carried away, and of the first image after it that shows a marker."""
     seen = [e.stamp_ns for e in given if isinstance(e, CornersEvent) and e.sightings and e.stamp_ns > lifted_ns]
     return lifted_ns, min(seen, default=2**62)
 
@@ -130,7 +130,7 @@ def refused_share(decisions: Sequence[Decision]) -> float:
 
 
 def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
-    """What is true of an installation, by the names that a run gives it.
+    """True values of an installation, by the names that a run gives it.
 
     - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
       ``camera.focal_scale``: true over believed; ``camera.cx_px``, ``.cy_px``, ``.k1``, ``.k2``, ``.p1``, ``.p2``;
@@ -169,7 +169,7 @@ def truth_values(installed: Mapping[str, Any]) -> dict[str, float]:
 
 
 def found_by(result: RunResult) -> Found | None:
-    """What a run found of the installation, but for the learned motion's scale, which has no truth."""
+    """Installation that a run found, but for the learned motion's scale, which has no truth."""
     told = result.installation
     if not told:
         return None
@@ -200,7 +200,7 @@ def found_errors(found: Found, installed: Mapping[str, Any]) -> dict[str, tuple[
 
 
 def inside(found: Mapping[str, tuple[float, float]], sigmas: float = 3.0) -> list[bool]:
-    """Of each value, whether its error is within so many of its sigmas."""
+    """Whether each value's error is within so many of its sigmas."""
     return [abs(error) <= sigmas * sigma for error, sigma in found.values()]
 
 

@@ -47,7 +47,7 @@ _ASK_EVERY = 20  # events, where the stream is faster than real time
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     yield from timed(_TIMED[:1] if quick else _TIMED, _QUICK_S if quick else None)
     yield from disorder(SEEDS["test"][: 1 if quick else 5])
     yield from live_resume.measure(quick)
@@ -95,7 +95,7 @@ class _Timed:
         self._asked: list[LivePose] = []
 
     def run(self) -> None:
-        """Push and ask."""
+        """Push the recording's events with their timing, and ask for poses meanwhile."""
         done = threading.Event()
         with Live(self._config, self._map, roles=self._roles) as live:  # type: ignore[arg-type]
             live.subscribe(self._take)
@@ -156,7 +156,7 @@ def _slips(bag: Path) -> IntArray:
 
 
 def disorder(seeds: Iterable[int]) -> Iterator[Row]:
-    """Everything that goes wrong on the way, at once."""
+    """Rows of the errors where everything goes wrong on the way at once, over those of orderly events."""
     takes = [Take("installed", "unequal_radii", "test", seed) for seed in seeds]
     prepare(takes)
     keyframes, now = [], []

@@ -1,4 +1,4 @@
-"""What a live run costs in the long term, and where nothing fits: `python -m benchmarks.live_endurance`.
+"""Long live runs, and live runs where nothing fits the map: `python -m benchmarks.live_endurance`.
 
 - ``live.million_*``: a million keyframes of a robot that drives in a circle among beacons, at once, in one process:
   processor time of a keyframe in the last tenth over that in the first, each over that of a run that has just begun, in
@@ -41,7 +41,7 @@ _WARM_UP_S = 20.0
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     yield from wrong(quick)
     yield from million(20_000 if quick else _MILLION)
 
@@ -110,7 +110,7 @@ def _resident_mb() -> float:
 
 
 def wrong(quick: bool) -> Iterator[Row]:
-    """Where nothing that is seen fits the map."""
+    """Row of the cost of updates where nothing that is seen fits the map."""
     takes = [Take("installed", "unequal_radii", "test", seed) for seed in SEEDS["test"][: 1 if quick else 5]]
     prepare(takes)
     ratios = [_ratio(load(take), take.seed) for take in takes]

@@ -37,7 +37,7 @@ _THREE_SIGMAS = 14.16  # chi-square of three degrees of freedom that is exceeded
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """What one process told: seconds until OK, and squared Mahalanobis distances of its first OK pose and its last."""
+    """Seconds until OK in one process, and squared Mahalanobis distances of its first OK pose and of its last pose."""
 
     ok_s: float
     first: float
@@ -108,7 +108,7 @@ def _distance(estimate: Estimate, truth: Callable[[int], FloatArray]) -> float:
 
 
 def _live(recorded: Recorded, epoch: float, state: Path, out: Connection) -> None:
-    """Replay from now on, in real time, until killed; tell every estimate."""
+    """Replay from now on, in real time, until killed; send every estimate."""
     began = time.time()
 
     def tell(e: Estimate) -> None:

@@ -102,7 +102,7 @@ def _received(event: Event, start_ns: int, at_s: float) -> Event:
 
 
 def wrong_ids(events: Iterable[Event], ids: Iterable[int], rng: np.random.Generator) -> Iterator[Event]:
-    """Every marker is read as another one of the map."""
+    """The events with every marker read as another one of the map."""
     known = np.array(sorted(ids))
     for event in events:
         if isinstance(event, CornersEvent):
@@ -148,13 +148,13 @@ def circle_map() -> LandmarkMap:
 
 
 def circle_truth(stamp_ns: int) -> FloatArray:
-    """Pose ``(3,)``."""
+    """True pose ``(3,)`` of the robot on the circle."""
     angle = 2.0 * math.pi * ((stamp_ns - START_NS) * 1e-9 % PERIOD_S) / PERIOD_S
     return np.array([RADIUS_M * math.sin(angle), -RADIUS_M * math.cos(angle), se2.wrap(angle)])
 
 
 def circle(seconds: float, seed: int = 0) -> Iterator[Event]:
-    """A robot that drives in a circle for ever: odometry at 10 Hz, an IMU at 20 Hz, two beacons seen at 5 Hz."""
+    """Events of a robot that drives in a circle: odometry at 10 Hz, an IMU at 20 Hz, two beacons seen at 5 Hz."""
     rng = np.random.default_rng(seed)
     landmarks = list(circle_map().landmarks.values())
     speed, turn = 2.0 * math.pi * RADIUS_M / PERIOD_S, 2.0 * math.pi / PERIOD_S

@@ -47,7 +47,7 @@ _OTHERS = 2  # processes beside, on a machine of two cores
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """What one run published."""
+    """Messages that one run published, and its processor time."""
 
     stamps_ns: IntArray  # (n,) of the keyframes' poses
     positions: FloatArray  # (n, 2)
@@ -86,7 +86,7 @@ class _Recorder:
 
     @property
     def latencies_ms(self) -> FloatArray:
-        """Of each image whose exposure has a pose."""
+        """Time [ms] from an image to the pose of its exposure, for each image that has one."""
         both = self.images_ns.keys() & self.pose_sent_ns.keys()
         return np.array([(self.pose_sent_ns[stamp] - self.images_ns[stamp]) * 1e-6 for stamp in sorted(both)])
 
@@ -159,7 +159,7 @@ def _busy(count: int) -> Iterator[None]:
 
 
 def largest_difference_mm(heard: Heard, sample: Path) -> tuple[float, float]:
-    """Between published poses and those of an online run, and the share of the latter that is common."""
+    """Largest difference [mm] of published poses from those of an online run, and the share of the latter published."""
     config = load_config(sample / "robot.yaml")
     online = run(sample / "bag", sample / "map.yaml", config, "online").trajectory
     _, published, expected = np.intersect1d(heard.stamps_ns, online.stamps_ns, return_indices=True)
@@ -183,7 +183,7 @@ def measure(quick: bool) -> Iterator[Row]:
 
 
 def timing(prefix: str, runs: Sequence[Heard]) -> Iterator[Row]:
-    """Of several runs the worst; latencies over all."""
+    """Rows of the worst of several runs; latencies over all of them."""
     gaps_ms = [np.diff(heard.sent_s) * 1e3 for heard in runs]
     rates = [1e3 / float(gaps.mean()) for gaps in gaps_ms]
     jitters = [float(np.percentile(np.abs(gaps - gaps.mean()), 99)) for gaps in gaps_ms]

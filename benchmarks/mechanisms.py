@@ -1,4 +1,4 @@
-"""What each mechanism is for: ``python -m benchmarks.mechanisms [--quick] [--json FILE] [--split validation]``.
+"""Effect of each mechanism: ``python -m benchmarks.mechanisms [--quick] [--json FILE] [--split validation]``.
 
 Every adaptive mechanism of fgloc (`benchmarks.mechanisms_off`) is taken away by itself, under failures of
 `benchmarks.installed` and others, on simulated recordings as installed, and on robots of MRCLAM 6, whose landmarks are
@@ -56,7 +56,7 @@ _SEEDS: dict[Split, tuple[int, ...]] = {"validation": SEEDS["validation"][:3], "
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Of the command line."""
+    """Options of the command line."""
 
     split: Split = "test"
     prefixes: tuple[str, ...] = ("",)
@@ -76,7 +76,7 @@ class Options:
 
 
 def scope(quick: bool, options: Options) -> Scope:
-    """What is run; a quick run has one seed, two cases, two mechanisms and no robot."""
+    """Scope of a run; a quick one has one seed, two cases, two mechanisms and no robot."""
     seeds = _SEEDS[options.split][: 1 if quick else options.seeds]
     robots = mrclam.ROBOTS if options.split == "test" else mrclam.ROBOTS[: len(seeds)]
     return Scope(
@@ -104,7 +104,7 @@ def measure(quick: bool, options: Options) -> Iterator[Row]:
 
 
 def counted() -> Iterator[Row]:
-    """What is counted in the code."""
+    """Rows of the numbers that are counted in the code."""
     yield Row("mechanisms.kept", len(MECHANISMS))
     yield Row("mechanisms.constants", sum(len(found) for found in mechanisms_count.constants().values()))
     yield Row("mechanisms.lines", sum(mechanisms_count.lines().values()))

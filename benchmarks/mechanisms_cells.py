@@ -89,7 +89,7 @@ class Outcome:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """What was kept of `asdict`."""
+        """Outcome from values of `asdict`, as JSON keeps them."""
         told = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
         for name in ("online", "batch"):
             told[name] = None if told[name] is None else Errors(**told[name])
@@ -97,7 +97,7 @@ class Outcome:
 
 
 def run(cell: Cell) -> Outcome:
-    """Replay and score a case; what fails has its reason. The run with everything on is smoothed, too."""
+    """Replay and score a case; a failed run has its reason, and the run with everything on is smoothed too."""
     mechanism = BY_NAME.get(cell.off)
     recorded = robot(cell.source) if isinstance(cell.source, int) else load(cell.source)
     seed = cell.source if isinstance(cell.source, int) else cell.source.seed
@@ -146,7 +146,7 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
 
 
 def _changes(cell: Cell, recorded: Recorded) -> dict[str, Any]:
-    """Of the configuration."""
+    """Changes of the configuration."""
     if cell.case == GIVEN:
         return {"estimator": {"initial_pose": recorded.truth[0, 1:].tolist()}}
     return {FOREIGN: _FOREIGN_MODEL, WHEELS: _WHEELS_ALONE}.get(cell.case, {})

@@ -1,4 +1,4 @@
-"""How many hand-set constants and lines decide, for `benchmarks.mechanisms`.
+"""Numbers of hand-set constants and of lines that decide, for `benchmarks.mechanisms`.
 
 The deciding modules are those of `DECIDING`: they choose what is fused, how much it weighs, and where the robot is.
 A hand-set constant is a numeric literal other than 0, 1, 2 and 0.5, with either sign,
@@ -91,14 +91,14 @@ def in_sections(source: str, sections: tuple[str, ...] = SECTIONS) -> Iterator[L
 
 
 def _default(value: ast.expr) -> ast.expr:
-    """Of ``Field(default, ...)`` the default; of another section, which has its own, nothing."""
+    """Default in ``Field(default, ...)``, or the value itself; None for another section, which has its own."""
     if not isinstance(value, ast.Call):
         return value
     return value.args[0] if ast.unparse(value.func) == "Field" else ast.Constant(None)
 
 
 def listing(found: Mapping[str, list[Literal]]) -> str:
-    """All of them as text, by module."""
+    """Hand-set constants as text, by module."""
     out = []
     for module, literals in found.items():
         out.append(f"{module}: {len(literals)}")

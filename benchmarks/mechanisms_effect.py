@@ -1,4 +1,4 @@
-"""What a mechanism is worth: its runs with it off compared with those with it on, for `benchmarks.mechanisms`.
+"""Effect of a mechanism: its runs with it off compared with those with it on, for `benchmarks.mechanisms`.
 
 Taking a mechanism away *worsens* a failure if the mean ATE over the seeds grows by 5 % or more, if ln(NEES/3), of the
 run or while a robot is lifted, gets farther from the band of 0.7 to 1.4 by 0.05 or more, if more names are wrong or
@@ -27,7 +27,7 @@ Pairs = Sequence[tuple[Outcome, Outcome]]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What taking a mechanism away does to one failure.
+    """Effect of taking a mechanism away on one figure of a failure.
 
     Attributes:
         case: the failure.
@@ -47,7 +47,7 @@ class Change:
 
 
 def changes(case: str, pairs: Pairs, modes: Iterable[str] = MODES) -> list[Change]:
-    """All figures of one failure."""
+    """Changes of all figures of one failure."""
     fails = [sum(bool(o.failed) for o in of_all) for of_all in zip(*pairs, strict=True)]
     out = [Change(case, "failed", fails[0], fails[1], fails[0] - fails[1], fails[0] != fails[1])]
     good = [(off, on) for off, on in pairs if not off.failed and not on.failed]
@@ -74,7 +74,7 @@ def changes(case: str, pairs: Pairs, modes: Iterable[str] = MODES) -> list[Chang
 
 
 def outside(nees_over_3: float) -> float:
-    """How far ln(NEES/3) is from the band."""
+    """Distance of ln(NEES/3) from the band."""
     value = math.log(max(nees_over_3, 1e-12))
     return max(_BAND[0] - value, value - _BAND[1], 0.0)
 

@@ -1,4 +1,4 @@
-"""What weighs the motion sources, for the table of `benchmarks.mechanisms_off`."""
+"""Mechanisms that weigh the motion sources, for the table of `benchmarks.mechanisms_off`."""
 
 from __future__ import annotations
 

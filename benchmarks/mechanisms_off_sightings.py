@@ -1,4 +1,4 @@
-"""What weighs and associates sightings, for the table of `benchmarks.mechanisms_off`."""
+"""Mechanisms that weigh and associate sightings, for the table of `benchmarks.mechanisms_off`."""
 
 from __future__ import annotations
 

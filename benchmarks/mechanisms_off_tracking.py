@@ -1,4 +1,4 @@
-"""What decides on the place, linearizes and smooths, for the table of `benchmarks.mechanisms_off`."""
+"""Mechanisms that decide on the place, linearize and smooth, for the table of `benchmarks.mechanisms_off`."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def cells(chosen: Scope, mechanism: Mechanism, case: str) -> list[tuple[Cell, Ce
 
 
 def effect(chosen: Scope, mechanism: Mechanism, found: Outcomes) -> list[Change]:
-    """What taking a mechanism away does, over the failures that were run; what it makes worse most comes first."""
+    """Effects of taking a mechanism away, over the failures that were run; the largest worsening comes first."""
     out: list[Change] = []
     for case in chosen.all_cases:
         runs = cells(chosen, mechanism, case)

@@ -37,7 +37,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """What is run.
+    """Scope of a run.
 
     Attributes:
         split, seeds: of the recordings.

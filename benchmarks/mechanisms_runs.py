@@ -49,7 +49,7 @@ def run_plain(cells: Sequence[InstalledCell], jobs: int) -> dict[InstalledCell, 
 
 
 def parallel(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Iterator[Any]:
-    """What the work gives for each item, in any order; in this process if there is one job."""
+    """Results of the work for the items, in any order; computed in this process if there is one job."""
     if jobs == 1 or len(items) < 2:
         yield from map(work, items)
         return
@@ -93,7 +93,7 @@ def _scoring(robots: bool) -> str:
 
 
 def file_name(cell: Cell) -> str:
-    """For what is kept of a cell."""
+    """Name of the file that keeps a cell's outcome."""
     where = f"robot{cell.source}" if isinstance(cell.source, int) else folder(cell.source)
     if cell.off:
         what = f"off_{'together' if JOIN in cell.off else cell.off}_{named(cell.off).signature}"

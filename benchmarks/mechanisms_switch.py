@@ -109,7 +109,7 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Mechanism:
-    """What adapts a weight, a covariance, an association or a state by evidence.
+    """Mechanism that adapts a weight, a covariance, an association or a state by evidence.
 
     Attributes:
         name: in the ids of rows.
@@ -131,7 +131,7 @@ class Mechanism:
 
     @contextmanager
     def off(self) -> Iterator[None]:
-        """The mechanism is switched off while this holds."""
+        """Switch the mechanism off inside a ``with``."""
         with ExitStack() as stack:
             for switch in self.switches:
                 stack.enter_context(switch.replaced())
@@ -139,12 +139,12 @@ class Mechanism:
 
     @property
     def signature(self) -> str:
-        """Changes with what its switches do."""
+        """Hash that changes with the switches."""
         return _digest(part for s in self.switches for part in (s.target, _fingerprint(s.off)))
 
 
 def together(mechanisms: Sequence[Mechanism]) -> Mechanism:
-    """All of them as one."""
+    """Join mechanisms into one."""
     modules = tuple(dict.fromkeys(module for m in mechanisms for module in m.modules))
     switches = tuple(switch for m in mechanisms for switch in m.switches)
     return Mechanism(JOIN.join(m.name for m in mechanisms), "Several at once.", modules, switches, batch=True)
@@ -163,7 +163,7 @@ def watched(mechanisms: Iterable[Mechanism]) -> Iterator[Counter[str]]:
 
 
 def probes_signature(mechanisms: Iterable[Mechanism]) -> str:
-    """Changes with what the probes count."""
+    """Hash that changes with the probes."""
     probed = [(m.name, m.probe) for m in mechanisms if m.probe is not None]
     return _digest(part for name, p in probed for part in (name, p.target, _fingerprint(p.acts)))
 
@@ -193,7 +193,7 @@ def _digest(parts: Iterable[str]) -> str:
 
 
 def _fingerprint(function: Any) -> str:
-    """What a function does, whatever line it is on; of a value object its representation."""
+    """Text that depends on the code of a function, but not on its line; of a value object its representation."""
     code = getattr(function, "__code__", None)
     return repr(function) if code is None else _of_code(code)
 
@@ -207,15 +207,15 @@ def _of_code(code: CodeType) -> str:
 
 
 def something(result: Any, *args: Any) -> bool:
-    """The mechanism acts where the result is not empty, zero or false."""
+    """Whether the result is not empty, zero or false, so that the mechanism acted."""
     return bool(result)
 
 
 def not_none(result: Any, *args: Any) -> bool:
-    """The mechanism acts where there is a result."""
+    """Whether there is a result, so that the mechanism acted."""
     return result is not None
 
 
 def called(*args: Any) -> bool:
-    """The mechanism acts where the function is called."""
+    """Whether the function was called, so that the mechanism acted: always."""
     return True

@@ -67,7 +67,7 @@ Scores = Mapping[str, Mapping[str, float]]  # by method: ate_mm, yaw_deg, nees_o
 
 
 def measure(quick: bool, split: Split, poses: Poses, seeds: int | None) -> Iterator[Row]:
-    """All rows; a quick run has one seed and two cases."""
+    """Rows of the benchmark; a quick run has one seed and two cases."""
     cases, chosen = (CASES[:2], SEEDS[split][:1]) if quick else (CASES, SEEDS[split][:seeds])
     prepare(Take("installed", floor(case), split, seed) for case in cases for seed in chosen)
     for case in cases:
@@ -108,7 +108,7 @@ def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
 
 
 def _scored(case: str, split: Split, seed: int) -> Scores:
-    """Scores of everybody in one case, kept under the hash of fgloc's sources and of the peers'."""
+    """Scores of fgloc and all peers in one case, kept under the hash of fgloc's sources and of the peers'."""
     return kept(f"peers_{case}_{split}_{seed}_{_sources()}", lambda: run_all(case, split, seed))
 
 
@@ -120,7 +120,7 @@ def _sources() -> str:
 
 
 def run_all(case: str, split: Split, seed: int) -> dict[str, dict[str, float]]:
-    """Everybody on the steps of one replay."""
+    """Scores of fgloc and all peers on the steps of one replay."""
     recorded, made, ms = replay(case, split, seed)
     truth = made.online.truth
     assert truth is not None
@@ -133,7 +133,7 @@ def run_all(case: str, split: Split, seed: int) -> dict[str, dict[str, float]]:
 
 
 def _robot(robot: int) -> Scores:
-    """Scores of everybody on one robot of MRCLAM, kept likewise."""
+    """Scores of fgloc and all peers on one robot of MRCLAM, kept likewise."""
 
     def run_all() -> dict[str, dict[str, float]]:
         with processor_times() as times:
@@ -169,7 +169,7 @@ def replay(case: str, split: Split, seed: int) -> tuple[Recorded, Replayed, floa
 
 
 def others(recorded: Recorded, made: Replayed) -> Runs:
-    """Everybody else, by name."""
+    """Peers by name."""
     camera, landmarks, wheels = recorded.camera, made.landmarks, recorded.config.wheels
     assert camera is not None
     assert made.online.truth is not None
@@ -179,7 +179,7 @@ def others(recorded: Recorded, made: Replayed) -> Runs:
 
 
 def dead_reckoning(steps: Sequence[Step], wheels: WheelsConfig, truth: Trajectory) -> list[Estimate]:
-    """Wheels alone from the first true pose; no covariance is claimed, so that its NEES is not a number."""
+    """Poses by the wheels alone from the first true pose; the covariance is NaN, and so is the NEES."""
     motion, pose, out = WheelMotion(wheels), None, []
     for step in steps:
         measured = motion.measure(step)
@@ -240,7 +240,7 @@ def _robots_truth(robot: int) -> Trajectory:
 
 
 def export(out: Path, quick: bool, split: Split, seeds: int | None) -> None:
-    """Write what everybody is given, a folder for each recording: ``bag/``, ``robot.yaml``, ``map.yaml``.
+    """Write the input of all peers, a folder for each recording: ``bag/``, ``robot.yaml``, ``map.yaml``.
 
     Images are replaced by the corners that fgloc detects in them; failures are made.
     """

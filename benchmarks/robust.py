@@ -37,7 +37,7 @@ def _say(text: str) -> None:
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     zygote.load()
     with tempfile.TemporaryDirectory(prefix="fgloc-robust-") as folder:
         place = Path(folder)

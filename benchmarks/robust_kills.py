@@ -66,7 +66,7 @@ def _call(work: Callable[[], None], kill_at: int = 0) -> int:
 
 
 def digest(folder: Path) -> str:
-    """Of the names and contents of a result."""
+    """Hash of the names and contents of a result."""
     found = hashlib.sha256()
     for path in sorted(folder.rglob("*")) if folder.is_dir() else []:
         name = path.relative_to(folder)
@@ -76,7 +76,7 @@ def digest(folder: Path) -> str:
 
 
 def writers(place: Path, bag: Path) -> Iterator[Writer]:
-    """One for each command."""
+    """Writers, one for each command."""
     yield from _runs(place, bag)
     yield _ablation(place, bag)
     yield _simulation(place)

@@ -58,7 +58,7 @@ _COMMAND = "import sys; from fgloc.cli import main; sys.argv = {0!r}; main()"
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows; a quick run has a tenth of the keyframes."""
+    """Rows of the benchmark; a quick run has a tenth of the keyframes."""
     yield from _start_up(3 if quick else 9)
     yield from _hours()
     yield from _sweeps()
@@ -205,7 +205,7 @@ def _added(graph: gtsam.NonlinearFactorGraph, factors: Iterable[gtsam.NonlinearF
 
 
 def _hours() -> Iterator[Row]:
-    """Of the bundled sample, a minute of a robot with camera, IMU and odometry, scaled to an hour."""
+    """Rows of the bundled sample, a minute of a robot with camera, IMU and odometry, scaled to an hour."""
     bag = _SAMPLE / "bag"
     read_bytes = sum(file.stat().st_size for file in bag.iterdir())
     seconds = 60.0

@@ -43,14 +43,14 @@ def only(config: Config, used: Sequence[str]) -> Config:
 
 
 def scores(folder: Path, used: Sequence[str]) -> Metrics:
-    """Of one run."""
+    """Metrics of one run."""
     config = only(load_config(folder / "robot.yaml"), used)
     config = start_at_truth(folder / "bag", config)
     return compute_metrics(run(folder / "bag", None, config, "online", check=False), config)
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     seeds, duration_s = (SEEDS[:1], 20.0) if quick else (SEEDS, _DURATION_S)
     ratios: dict[str, list[float]] = {name: [] for name in NAMES}
     ates: dict[str, list[float]] = {name: [] for name in ("none", *NAMES)}

@@ -43,7 +43,7 @@ _CAMERA_IDS = ("camera.corner_bias_px", "camera.corner_rms_px", "speed.camera_rt
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Rows of the benchmark."""
     seeds = range(1 if quick else 6)
     yield _agreement("physics.straight_error", "straight", seeds)
     yield _agreement("physics.spin_error", "spin", seeds)
@@ -185,7 +185,7 @@ def _suite(quick: bool) -> Row:
 
 
 class _Remembering(BagWriter):
-    """Keeps what it writes."""
+    """Bag writer that also keeps the messages in memory."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, compress=True)

@@ -1,4 +1,4 @@
-"""Photographs of markers whose ids others have published: which of them do we miss? And what does tracking miss?
+"""Published marker ids that are not found in photographs, and markers that tracking does not find.
 
 stills.missed_ids            published ids that are not found
 detect.over_full             time of a thorough search of every image over that of following markers
@@ -73,7 +73,7 @@ STILLS = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of one photograph."""
+    """Missed and false ids of one photograph."""
 
     still: Still
     missed: tuple[int, ...]
