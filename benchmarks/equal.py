@@ -76,7 +76,7 @@ def described(found: Found) -> Outcome:
 
 
 def verdict(found: Outcome | None, expected: Outcome | None) -> tuple[str, bool]:
-    """How a case compares with its committed outcome, in words, and whether that is good."""
+    """Comparison of a case with its committed outcome, in words, and whether it is good."""
     if found is None or expected is None:
         return "DIFFERS: " + ("no result" if found is None else "not in the committed file"), False
     names = [*(found.keys() | expected.keys()) - {"rows"}]

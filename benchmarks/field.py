@@ -104,7 +104,7 @@ def ate(estimate: Trajectory, truth: Trajectory, at_ns: IntArray, align: bool, l
 
 
 def _covered(stamps: IntArray, at_ns: IntArray, gap_s: float) -> Any:
-    """Which stamps lie between two that are no further apart than this."""
+    """Mask of the times that lie between two stamps at most ``gap_s`` apart."""
     if len(stamps) < 2:
         return np.zeros(len(at_ns), dtype=bool)
     k = np.clip(np.searchsorted(stamps, at_ns), 1, len(stamps) - 1)

@@ -28,7 +28,7 @@ _ANGLES = frozenset({"roll", "pitch", "yaw"})
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """How far a trajectory is from the truth, and whether its covariance is right."""
+    """Errors of a trajectory, and the consistency of its covariance."""
 
     ate_mm: float
     yaw_deg: float

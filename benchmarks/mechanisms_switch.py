@@ -1,4 +1,4 @@
-"""How `benchmarks.mechanisms` switches a mechanism off, and how it counts whether the mechanism acts at all.
+"""Switches that turn mechanisms off for `benchmarks.mechanisms`, and counters of whether a mechanism acts at all.
 
 A switch replaces one function or constant of fgloc by `unittest.mock.patch` for as long as a context holds; fgloc has
 no settings for this. A probe wraps one function and counts the calls whose result differs from what the mechanism would

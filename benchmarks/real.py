@@ -76,7 +76,7 @@ def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
 
 
 def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
-    """Ours beside wheel odometry, both against the mocap target.
+    """Rows of fgloc and of wheel odometry, both against the mocap target.
 
     Plain: the recording as it is, mocap at its time of receipt and the target taken for the robot's base, as the
     figures to beat were measured. Seated: mocap bursts dated back and the target where it sits on the robot (found

@@ -109,7 +109,7 @@ def _coulomb_acceleration(scene: Scene, mu: float) -> float:
 
 
 def _slip_contrast(quick: bool) -> Row:
-    """How much more the wheels are wrong where they slip in the simulator."""
+    """Ratio of the wheels' error where they slip in the simulator to that where they do not."""
     ratios = []
     for job in jobs(load_suite(BUNDLED), 20.0 if quick else None):
         if job.scenario.name == "patches" and (not quick or job.split == "test"):

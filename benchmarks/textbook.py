@@ -171,7 +171,7 @@ class Textbook:
         return float(np.hypot(*(pixels - seen.corners_px).T).mean())
 
     def _accepted(self, seen: MarkerCorners, predicted: FloatArray) -> bool:
-        """Rule 1; without it all that can be projected."""
+        """Whether rule 1 accepts a marker; without the rule, whether the marker can be projected."""
         if self._pipeline == "marker_poses":
             return True
         error = self._reprojection(seen, predicted)

@@ -261,7 +261,7 @@ def convert(source: Path, out: Path, storage: str = "mcap") -> Path:
 
 
 def date_bursts(received_ns: IntArray) -> IntArray:
-    """When poses that arrive in bursts were captured ``(n,)``: back from each burst's last, strictly increasing.
+    """Capture times ``(n,)`` [ns] of poses that arrive in bursts: back from each burst's last, strictly increasing.
 
     A burst too long for the time since the one before is spread over that time.
     """

@@ -44,7 +44,7 @@ class Run(Protocol):
 
     @property
     def modes(self) -> Sequence[Mode]:
-        """One per pose."""
+        """Mode of each pose."""
 
     @property
     def truth(self) -> Trajectory | None:

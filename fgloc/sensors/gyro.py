@@ -228,7 +228,7 @@ class Gyro:
         self.bias, self.bias_variance = bias, min(bias_variance, self._config.bias_sigma**2)
 
     def measure(self, step: Step, wheels: ArrayLike | None, since_fix_s: float = 0.0) -> Turn | None:
-        """Turn over the step.
+        """Turn of the robot over a step.
 
         Args:
             step: with the IMU's messages.
@@ -425,7 +425,7 @@ class ImuBias(EventFailure):
     acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """IMU messages."""
+        """Classes of the changed events: IMU messages."""
         return (ImuEvent,)
 
     def begin(self, scene: Scene) -> Change:

@@ -23,7 +23,7 @@ _SUBPIX_STOP = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.01)
 
 
 def detector_parameters(windows: tuple[int, int, int], smallest: float = SMALLEST) -> cv2.aruco.DetectorParameters:
-    """Detection settings.
+    """Parameters of OpenCV's marker detection.
 
     Cells are sampled 8 pixels wide without the outer quarters, where blur mixes them with their neighbours.
 

@@ -175,7 +175,7 @@ class Darkness(EventFailure):
     noise: float = Field(2.0, ge=0, description="read noise [gray levels of 255]")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Images."""
+        """Classes of the changed events: images."""
         return (ImageEvent,)
 
     def begin(self, scene: Scene) -> Change:
@@ -195,7 +195,7 @@ class MirroredImage(EventFailure):
     kind: Literal["mirrored_image"] = "mirrored_image"
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Images."""
+        """Classes of the changed events: images."""
         return (ImageEvent,)
 
     def begin(self, scene: Scene) -> Change:
@@ -210,7 +210,7 @@ class FrameRate(EventFailure):
     max_hz: float = Field(1.0, gt=0, description="Hz")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Everything that a camera reports."""
+        """Classes of the changed events: everything that a camera reports."""
         return (RawEvent, SightingsEvent)
 
     def begin(self, scene: Scene) -> Change:

@@ -286,7 +286,7 @@ class EncoderRollover(EventFailure):
     range_rad: float = Field(6.283185307179586, gt=0, description="rad")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Joint states."""
+        """Classes of the changed events: joint states."""
         return (JointsEvent,)
 
     def begin(self, scene: Scene) -> Change:
@@ -331,7 +331,7 @@ class WheelNan(EventFailure):
     kind: Literal["wheel_nan"] = "wheel_nan"
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Odometry and joints."""
+        """Classes of the changed events: odometry and joint states."""
         return (OdometryEvent, JointsEvent)
 
     def begin(self, scene: Scene) -> Change:
@@ -353,7 +353,7 @@ class WrongCovariance(EventFailure):
     factor: float = Field(0.01, description="of variances")
 
     def targets(self) -> tuple[type[Event], ...]:
-        """Odometry."""
+        """Classes of the changed events: odometry."""
         return (OdometryEvent,)
 
     def begin(self, scene: Scene) -> Change:

@@ -105,7 +105,7 @@ _ALIKE = 0.05  # relative spread of the track that commands give at different ti
 
 @dataclass(frozen=True, slots=True)
 class WheelPair:
-    """Two joints."""
+    """Joints of the left and the right wheel."""
 
     left: str
     right: str
