@@ -18,7 +18,7 @@ from fgloc.config import Config, NoiseDensity, config_of
 from fgloc.errors import FglocError
 from fgloc.graph.contradictions import smoothed_within_priors
 from fgloc.graph.measurement_log import Keyframe
-from fgloc.graph.noise import FusionRules
+from fgloc.graph.noise import FusionRules, NoiseBudget
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
 from fgloc.replay import Progress
@@ -33,6 +33,7 @@ _RANGE = math.log(4.0)  # of each factor, up and down
 _PRIOR = math.log(3.0)  # sigma of its logarithm
 _TELLS = 1.0  # by which the logarithm of the likelihood must grow
 _FAR = 2.0  # with such a factor other sightings are accepted: a second round
+_DISAGREES = 2.0  # scale on the covariance of wheels that differ from other sources more than they use to
 _ACCURACY = 0.1  # of the logarithms
 
 
@@ -57,7 +58,8 @@ def identify_motion_noise(
 
     The recording is smoothed, its sightings, map and installation with the noise and priors that they have; then the
     evidence of the linear graph is maximised over both factors (`fgloc.graph.batch.BatchSmoother.evidence`). Steps
-    in which the wheels were judged wrong or at rest keep their noise.
+    in which the wheels were judged wrong, or at rest, keep their noise; in the others the scale by which a run follows
+    the sources' disagreement is 1.
 
     A recording can show that the noise is larger. That it is smaller it shows only in part, as errors that last longer
     than a step seem smaller than they are: a factor below 1 is replaced by its root, and for commands by 1.
@@ -149,13 +151,12 @@ def _first(events: Iterator[Event], seconds: float) -> Iterator[Event]:
 
 
 def _is_sound(frame: Keyframe) -> bool:
-    """Whether the wheels measured the motion to a keyframe, and nothing was found wrong with them."""
-    return (
-        bool(frame.motions)
-        and frame.readings.wheels is not None
-        and not (
-            frame.readings.at_rest or frame.budget.rejected or frame.budget.scale != 1.0 or frame.prior is not None
-        )
+    """Whether the wheels measured the motion to a keyframe, and nothing says that they were wrong."""
+    if not frame.motions or frame.readings.wheels is None or frame.prior is not None:
+        return False
+    budget = frame.budget
+    return not (
+        frame.readings.at_rest or budget.rejected or budget.scale > _DISAGREES or budget.overruled_cov is not None
     )
 
 
@@ -163,4 +164,4 @@ def _with_noise(frame: Keyframe, scale: FloatArray, rules: FusionRules) -> tuple
     wheels = frame.readings.wheels
     assert wheels is not None
     readings = replace(frame.readings, wheels=replace(wheels, cov=wheels.cov * np.outer(scale, scale)))
-    return tuple(frame.budget.combine(readings, rules))
+    return tuple(NoiseBudget().combine(readings, rules))
