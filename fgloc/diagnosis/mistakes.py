@@ -119,7 +119,7 @@ class _Search:
 
     def __init__(self, path: Path, map_path: Path | None, config: Config) -> None:
         self._path, self._map_path = path, map_path
-        self.config = config
+        self.config = self._given = config
         self.landmark_map: LandmarkMap | None = None
         self.sentences: list[str] = []
         self._conventions: list[Finding] = []
@@ -210,7 +210,15 @@ class _Search:
             return
         image: Role = "image" if parts.detector is not None else "sightings"
         up = base_up(recording, self.config)
-        checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
+        # by gyro or truth alone the turn and the way are judged apart; images show both, and radii explain both
+        as_given = self.config.wheels.model_copy(update={"scale_omega": self._given.wheels.scale_omega})
+        before = self.config.model_copy(update={"wheels": as_given})
+        checked = check_fit(excerpt, before, landmark_map, camera, up, image)
+        if checked.correction is not None and checked.correction.config.wheels != as_given:
+            self.config = before
+            self._conventions = [f for f in self._conventions if f.code not in ("wheels.turn", "wheels.scale")]
+        elif before != self.config:
+            checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
         if checked.unexplained:
             self.sentences.append(
                 f"What the camera saw does not fit {self._map_path}, and no single mistake of the set-up explains it: "
