@@ -84,3 +84,9 @@ def test_init_writes_it_and_the_covariance_is_right_with_it(tmp_path):
         return compute_metrics(result, result.config).nees_over_3
 
     assert nees(made.text) < 1.6 < nees(first.text)
+
+
+@pytest.mark.parametrize(("made", "seed"), [(1.0, 2), (3.0, 0), (3.0, 4)])
+def test_noise_of_the_wheels_is_no_lag_and_no_mounting(tmp_path, made, seed):
+    bag = record(tmp_path, made, made, seed)
+    assert not [f.code for f in first_settings(bag).found]
