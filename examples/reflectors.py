@@ -31,7 +31,7 @@ class ReflectorsConfig(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReflectorsEvent(SensorEvent):
-    """What one turn of the scanner saw."""
+    """Reflectors that were seen in one turn of the scanner."""
 
     frame_id: str
     ids: tuple[int, ...]

@@ -26,8 +26,8 @@ from fgloc.runner import replayed
 from fgloc.sensors.base import with_values
 from fgloc.types import Event, Finding, FloatArray, MotionMeasurement
 
-_EXCERPT_S = 300.0  # of the recording; of one with images a part, as their markers have to be found
-_IMAGES_S = 60.0
+_EXCERPT_S = 300.0  # from the beginning of the recording
+_IMAGES_S = 60.0  # likewise, if it has images: to find the markers in them takes most of the time
 _LEAST_STEPS = 100
 _RANGE = math.log(4.0)  # of each factor, up and down
 _PRIOR = math.log(3.0)  # sigma of its logarithm
@@ -65,7 +65,7 @@ def identify_motion_noise(
     than a step seem smaller than they are: a factor below 1 is replaced by its root, and for commands by 1.
 
     Args:
-        bag: the recording; the first five minutes are used, of one with images the first.
+        bag: the recording; its first five minutes are used, or one minute if it has images.
         map_path: marker map; None: landmarks are estimated too.
         config: of the robot.
         progress: called now and then.
@@ -86,12 +86,13 @@ def identify_motion_noise(
         total, gained = total * factors, gained + gain
         if factors.max() < _FAR:
             break
-    if gained < _TELLS:
+    if not gained >= _TELLS:  # also if it is not a number
         return None
     value = f"{{{', '.join(f'{key}: {density:.3g}' for key, density in _scaled(noise, total).items())}}}"
     text = (
-        f"The noise of the wheels' motion is {total[0]:.2g} times the default along the way and {total[1]:.2g} times "
-        f"in turns: so the sightings are more likely (gain of log-likelihood {gained:.0f}): set wheels.noise: {value}."
+        f"The noise of the wheels' motion is {total[0]:.2g} times the assumed one along the way and {total[1]:.2g} "
+        f"times in turns: so the sightings are more likely (gain of log-likelihood {gained:.0f}): "
+        f"set wheels.noise: {value}."
     )
     return Finding("wheels.noise", text, lines={"wheels.noise": value}, value=float(total[0]))
 
@@ -99,7 +100,7 @@ def identify_motion_noise(
 def _most_likely(
     bag: Path, map_path: Path | None, config: Config, progress: Progress | None
 ) -> tuple[FloatArray, float] | None:
-    """Most likely factors ``(2,)`` and their gain of log-likelihood; None: the recording does not determine them."""
+    """Most likely factors ``(2,)`` and their gain of log-likelihood; None: too few steps have sound wheels."""
     with open_recording(bag, config.recording) as recording:
         parts = assemble(recording, map_path, config, True)
         longest_s = _EXCERPT_S if parts.detector is None else _IMAGES_S

@@ -210,13 +210,14 @@ class _Search:
             return
         image: Role = "image" if parts.detector is not None else "sightings"
         up = base_up(recording, self.config)
-        # by gyro or truth alone the turn and the way are judged apart; images show both, and radii explain both
-        as_given = self.config.wheels.model_copy(update={"scale_omega": self._given.wheels.scale_omega})
-        before = self.config.model_copy(update={"wheels": as_given})
+        before, apart = self.config, [f for f in self._conventions if f.code in ("wheels.turn", "wheels.scale")]
+        if apart:  # gyro and truth judge turn and way apart; images show both, and radii explain both
+            as_given = before.wheels.model_copy(update={"scale_omega": self._given.wheels.scale_omega})
+            before = before.model_copy(update={"wheels": as_given})
         checked = check_fit(excerpt, before, landmark_map, camera, up, image)
-        if checked.correction is not None and checked.correction.config.wheels != as_given:
+        if checked.correction is not None and checked.correction.config.wheels != before.wheels:
             self.config = before
-            self._conventions = [f for f in self._conventions if f.code not in ("wheels.turn", "wheels.scale")]
+            self._conventions = [f for f in self._conventions if f not in apart]
         elif before != self.config:
             checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
         if checked.unexplained:

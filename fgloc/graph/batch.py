@@ -373,8 +373,8 @@ class BatchSmoother:
         """Logarithm of the likelihood of the whole log, but for a constant, with other motions of its keyframes.
 
         ``-½ min |A x - b|² - log |R| - ½ Σ log |Q|``, with the white graph ``A x = b`` linear about the solution, its
-        square root R (``RᵀR = AᵀA``) and the covariances Q of the motions: Laplace's approximation. What is the best
-        covariance of the motions has the largest evidence. On a flat floor only.
+        square root R (``RᵀR = AᵀA``) and the covariances Q of the motions: Laplace's approximation. The most
+        likely covariances of the motions have the largest evidence. On a flat floor only.
 
         Source: MacKay 1992, "Bayesian interpolation".
 
@@ -388,12 +388,11 @@ class BatchSmoother:
         before, self._motions = self._motions, BatchMotions(frames, self._factors.installation)
         try:
             linear = self._linearized().linearize(self._values)
-        finally:
-            self._motions = before
-        try:
             root, solution = with_deep_stack(lambda: _eliminated(linear, self._order))
         except RuntimeError as error:
             raise EstimatorError("the graph leaves a pose undetermined") from error
+        finally:
+            self._motions = before
         covs = np.array([m.cov for some in motions for m in some]).reshape(-1, 3, 3)
         of_motions = 0.5 * float(np.linalg.slogdet(covs)[1].sum())
         return -float(linear.error(solution)) - float(root.logDeterminant()) - of_motions
