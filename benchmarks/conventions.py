@@ -33,7 +33,7 @@ from benchmarks.common import Row, main
 from benchmarks.field_recordings import RECORDINGS as FIELD
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of
+from fgloc.config import Config, config_of_file
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.signals import SignalCollector
 from fgloc.errors import FglocError
@@ -342,7 +342,7 @@ def measure(quick: bool) -> Iterator[Row]:
     online_false = 0
     for name, bag in bags():
         recordings += 1
-        recording = heard(bag, config_of(yaml.safe_load(first_settings(bag).text)))
+        recording = heard(bag, config_of_file(yaml.safe_load(first_settings(bag).text)))
         sound = found_in(recording, None)
         if sound:
             print(f"  {name} as it is: {[(f.code, f.value) for f in sound]}")

@@ -32,7 +32,8 @@ from benchmarks.gross_recordings import write as write_mistaken
 from fgloc import LandmarkMap, Live, RunResult, load_config, load_map, run, se2
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.cli import app
-from fgloc.config import config_of
+from fgloc.config import config_of, file_content
+from fgloc.files.settings import joined
 from fgloc.recording.reader import open_recording
 from fgloc.replay import RunMode
 from fgloc.sensors.failures import Scene
@@ -111,7 +112,7 @@ class Drive:
         landmarks = {} if self.sees in ("", "radio") else _beacons() if self.sees == "beacons" else _markers()
         folder.mkdir(parents=True)
         _Recorder(self, landmarks, folder / "bag").write()
-        (folder / "robot.yaml").write_text(yaml.safe_dump(self.settings), encoding="utf-8")
+        (folder / "robot.yaml").write_text(yaml.safe_dump(file_content(self.settings)), encoding="utf-8")
         if landmarks:
             shown = {i: replace(m, position=m.position + _shift(i, self.moved)) for i, m in landmarks.items()}
             write_map(LandmarkMap(shown, "DICT_4X4_50" if self.sees != "beacons" else ""), folder / "map.yaml")
@@ -389,7 +390,9 @@ def _run(
     folder = place / recording
     bag = bag_of(folder)
     content = (
-        yaml.safe_load((folder / "robot.yaml").read_text(encoding="utf-8")) if "robot.yaml" in _names(folder) else {}
+        joined(yaml.safe_load((folder / "robot.yaml").read_text(encoding="utf-8")))
+        if "robot.yaml" in _names(folder)
+        else {}
     )
     config = config_of({k: content.get(k, {}) | (changes or {}).get(k, {}) for k in {**content, **(changes or {})}})
     map_path = folder / "map.yaml" if landmark_map and "map.yaml" in _names(folder) else None

@@ -18,6 +18,8 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from fgloc.config import file_content
+from fgloc.files.settings import joined
 from fgloc.recording.messages import default_typestore
 from fgloc.types import FloatArray
 
@@ -206,12 +208,12 @@ def write(source: Path, folder: Path, mistake: Mistake | None, length_s: float =
     made = mistake or Mistake("")
     folder.mkdir(parents=True)
     start = _copied(source / "bag", folder / "bag", made.messages, length_s)
-    robot = yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8"))
+    robot = joined(yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8")))
     landmarks = yaml.safe_load((source / "map.yaml").read_text(encoding="utf-8"))
     robot, landmarks = deepcopy(robot), deepcopy(landmarks)
     made.robot(robot, start)
     made.map(landmarks)
-    (folder / "robot.yaml").write_text(yaml.safe_dump(robot), encoding="utf-8")
+    (folder / "robot.yaml").write_text(yaml.safe_dump(file_content(robot)), encoding="utf-8")
     (folder / "map.yaml").write_text(yaml.safe_dump(landmarks), encoding="utf-8")
     return folder / "bag"
 

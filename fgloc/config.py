@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -13,7 +13,17 @@ from pydantic import AfterValidator, BeforeValidator, Field, create_model, model
 
 from fgloc.errors import ConfigError
 from fgloc.extensions import outside_sensors
-from fgloc.files.settings import SHIPPED, Settings
+from fgloc.files.settings import (
+    SHIPPED,
+    Settings,
+    constant,
+    expert,
+    file_type,
+    joined,
+    key_in_file,
+    parted,
+    refuse_misplaced,
+)
 from fgloc.files.settings import Section as Section
 from fgloc.stats import GATE
 
@@ -27,13 +37,13 @@ class NoiseDensity(Section):
     splitting a step leaves the covariance as it was.
     """
 
-    x_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="m/√m, along the motion")
-    y_per_sqrt_m: float = Field(0.015, ge=0, le=100, description="m/√m, across the motion")
-    yaw_per_sqrt_m: float = Field(0.03, ge=0, le=100, description="rad/√m")
-    xy_per_sqrt_rad: float = Field(0.01, ge=0, le=100, description="m/√rad")
-    yaw_per_sqrt_rad: float = Field(0.05, ge=0, le=100, description="rad/√rad")
-    xy_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="m/√s, also at rest")
-    yaw_per_sqrt_s: float = Field(0.002, ge=0, le=100, description="rad/√s, also at rest")
+    x_per_sqrt_m: float = expert(0.03, ge=0, le=100, description="m/√m, along the motion")
+    y_per_sqrt_m: float = expert(0.015, ge=0, le=100, description="m/√m, across the motion")
+    yaw_per_sqrt_m: float = expert(0.03, ge=0, le=100, description="rad/√m")
+    xy_per_sqrt_rad: float = expert(0.01, ge=0, le=100, description="m/√rad")
+    yaw_per_sqrt_rad: float = expert(0.05, ge=0, le=100, description="rad/√rad")
+    xy_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="m/√s, also at rest")
+    yaw_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="rad/√s, also at rest")
 
 
 class WheelsConfig(Section):
@@ -50,21 +60,21 @@ class WheelsConfig(Section):
     left_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
     right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
-    angle_range: float | None = Field(
+    angle_range: float | None = expert(
         None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
     )
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(
         1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: it counts clockwise"
     )
-    yaw_per_m: float = Field(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
-    slowdown: float = Field(
+    yaw_per_m: float = expert(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
+    slowdown: float = expert(
         0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
     )
-    delay_s: float = Field(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
-    hold_s: float = Field(0.5, gt=0, le=60, description="a twist is held for this long when the next one is missing")
-    zero_speed: float = Field(0.0, ge=0, le=10, description="m/s below which a reported speed is rest")
-    zero_yaw_rate: float = Field(0.0, ge=0, le=10, description="rad/s below which a reported rate is rest")
+    delay_s: float = expert(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
+    hold_s: float = expert(0.5, gt=0, le=60, description="a twist is held for this long when the next one is missing")
+    zero_speed: float = expert(0.0, ge=0, le=10, description="m/s below which a reported speed is rest")
+    zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="rad/s below which a reported rate is rest")
     noise: NoiseDensity = NoiseDensity()
     scale_sigma: float = Field(
         0.01,
@@ -73,107 +83,126 @@ class WheelsConfig(Section):
         description="how far the radii of both wheels may be off alike; estimated, as all sigmas here",
     )
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
-    time_offset_sigma_s: float = Field(
+    time_offset_sigma_s: float = expert(
         0.005, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
     )
-    yaw_per_m_sigma: float = Field(
+    yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
         le=1,
         description="rad/m: how far yaw_per_m may be off: 0.4 % of unequal radii at a track of 0.26 m",
     )
-    slowdown_sigma: float = Field(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
-    delay_sigma_s: float = Field(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
+    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
+    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
 
 
 class GyroConfig(Section):
     """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
 
-    use: bool = True
-    scale: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: it turns the other way")
-    yaw_per_sqrt_s: float = Field(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
-    scale_sigma: float = Field(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
-    bias_sigma: float = Field(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
-    tilt_sigma_rad: float = Field(
-        0.0087, ge=0, le=0.5, description="rad: roll and pitch that the mounting is off by; estimated on uneven ground"
+    use: bool = expert(True)
+    scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: it turns the other way")
+    yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
+    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
+    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
+    tilt_sigma_rad: float = constant(
+        0.0087,
+        "mounting to half a degree",
+        ge=0,
+        le=0.5,
+        description="rad: roll and pitch that the mounting is off by; estimated on uneven ground",
     )
-    level_sigma_rad: float = Field(
+    level_sigma_rad: float = constant(
         0.005,
+        "a bias of 0.05 m/s², over gravity",
         ge=0,
         le=0.5,
         description="rad: tilt that the accelerometer's bias makes, in roll and pitch; estimated on uneven ground",
     )
-    acceleration_sigma: float = Field(
-        0.15, ge=1e-3, le=100, description="m/s²: of the specific force of a step, beside gravity; on uneven ground"
+    acceleration_sigma: float = constant(
+        0.15,
+        "vibration of a driving robot",
+        ge=1e-3,
+        le=100,
+        description="m/s²: of the specific force of a step, beside gravity; on uneven ground",
     )
-    bias_walk: float = Field(0.0003, ge=0, le=10, description="rad/s/√s")
+    bias_walk: float = constant(0.0003, "of a MEMS gyro; rests measure the bias", ge=0, le=10, description="rad/s/√s")
 
 
 class CameraConfig(Section):
     """The camera, where the recording does not say."""
 
     file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
-    rescale: bool = Field(False, description="scale the calibration to the image size instead of refusing")
-    focal_scale: float = Field(1.0, ge=0.01, le=100, description="true focal length over that of the calibration")
-    cx_px: float | None = Field(
+    rescale: bool = expert(False, description="scale the calibration to the image size instead of refusing")
+    focal_scale: float = expert(1.0, ge=0.01, le=100, description="true focal length over that of the calibration")
+    cx_px: float | None = expert(
         None, ge=-1e5, le=1e5, description="px: principal point; None, as below: the calibration's"
     )
-    cy_px: float | None = Field(None, ge=-1e5, le=1e5, description="px")
-    k1: float | None = Field(None, ge=-100, le=100, description="of plumb_bob; other models are taken as they are")
-    k2: float | None = Field(None, ge=-100, le=100)
-    position_sigma_m: float = Field(
+    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px")
+    k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; other models are taken as they are")
+    k2: float | None = expert(None, ge=-100, le=100)
+    position_sigma_m: float = expert(
         0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
     )
-    rotation_sigma_rad: float = Field(0.007, ge=0, le=0.5, description="rad: likewise, about each axis (0.4 degrees)")
-    focal_sigma: float = Field(0.003, ge=0, le=0.5, description="how far the focal length may be off, as a share")
-    principal_sigma_px: float = Field(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
-    distortion_sigma: float = Field(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
-    time_offset_sigma_s: float = Field(
+    rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis (0.4 degrees)")
+    focal_sigma: float = expert(0.003, ge=0, le=0.5, description="how far the focal length may be off, as a share")
+    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
+    distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
+    time_offset_sigma_s: float = expert(
         0.012,
         ge=0,
         le=1.0,
         description="s: how far its clock may be off that of the gyro (without one: of the wheels); estimated",
     )
-    time_jitter_s: float = Field(0.002, ge=0, le=0.1, description="s: what each stamp is off by on its own")
+    time_jitter_s: float = constant(
+        0.002,
+        "jitter of a driver that stamps on arrival",
+        ge=0,
+        le=0.1,
+        description="s: what each stamp is off by on its own",
+    )
 
 
 class LandmarksConfig(Section):
     """Range/bearing and marker-pose sightings."""
 
     range_sigma_m: float = Field(0.1, ge=1e-4, le=100)
-    range_sigma_per_m: float = Field(0.0, ge=0, le=10, description="added range sigma per metre of range")
+    range_sigma_per_m: float = expert(0.0, ge=0, le=10, description="added range sigma per metre of range")
     bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2)
-    range_scale: float = Field(1.0, ge=1e-4, le=1e4, description="true over reported range")
-    range_along_axis: bool = Field(
+    range_scale: float = expert(1.0, ge=1e-4, le=1e4, description="true over reported range")
+    range_along_axis: bool = expert(
         False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
     )
-    range_bias_m: float = Field(0.0, ge=-100, le=100, description="subtracted from the reported range")
-    bearing_bias_rad: float = Field(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
-    range_scale_sigma: float = Field(
+    range_bias_m: float = expert(0.0, ge=-100, le=100, description="subtracted from the reported range")
+    bearing_bias_rad: float = expert(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
+    range_scale_sigma: float = expert(
         0.005, ge=0, le=0.5, description="how far range_scale may be off; estimated during the run"
     )
-    bearing_bias_sigma_rad: float = Field(
+    bearing_bias_sigma_rad: float = expert(
         0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
     )
-    position_sigma_m: float = Field(
+    position_sigma_m: float = expert(
         0.0, ge=0, le=1.0, description="m: how far off the sensor is mounted, ahead and to the left; estimated"
     )
-    time_offset_sigma_s: float = Field(
+    time_offset_sigma_s: float = expert(
         0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
     )
-    yaw_sigma_rad: float | None = Field(
+    yaw_sigma_rad: float | None = expert(
         None,
         ge=1e-5,
         le=3.2,
         description="of a marker pose's yaw; None: marker poses are used as range and bearing only",
     )
-    cauchy_k: float = Field(
+    cauchy_k: float = expert(
         3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
     )
-    min_sightings: int = Field(
-        3, gt=0, le=1_000_000, description="sightings that an unknown landmark needs before it is used"
+    min_sightings: int = constant(
+        3,
+        "two may agree by chance",
+        gt=0,
+        le=1_000_000,
+        description="sightings that an unknown landmark needs before it is used",
     )
-    repeat_s: float = Field(
+    repeat_s: float = expert(
         0.0,
         ge=0,
         le=1e6,
@@ -188,16 +217,26 @@ class MarkersConfig(Section):
     dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
     default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, for maps that give none")
     sigma_px: float = Field(0.5, ge=1e-3, le=100, description="noise of one corner coordinate")
-    blur_s: float = Field(
+    blur_s: float = expert(
         2e-4,
         ge=0,
         le=0.1,
         description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
     )
-    cauchy_k: float = Field(
-        3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
+    cauchy_k: float = constant(
+        3.0,
+        "as for ranges",
+        ge=0.01,
+        le=1e6,
+        description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose",
     )
-    max_sightings: int = Field(12, gt=0, le=1000, description="the largest markers of an image that are used")
+    max_sightings: int = constant(
+        12,
+        "more cost time and hardly add information",
+        gt=0,
+        le=1000,
+        description="the largest markers of an image that are used",
+    )
 
 
 MODELS = Path(__file__).parent / "sensors" / "learned" / "models"
@@ -232,12 +271,12 @@ class MotionConfig(Section):
         None,
         description="a .safetensors file that fgloc train wrote, or a shipped one: shipped:sim/diff_drive",
     )
-    use: bool = True
-    scale: float = Field(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
-    scale_sigma: float = Field(
+    use: bool = expert(True)
+    scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
+    scale_sigma: float = expert(
         0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
     )
-    correlation: Literal["joint", "independent"] = Field(
+    correlation: Literal["joint", "independent"] = expert(
         "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
     )
 
@@ -312,8 +351,9 @@ class RecordingConfig(Section):
     received_stamps: tuple[_KnownRole, ...] = Field(
         (), description="roles whose header stamps are wrong: use receive times"
     )
-    clock_sigma_s: float = Field(
+    clock_sigma_s: float = constant(
         0.003,
+        "the other clocks are measured against it",
         ge=0,
         le=1.0,
         description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
@@ -338,29 +378,63 @@ class RecordingConfig(Section):
 class GateConfig(Section):
     """What is too wrong to enter the graph."""
 
-    max_speed: float = Field(5.0, gt=0, le=1e3, description="m/s")
-    max_yaw_rate: float = Field(10.0, gt=0, le=1e4, description="rad/s")
-    max_wheel_rate: float = Field(500.0, gt=0, le=1e6, description="rad/s")
-    max_position: float = Field(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
-    max_range: float = Field(50.0, gt=0, le=1e5, description="m, of a sighting")
-    min_range: float = Field(0.0, ge=0, le=1e5, description="m: sightings have to be farther off than this")
-    max_variance: float = Field(1e6, gt=0, le=1e12, description="above it a variance says 'unknown'")
-    quaternion_tolerance: float = Field(
-        0.05, gt=0, le=1, description="less off unit length: normalised; more: rejected"
+    max_speed: float = expert(5.0, gt=0, le=1e3, description="m/s")
+    max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="rad/s")
+    max_wheel_rate: float = constant(500.0, "ticks taken for radians exceed it", gt=0, le=1e6, description="rad/s")
+    max_position: float = expert(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
+    max_range: float = expert(50.0, gt=0, le=1e5, description="m, of a sighting")
+    min_range: float = constant(
+        0.0, "a range is positive", ge=0, le=1e5, description="m: sightings have to be farther off than this"
     )
-    gap_s: float = Field(1.0, gt=0, le=1e9, description="a silence of a sensor longer than this is reported")
-    clock_jump_s: float = Field(60.0, gt=0, le=1e9, description="a jump ahead larger than this starts a new segment")
-    clock_back_s: float = Field(1.0, gt=0, le=1e9, description="a jump back larger than this starts a new segment")
-    min_marker_side_px: float = Field(8.0, gt=0, le=1e4, description="a smaller marker is rejected")
+    max_variance: float = constant(
+        1e6, "drivers write 1e6 or more for unknown", gt=0, le=1e12, description="above it a variance says 'unknown'"
+    )
+    quaternion_tolerance: float = constant(
+        0.05,
+        "more than rounding is no quaternion",
+        gt=0,
+        le=1,
+        description="less off unit length: normalised; more: rejected",
+    )
+    gap_s: float = constant(
+        1.0,
+        "it is reported, and changes no pose",
+        gt=0,
+        le=1e9,
+        description="a silence of a sensor longer than this is reported",
+    )
+    clock_jump_s: float = constant(
+        60.0,
+        "shorter ones are silences",
+        gt=0,
+        le=1e9,
+        description="a jump ahead larger than this starts a new segment",
+    )
+    clock_back_s: float = constant(
+        1.0,
+        "messages late by less are sorted",
+        gt=0,
+        le=1e9,
+        description="a jump back larger than this starts a new segment",
+    )
+    min_marker_side_px: float = constant(
+        8.0, "of smaller ones the corners are not fitted well", gt=0, le=1e4, description="a smaller marker is rejected"
+    )
 
 
 class KeyframesConfig(Section):
     """When a pose is added to the graph."""
 
-    max_interval_s: float = Field(0.2, ge=0.001, le=60)
-    min_interval_s: float = Field(0.05, ge=0, le=60)
-    reorder_s: float = Field(0.1, ge=0, le=60, description="late messages wait this long to be put in order")
-    history_s: float = Field(2.0, ge=0, le=60, description="commands before a step that the learned motion may read")
+    max_interval_s: float = expert(0.2, ge=0.001, le=60)
+    min_interval_s: float = constant(0.05, "bounds the poses per second", ge=0, le=60)
+    reorder_s: float = expert(0.1, ge=0, le=60, description="late messages wait this long to be put in order")
+    history_s: float = constant(
+        2.0,
+        "the shipped models read 0.8 s",
+        ge=0,
+        le=60,
+        description="commands before a step that the learned motion may read",
+    )
 
     @model_validator(mode="after")
     def _in_order(self) -> KeyframesConfig:
@@ -373,9 +447,9 @@ class MapConfig(Section):
     """How well the landmarks of the map were surveyed, where the map does not give it of each."""
 
     scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the map's positions")
-    size_scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the sizes that the map gives")
+    size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres of one unit of the sizes that the map gives")
     position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
-    rotation_sigma_rad: float = Field(
+    rotation_sigma_rad: float = expert(
         0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"
     )
 
@@ -387,14 +461,20 @@ class EstimatorConfig(Section):
         "fixed_lag", description="isam2: the whole run; ekf: a filter of the pose alone, for comparison"
     )
     ground: Literal["flat", "uneven"] = Field("flat", description="uneven: height, roll and pitch are estimated too")
-    lag_s: float = Field(10.0, ge=0.05, le=1e5)
-    relinearize_threshold: float = Field(0.01, ge=1e-6, le=10)
+    lag_s: float = expert(10.0, ge=0.05, le=1e5)
+    relinearize_threshold: float = constant(0.01, "1 cm or 0.6 degrees", ge=1e-6, le=10)
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
-    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = (0.05, 0.05, 0.05)
-    initialise_s: float = Field(5.0, ge=0.01, le=1e5, description="how long to collect sightings for the first pose")
-    gate_probability: float = Field(GATE, gt=0, lt=1, description="a sighting less likely than 1 - this is not fused")
-    dead_reckoning_after_s: float = Field(2.0, gt=0, le=1e6, description="without a fix for this long: DEAD_RECKONING")
-    motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = Field(
+    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05))
+    initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="how long to collect sightings for the first pose")
+    gate_probability: float = constant(
+        GATE,
+        "one sound sighting in 10 000",
+        gt=0,
+        lt=1,
+        description="a sighting less likely than 1 - this is not fused",
+    )
+    dead_reckoning_after_s: float = expert(2.0, gt=0, le=1e6, description="without a fix for this long: DEAD_RECKONING")
+    motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = expert(
         "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
     )
 
@@ -416,14 +496,19 @@ class Distrust(Section):
 class WeightsConfig(Section):
     """How the weights of motion and landmark factors follow how the sources differ."""
 
-    adaptive: bool = Field(True, description="false: covariances stay as they were made; sightings are still gated")
-    distrust: tuple[Distrust, ...] = Field((), description="known failures: inside, the source's factors are left out")
-    window_s: float = Field(
-        2.0, ge=0.01, le=1e3, description="the motion sources are compared over windows of up to this long"
+    adaptive: bool = expert(True, description="false: covariances stay as they were made; sightings are still gated")
+    distrust: tuple[Distrust, ...] = expert((), description="known failures: inside, the source's factors are left out")
+    window_s: float = constant(
+        2.0,
+        "part of the fault test",
+        ge=0.01,
+        le=1e3,
+        description="the motion sources are compared over windows of up to this long",
     )
-    release_s: float = Field(0.6, gt=0, le=1e4, description="agreement for this long ends it")
-    quarantine_after: int = Field(
+    release_s: float = constant(0.6, "three keyframes", gt=0, le=1e4, description="agreement for this long ends it")
+    quarantine_after: int = constant(
         6,
+        "fewer may agree by chance",
         gt=0,
         le=1_000_000,
         description="sightings that a displacement has to explain before a landmark is left out as moved",
@@ -433,16 +518,18 @@ class WeightsConfig(Section):
 class BatchConfig(Section):
     """The batch smoother."""
 
-    max_iterations: int = Field(50, ge=1, le=1000, description="of Levenberg–Marquardt")
+    max_iterations: int = constant(50, "it converges in some ten", ge=1, le=1000, description="of Levenberg–Marquardt")
 
 
 class LiveConfig(Section):
     """A live run."""
 
-    startup_s: float = Field(
+    startup_s: float = expert(
         2.0, ge=0, le=1e6, description="the run begins this long after its first event, without what has not come"
     )
-    image_queue: int = Field(4, gt=0, le=100_000, description="images that may wait for detection; the oldest goes")
+    image_queue: int = constant(
+        4, "older images are late", gt=0, le=100_000, description="images that may wait for detection; the oldest goes"
+    )
 
 
 class TruthConfig(Section):
@@ -452,10 +539,10 @@ class TruthConfig(Section):
         0.0, ge=-100, le=100, description="yaw of the truth's body axes in the base frame; subtracted"
     )
     offset_m: tuple[_Place, _Place] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
-    axes: Literal["enu", "ned"] = Field("enu", description="ned: x north, y east, yaw clockwise")
-    scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of its positions")
+    axes: Literal["enu", "ned"] = expert("enu", description="ned: x north, y east, yaw clockwise")
+    scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres of one unit of its positions")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
-    max_gap_s: float = Field(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
+    max_gap_s: float = expert(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
 
 
 class Config(SensorSections):
@@ -501,13 +588,53 @@ def _with_sensors(sensors: tuple[type[Any], ...]) -> type[Config]:
     )
 
 
+def robot_file() -> type[Section]:
+    """Model of ``robot.yaml``: sections of users, and ``expert``."""
+    return file_type(config_type())
+
+
 def config_of(content: Any) -> Config:
-    """Settings as `load_config` has them, from what a file would say.
+    """Settings from values in their sections; nothing is under ``expert``, and constants may be among them.
 
     Raises:
         pydantic.ValidationError: a key or a value is wrong.
     """
     return config_type().model_validate(content)
+
+
+def config_of_file(content: Any) -> Config:
+    """Settings as `load_config` has them, from what a file would say.
+
+    Raises:
+        ConfigError: a key is misplaced, or a constant.
+        pydantic.ValidationError: a key or a value is wrong.
+    """
+    refuse_misplaced(content, config_type())
+    robot_file().model_validate(content)
+    return config_of(joined(content))
+
+
+def file_content(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Values in their sections as ``robot.yaml`` has them: those of experts under ``expert``, and no constants."""
+    return parted(content, config_type())
+
+
+def with_value(config: Config, key: str, value: Any) -> Config:
+    """The configuration with one value set, by its key in ``robot.yaml``; a mapping is merged.
+
+    Raises:
+        pydantic.ValidationError: the value is wrong.
+    """
+    section, name = key.removeprefix("expert.").split(".")
+    content = config.model_dump(mode="json", exclude_unset=True)
+    part = dict(content.get(section, {}))
+    part[name] = {**part.get(name, {}), **value} if isinstance(value, dict) else value
+    return config_of(content | {section: part})
+
+
+def setting(key: str) -> str:
+    """Key of a value in ``robot.yaml``: ``expert.wheels.delay_s`` for ``wheels.delay_s``."""
+    return key_in_file(key, config_type())
 
 
 def files_of(config: type[Config]) -> Iterator[tuple[str, str]]:
@@ -526,7 +653,7 @@ def yaml_of(config: Config, folder: Path) -> str:
         path = getattr(getattr(config, section), key)
         if path is not None:
             data[section][key] = shipped_name(path) or os.path.relpath(path, folder)
-    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110))
+    return str(yaml.safe_dump(parted(data, type(config)), sort_keys=False, default_flow_style=None, width=110))
 
 
 def load_config(path: Path) -> Config:
@@ -538,8 +665,8 @@ def load_config(path: Path) -> Config:
     settings = Settings(path, "give a YAML file with --config")
     if isinstance(settings.content.get("landmarks"), list):
         raise ConfigError(f"{path} is a map, expected settings of a robot; give a map with --map")
-    for section, key in files_of(config_type()):
+    for section, key in files_of(config_type()):  # none of them is an expert's
         part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(SHIPPED):
             settings.content[section] = part | {key: path.parent / part[key]}
-    return settings.validated(config_type())
+    return settings.validated_in_parts(config_type())

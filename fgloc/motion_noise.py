@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import RobotFile, with_findings
-from fgloc.config import Config, NoiseDensity, config_of
+from fgloc.config import Config, NoiseDensity, config_of_file, setting
 from fgloc.errors import FglocError
 from fgloc.graph.contradictions import smoothed_within_priors
 from fgloc.graph.measurement_log import Keyframe
@@ -42,7 +42,7 @@ def with_motion_noise(robot: RobotFile, bag: Path, progress: Progress | None = N
     if not {"image", "sightings"} & robot.roles.keys():
         return robot
     try:
-        config = config_of(yaml.safe_load(robot.text) or {})
+        config = config_of_file(yaml.safe_load(robot.text) or {})
         found = identify_motion_noise(bag, find_beside(bag, "map.yaml"), config, progress)
     except FglocError:  # why it cannot be smoothed, `info` and a run say
         return robot
@@ -92,9 +92,9 @@ def identify_motion_noise(
     text = (
         f"The noise of the wheels' motion is {total[0]:.2g} times the assumed one along the way and {total[1]:.2g} "
         f"times in turns: so the sightings are more likely (gain of log-likelihood {gained:.0f}): "
-        f"set wheels.noise: {value}."
+        f"set {setting('wheels.noise')}: {value}."
     )
-    return Finding("wheels.noise", text, lines={"wheels.noise": value}, value=float(total[0]))
+    return Finding("wheels.noise", text, lines={setting("wheels.noise"): value}, value=float(total[0]))
 
 
 def _most_likely(

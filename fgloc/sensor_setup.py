@@ -210,7 +210,7 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     if not {"odometry", "joints", "command"} & set(facts.roles):
         notes.append(
             "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
-            "gate.max_speed takes it."
+            "expert.gate.max_speed takes it."
         )
     camera = _camera(facts, config) if "image" in facts.roles or _in_pixels(facts.first) else None
     notes += camera.notes if camera is not None else ()
@@ -353,7 +353,7 @@ def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
     if not config.camera.rescale:
         raise CameraError(
             f"{facts.name}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
-            "calibrate at this size, or set camera.rescale: true"
+            "calibrate at this size, or set expert.camera.rescale: true"
         )
     return corrected(rescaled(camera, *size), config.camera)
 

@@ -10,14 +10,14 @@ import schema_files
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from fgloc.config import Config
+from fgloc.config import robot_file
 from fgloc_training.config import TrainConfig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = {"configuration.md": Config, "identification.md": TrainConfig}
+PAGES = {"configuration.md": robot_file(), "identification.md": TrainConfig}
 
 
-def sections(model=Config, path=""):
+def sections(model=PAGES["configuration.md"], path=""):
     """Dotted name and model of every section, outermost first."""
     for name, field in model.model_fields.items():
         if (kind := _section(field)) is not None:
@@ -49,7 +49,7 @@ def _default(value):
     return f"`{list(value) if isinstance(value, tuple) else value}`"
 
 
-def tables(model=Config):
+def tables(model=PAGES["configuration.md"]):
     """All tables, as they stand in the document; first that of the values outside every section."""
     parts = []
     for name, section in (("top level", model), *sections(model)):

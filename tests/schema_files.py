@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 from fgloc.ablation.suite import Suite
-from fgloc.config import Config
+from fgloc.config import robot_file
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "schema"
-MODELS = {"robot.schema.json": Config, "suite.schema.json": Suite}
+MODELS = {"robot.schema.json": robot_file(), "suite.schema.json": Suite}
 
 
 def schema(name):

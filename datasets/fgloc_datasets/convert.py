@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from fgloc.config import load_config
+from fgloc.config import file_content, load_config
 from fgloc.errors import RecordingError
 from fgloc.files.outputs import write_text
 from fgloc.instrumentation import counted
@@ -179,11 +179,18 @@ def write_merged(*streams: Iterable[Message], total: int | None = None) -> None:
 def write_robot(path: Path, settings: Mapping[str, Any], note: str) -> Path:
     """Write a ``robot.yaml`` headed by a comment, and load it back to prove it valid.
 
+    Args:
+        path: of the file.
+        settings: values in their sections, those of experts too.
+        note: the comment.
+
     Raises:
         ConfigError: the settings are not a configuration.
     """
     header = "".join(f"# {line}\n" for line in note.splitlines())
-    write_text(path, header + yaml.safe_dump(dict(settings), sort_keys=False, default_flow_style=None, width=110))
+    write_text(
+        path, header + yaml.safe_dump(file_content(settings), sort_keys=False, default_flow_style=None, width=110)
+    )
     load_config(path)
     return path
 

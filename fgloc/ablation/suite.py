@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from fgloc.ablation.failures import AnyFailure
-from fgloc.config import Config, Section, config_of, config_type, load_config
+from fgloc.config import Config, Section, config_of, config_type, load_config, robot_file
 from fgloc.errors import ConfigError
-from fgloc.files.settings import Settings, sentences
+from fgloc.files.settings import Settings, joined, refuse_misplaced, sentences
 from fgloc.recording.storage import find_beside
 from fgloc.replay import RunMode
 
@@ -194,17 +194,20 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
 
 
 def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path) -> Config:
-    content = _merged(_merged(base.model_dump(), entry.settings), variant.config)
+    content = _merged(_merged(base.model_dump(), joined(entry.settings)), joined(variant.config))
     for section, key in (("camera", "file"), ("motion", "model")):
         part = content[section]
         if isinstance(part, dict) and isinstance(part.get(key), str):  # of the suite; the base's are paths already
             content[section] = part | {key: folder / part[key]}
     try:
+        for change in (entry.settings, variant.config):
+            refuse_misplaced(change, config_type())
+            robot_file().model_validate(change)
         return config_of(content)
-    except ValidationError as error:
-        lines = [f"  {text}" for text in sentences(error, config_type())]
+    except (ValidationError, ConfigError) as error:
+        lines = sentences(error, robot_file()) if isinstance(error, ValidationError) else str(error).splitlines()
         raise ConfigError(
-            f"variant '{variant.name}' of recording '{entry.name}': wrong configuration\n" + "\n".join(lines)
+            "\n  ".join([f"variant '{variant.name}' of recording '{entry.name}': wrong configuration", *lines])
         ) from error
 
 

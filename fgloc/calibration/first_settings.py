@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from fgloc.config import Config, Role, config_of
+from fgloc.config import Config, Role, config_of_file
 from fgloc.diagnosis.conventions import Conventions, conventions
 from fgloc.diagnosis.pairs import Noise
 from fgloc.diagnosis.signals import other_clocks, read_signals
@@ -29,7 +30,7 @@ _UNCALIBRATED = {
     "position_sigma_m": 0.05,
     "time_offset_sigma_s": 0.05,
 }
-_WHEELS = (
+_WHEELS: tuple[str, ...] = (
     "  # Nobody has calibrated this odometry: radii and track may be off by more than those of measured wheels.",
     "  scale_sigma: 0.02",
     "  turn_scale_sigma: 0.05",
@@ -38,9 +39,12 @@ _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the
 _COMMANDED = (
     "  # Commands stand in for wheels. A robot follows them by a share that nobody has measured (5 to 12 % less is",
     "  # usual), late, and each time a little differently: priors and noise are wider than those of wheels.",
-    "  hold_s: 1.1",
     "  scale_sigma: 0.1",
     "  turn_scale_sigma: 0.1",
+)
+_COMMANDED_EXPERT = (
+    "  # Of commands in place of wheels, as above.",
+    "  hold_s: 1.1",
     "  yaw_per_m_sigma: 0.05",
     "  delay_sigma_s: 0.1",
     "  noise: {x_per_sqrt_m: 0.07, yaw_per_sqrt_rad: 0.09}",
@@ -109,10 +113,10 @@ def first_settings(bag: Path) -> RobotFile:
     text = with_findings(text, found)
     if compared is not None and "sightings" in seen.info.roles:
         text = _with_lines(text, _noise_lines(compared.noise, seen.has_map))
-    if compared is not None and seen.has_map:  # without a map these constants are not estimated
-        text = _with_lines(text, {"wheels": _COMMANDED if compared.commanded else _WHEELS})
-    elif compared is not None and compared.commanded:
-        text = _with_lines(text, {"wheels": _COMMANDED})
+    if compared is not None and compared.commanded:
+        text = _with_lines(text, {"wheels": _COMMANDED, "expert.wheels": _COMMANDED_EXPERT})
+    elif compared is not None and seen.has_map:  # without a map these constants are not estimated
+        text = _with_lines(text, {"wheels": _WHEELS})
     missing += [f.text for f in found if not f.lines]
     lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
@@ -125,18 +129,19 @@ def _noise_lines(noise: Noise | None, has_map: bool) -> dict[str, list[str]]:
     A recording can show that errors are larger than the defaults; that they are smaller it does not: over seconds the
     errors of one view are alike, and hidden.
     """
-    section, lines = Config().landmarks, []
+    section = Config().landmarks
     repeat_s = _CORRELATED_S if noise is None else max(noise.correlated_s, _CORRELATED_S)
-    lines += ["  # So long the errors of one landmark are taken to be alike.", f"  repeat_s: {repeat_s:.2g}"]
+    alike = ["  # So long the errors of one landmark are taken to be alike.", f"  repeat_s: {repeat_s:.2g}"]
     wide = {} if noise is None else {"range_sigma_m": noise.range_m, "bearing_sigma_rad": noise.bearing_rad}
     wide = {key: value for key, value in wide.items() if value > getattr(section, key)}
+    blocks: dict[str, list[str]] = {}
     if wide:
-        lines += ["  # Noise that the wheels' motion leaves unexplained."]
-        lines += [f"  {key}: {value:.3g}" for key, value in wide.items()]
+        lines = [f"  {key}: {value:.3g}" for key, value in wide.items()]
+        blocks["landmarks"] = ["  # Noise that the wheels' motion leaves unexplained.", *lines]
     if has_map:  # without one these constants are not estimated
-        lines += ["  # Nobody has calibrated this sensor: it may be off by more than a measured one (the defaults)."]
-        lines += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
-    blocks = {"landmarks": lines}
+        alike.append("  # Nobody has calibrated this sensor: it may be off by more than a measured one (the defaults).")
+        alike += [f"  {key}: {value:g}" for key, value in _UNCALIBRATED.items()]
+    blocks["expert.landmarks"] = alike
     if noise is not None and noise.map_m is not None and noise.map_m > Config().map.position_sigma_m:
         about = "  # By how much landmarks stand elsewhere than on the map, by sightings and wheels."
         blocks["map"] = [about, f"  position_sigma_m: {noise.map_m:.2g}"]
@@ -145,7 +150,7 @@ def _noise_lines(noise: Noise | None, has_map: bool) -> dict[str, list[str]]:
 
 def _compared(bag: Path, text: str) -> Conventions:
     """Conventions of the recording, read as the settings so far have it."""
-    config = config_of(yaml.safe_load(text) or {})
+    config = config_of_file(yaml.safe_load(text) or {})
     map_path = find_beside(bag, "map.yaml")
     landmark_map = T_base_sensor = imu_up = None
     with Recording(bag, config.recording) as recording:
@@ -169,8 +174,8 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
             values[key] = (finding.text.partition(": set ")[0] + ".", value)
     written: dict[str, list[str]] = {}
     for key, (why, value) in values.items():
-        section, name = key.split(".")
-        lines = [line for line in lines if not line.startswith(f"  {name}:") or _section_at(lines, line) != section]
+        section, _, name = key.rpartition(".")
+        lines = [line for line, place in zip(lines, _places(lines), strict=True) if place != key]
         comment = textwrap.wrap(why, 110, initial_indent="  # ", subsequent_indent="  # ")
         block = written.setdefault(section, [])
         block += [*(() if comment[0] in block else comment), f"  {name}: {value}"]
@@ -178,20 +183,30 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
 
 
 def _with_lines(text: str, blocks: Mapping[str, Sequence[str]]) -> str:
-    """A robot.yaml with lines put at the head of its sections."""
+    """A robot.yaml with lines put at the head of its sections; "expert.wheels" is one within another."""
     lines = text.splitlines()
     for section, block in blocks.items():
-        if f"{section}:" not in lines:
-            lines += ["", f"{section}:"]
-        at = lines.index(f"{section}:") + 1
-        lines[at:at] = block
+        outer = section.rpartition(".")[0]
+        for name in (outer, section) if outer else (section,):
+            if name not in (places := _places(lines)):
+                head = f"{'  ' * name.count('.')}{name.rpartition('.')[2]}:"
+                at = places.index(outer) + 1 if name != outer and outer else len(lines)
+                lines[at:at] = [head] if at < len(lines) or name.count(".") else ["", head]
+        at, indent = _places(lines).index(section) + 1, "  " * section.count(".")
+        lines[at:at] = [indent + line for line in block]
     return "\n".join(lines) + "\n"
 
 
-def _section_at(lines: Sequence[str], line: str) -> str:
-    """Name of the section that a line stands in."""
-    heads = [one for one in lines[: lines.index(line)] if one and not one.startswith((" ", "#"))]
-    return heads[-1].partition(":")[0] if heads else ""
+def _places(lines: Sequence[str]) -> list[str]:
+    """Dotted key of each line of a robot.yaml that has one; "" for comments and the rest."""
+    places: list[str] = []
+    open_keys: list[str] = []  # of the line and what it is in, by its indentation of two spaces each
+    for line in lines:
+        key = re.match(r"((?:  )*)(\w+):", line)
+        if key is not None:
+            open_keys[len(key[1]) // 2 :] = [key[2]]
+        places.append(".".join(open_keys) if key is not None else "")
+    return places
 
 
 def _look(bag: Path) -> _Seen:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.assembly import Assembly
-from fgloc.config import Config
+from fgloc.config import Config, setting
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
@@ -399,7 +399,7 @@ def _lines(settings: Sequence[Setting]) -> dict[str, str]:
         if section == "stamp_offset_s":
             lines["recording.stamp_offset_s"] = f"{{{key}: {s.found:.3f}}}"
         elif key not in _AXES:
-            lines[s.name] = f"{s.found:.5g}"
+            lines[setting(s.name)] = f"{s.found:.5g}"
     return lines
 
 
@@ -438,7 +438,7 @@ def _is_clock(s: Setting) -> bool:
 def _line(s: Setting) -> str:
     if s.name.split(".")[1] in _AXES:
         return "recording.sightings_pose, as the run's installation.yaml has it"
-    return f"{s.name}: {s.found:.5g}"
+    return f"{setting(s.name)}: {s.found:.5g}"
 
 
 def _number(s: Setting) -> str:

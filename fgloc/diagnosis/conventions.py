@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from fgloc import se2
-from fgloc.config import Config, Role, WheelsConfig, config_of
+from fgloc.config import Config, Role, WheelsConfig, setting, with_value
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
@@ -117,13 +117,13 @@ class Conventions:
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
         """Note a finding, and set its lines."""
-        shown = {key: _yaml(value) for key, value in lines.items()}
+        shown = {setting(key): _yaml(value) for key, value in lines.items()}
         value, sigma = (None, None) if figure is None else (figure.value, figure.sigma)
         remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
         self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
         for key, given in lines.items():
             with suppress(ValueError):  # beyond what a setting may be: it is said, and left as it is
-                self.config = with_line(self.config, key, given)
+                self.config = with_value(self.config, key, given)
 
 
 def conventions(
@@ -175,15 +175,6 @@ def conventions(
                 severity = _refuted(figure, found.config.wheels.scale_sigma)
             found.add(code, text, lines, figure, severity)
     return found
-
-
-def with_line(config: Config, key: str, value: Any) -> Config:
-    """The configuration with one key of robot.yaml set; a mapping is merged."""
-    section, name = key.split(".")
-    content = config.model_dump(mode="json", exclude_unset=True)
-    part = dict(content.get(section, {}))
-    part[name] = {**part.get(name, {}), **value} if isinstance(value, dict) else value
-    return config_of(content | {section: part})
 
 
 def _yaml(value: Any) -> str:
@@ -352,7 +343,7 @@ def _yaw_of_gyro(found: Conventions, signals: Signals, imu_up: FloatArray | None
     with_angles = found.config
     try:
         for key, value in lines.items():
-            with_angles = with_line(with_angles, key, value)
+            with_angles = with_value(with_angles, key, value)
     except ValueError:  # no wheels are like this: the angles have another unit
         return
     angles = signals.path(with_angles)
@@ -677,7 +668,7 @@ def _along_axis(
     bearing = np.arctan2(seen.points[:, 1], seen.points[:, 0])
     if seen.spatial or float(np.std(bearing)) < _ASKEW_RAD:  # ahead the two are alike
         return False
-    other = with_line(found.config, "landmarks.range_along_axis", along := not found.config.landmarks.range_along_axis)
+    other = with_value(found.config, "landmarks.range_along_axis", along := not found.config.landmarks.range_along_axis)
     places = {} if landmark_map is None else {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()}
     first, second = (_as_configured(config, seen, T_base_sensor)[0] for config in (found.config, other))
     gains = {"the wheels' motion": compared(path, first, second, m, {})}
@@ -1048,7 +1039,7 @@ def _first_pose(
     sentence = None if started is None else first_pose_sentence(found.config, started)
     if sentence is not None:
         found.findings.append(Finding("frame.first_pose", sentence, Severity.ERROR))
-        found.config = with_line(found.config, "estimator.initial_pose", None)
+        found.config = with_value(found.config, "estimator.initial_pose", None)
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------

@@ -320,16 +320,16 @@ def _lens(change: Change, given: Setup) -> Correction:
         k1, k2 = after.D[:2].tolist()
         sentence = (
             f"The camera's distortion is not as given, k1 {k1_of(given):.3g}: by the markers it is about {k1:.3g}; set "
-            f"camera.k1: {k1:.3f} and camera.k2: {k2:.3f}, or better calibrate it."
+            f"expert.camera.k1: {k1:.3f} and expert.camera.k2: {k2:.3f}, or better calibrate it."
         )
         return Correction(sentence, _set(given.config, "camera", k1=k1, k2=k2), given.landmark_map)
     factor = float(after.K[0, 0] / before.K[0, 0])
     scale = given.config.camera.focal_scale * factor
-    line = f"set camera.focal_scale: {scale:.4f}"
+    line = f"set expert.camera.focal_scale: {scale:.4f}"
     values: dict[str, float] = {"focal_scale": scale}
     if change.kind == "resolution":
         values |= {"cx_px": float(after.K[0, 2]), "cy_px": float(after.K[1, 2])}
-        line += f", camera.cx_px: {after.K[0, 2]:.1f} and camera.cy_px: {after.K[1, 2]:.1f}"
+        line += f", expert.camera.cx_px: {after.K[0, 2]:.1f} and expert.camera.cy_px: {after.K[1, 2]:.1f}"
         what = "is for another resolution"
     else:
         what = "has the wrong focal length"

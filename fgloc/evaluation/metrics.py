@@ -196,12 +196,12 @@ _MOST_DROPPED = 0.2  # share of a sensor's messages
 _FEWEST = 20  # dropped ones
 _PRIOR = re.compile(r"(position|scale)_sigma")  # of a section's settings, the one that says most of its installation
 _SETTINGS = {  # of a sensor whose messages are dropped
-    "odometry": "gate.max_speed, gate.max_yaw_rate or recording.received_stamps",
-    "joints": "gate.max_wheel_rate or recording.received_stamps",
-    "command": "gate.max_speed, gate.max_yaw_rate",
-    "imu": "gate.max_yaw_rate or recording.received_stamps",
+    "odometry": "expert.gate.max_speed, expert.gate.max_yaw_rate or recording.received_stamps",
+    "joints": "recording.received_stamps",
+    "command": "expert.gate.max_speed, expert.gate.max_yaw_rate",
+    "imu": "expert.gate.max_yaw_rate or recording.received_stamps",
     "image": "camera.file, recording.topics.image",
-    "sightings": "markers.sigma_px, map.position_sigma_m, gate.max_range",
+    "sightings": "markers.sigma_px, map.position_sigma_m, expert.gate.max_range",
 }
 
 _MOTION = ("odometry", "joints", "command")  # of which one is used

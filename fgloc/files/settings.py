@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, to_jsonable_python
 
 from fgloc.errors import ConfigError
 from fgloc.files.documents import Item, plain, read_document
@@ -31,6 +33,197 @@ class Section(BaseModel):
         return {} if content is None else content
 
 
+# --- Who sets a value: a user, an expert, or nobody -------------------------------------------------------------------
+
+EXPERT = "expert"
+"""Section of a settings file with the values that few users change, in sections of the same names."""
+
+Level = Literal["user", "expert", "constant"]
+
+
+def expert(default: Any, **rest: Any) -> Any:
+    """Field of a `Section` that a settings file has under ``expert:``."""
+    return Field(default, json_schema_extra={"level": "expert"}, **rest)
+
+
+def constant(value: Any, reason: str, **rest: Any) -> Any:
+    """Field of a `Section` that no settings file has; Python code may give it another value.
+
+    Args:
+        value: of the constant.
+        reason: why it is so, in a few words; shown to whoever sets it.
+        rest: as of pydantic's ``Field``.
+    """
+    return Field(value, json_schema_extra={"level": "constant", "reason": reason}, **rest)
+
+
+def level_of(field: FieldInfo) -> Level:
+    """Who sets a value that is no section."""
+    extra = field.json_schema_extra
+    return extra.get("level", "user") if isinstance(extra, dict) else "user"  # type: ignore[return-value]
+
+
+def section_of(field: FieldInfo) -> type[Section] | None:
+    """Model of a field that is a section; None: it is a value."""
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
+
+
+@cache
+def file_type(model: type[Section]) -> type[Section]:
+    """Model of a settings file: the values of users, and under ``expert`` those of experts.
+
+    Args:
+        model: with all values, as the code reads them.
+    """
+    users, experts = _part(model, "user"), _part(model, "expert")
+    if experts is None:
+        return model
+    experts.__doc__ = "Values that few users change, in sections of the same names."
+    fields: dict[str, Any] = {EXPERT: (experts, experts())}
+    return _made(model, users or Section, fields)
+
+
+def _made(model: type[Section], base: type[Section], fields: dict[str, Any]) -> type[Section]:
+    made: Any = create_model(model.__name__, __base__=base, __doc__=model.__doc__, **fields)
+    return made
+
+
+def _part(model: type[Section], level: Level) -> type[Section] | None:
+    """The model with its values of one level alone; None: it has none."""
+    fields: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        if (inner := section_of(field)) is not None:
+            if (part := _part(inner, level)) is not None:
+                fields[name] = (part, part())
+        elif level_of(field) == level:
+            fields[name] = (field.annotation, field)
+    if len(fields) == len(model.model_fields) and all(
+        section_of(field) in (None, fields[name][0]) for name, field in model.model_fields.items()
+    ):
+        return model
+    return _made(model, Section, fields) if fields else None
+
+
+def joined(content: Any) -> Any:
+    """Content of a settings file with the values under ``expert`` in the sections that they belong to."""
+    if not isinstance(content, Mapping):
+        return content
+    return _merged({key: value for key, value in content.items() if key != EXPERT}, content.get(EXPERT) or {})
+
+
+def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in change.items():
+        if isinstance(value, Mapping):
+            value = _merged(out.get(key) or {}, value)
+        out[key] = value
+    return out
+
+
+def parted(content: Mapping[str, Any], model: type[Section]) -> dict[str, Any]:
+    """Values of a model as a settings file has them, without constants: the inverse of `joined`."""
+    users, experts = _of_level(content, model, "user"), _of_level(content, model, "expert")
+    return users | {EXPERT: experts} if experts else users
+
+
+def _of_level(content: Mapping[str, Any], model: type[Section], level: Level) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key, value in content.items():
+        field = model.model_fields.get(key)
+        if field is None:
+            out |= {key: value} if level == "user" else {}
+        elif (inner := section_of(field)) is not None:
+            if part := _of_level(value, inner, level):
+                out[key] = part
+        elif level_of(field) == level:
+            out[key] = value
+    return out
+
+
+def key_in_file(key: str, model: type[Section]) -> str:
+    """Place of a value in a settings file: ``expert.wheels.delay_s`` for ``wheels.delay_s``.
+
+    Args:
+        key: of the value, or of a section whose values are all of one level.
+        model: with all values.
+    """
+    *outer, last = key.split(".")
+    inner = model
+    for part in outer:
+        section = section_of(inner.model_fields[part])
+        assert section is not None
+        inner = section
+    field = inner.model_fields[last]
+    while (section := section_of(field)) is not None:  # of a section the first value
+        field = next(iter(section.model_fields.values()))
+    return f"{EXPERT}.{key}" if level_of(field) == "expert" else key
+
+
+def refuse_misplaced(content: Any, model: type[Section], where: Callable[[Sequence[str]], str] = lambda _: "") -> None:
+    """Refuse values of a settings file that belong elsewhere in it, or that are constants.
+
+    Args:
+        content: of the file.
+        model: with all values.
+        where: what a line of the message begins with, by the place of its key.
+
+    Raises:
+        ConfigError: there are some; the message has the lines that replace them.
+    """
+    if not isinstance(content, Mapping):
+        return
+    experts = content.get(EXPERT)
+    users = {key: value for key, value in content.items() if key != EXPERT}
+    wrong = [*_misplaced(users, model), *_misplaced(experts, model, (EXPERT,))]
+    if not wrong:
+        return
+    moved: dict[str, Any] = {}
+    for _, _, value in wrong:
+        if value is not None:
+            moved = _merged(moved, value)
+    lines = [f"{where(loc)}{sentence}" for loc, sentence, _ in wrong]
+    if len(lines) > 1:
+        lines = [f"{len(lines)} settings are elsewhere now, or none any more", *(f"  {line}" for line in lines)]
+    if moved:
+        block = yaml.safe_dump(to_jsonable_python(moved), sort_keys=False, default_flow_style=None, width=110)
+        lines[-1] += "; write"
+        lines.append(block.rstrip())
+    raise ConfigError("\n".join(lines))
+
+
+def _misplaced(
+    content: Any, model: type[Section], loc: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], str, dict[str, Any] | None]]:
+    """Place, complaint and replacement of each value that is not where a settings file has it."""
+    if not isinstance(content, Mapping):
+        return
+    for key, value in content.items():
+        field, place = model.model_fields.get(key), (*loc, str(key))
+        if field is None:
+            continue
+        if (inner := section_of(field)) is not None:
+            yield from _misplaced(value, inner, place)
+            continue
+        level, name = level_of(field), ".".join(place)
+        if level == "constant":
+            assert isinstance(field.json_schema_extra, dict)
+            is_now = f"{field.default:g}" if isinstance(field.default, float) else str(field.default)
+            why = field.json_schema_extra["reason"]
+            yield place, f"{name} is no setting any more (it is {is_now}: {why}); remove the line", None
+        elif (level == "expert") != (loc[0] == EXPERT if loc else False):
+            to = place[1:] if level == "user" else (EXPERT, *place)
+            yield place, f"{name} is now {'.'.join(to)}", _nested(to, value)
+
+
+def _nested(place: Sequence[str], value: Any) -> dict[str, Any]:
+    for key in reversed(place):
+        value = {key: value}
+    return dict(value)
+
+
+# --- Reading ----------------------------------------------------------------------------------------------------------
+
 MAX_BYTES = 1_000_000  # of a settings file; PyYAML takes 6 s for it
 _MOST_SHOWN = 20  # wrong values
 _LONGEST = 80  # characters of a wrong value that are shown
@@ -43,6 +236,7 @@ _EXPECTED = {  # by the kind of error
 }
 
 M = TypeVar("M", bound=BaseModel)
+S = TypeVar("S", bound=Section)
 
 
 class Settings:
@@ -73,6 +267,17 @@ class Settings:
         if not isinstance(content, dict):
             raise ConfigError(f"{path}:{self._item.line}: expected keys with values, got {short(content)}; {remedy}")
         self.content = content
+
+    def validated_in_parts(self, model: type[S]) -> S:
+        """The content as a model some of whose values are under ``expert`` in the file, and some are constants.
+
+        Raises:
+            ConfigError: a key is unknown, misplaced or a constant, or a value is wrong; all are named.
+        """
+        refuse_misplaced(self.content, model, lambda loc: f"{self.path}:{self._line(loc)}: ")
+        self.validated(file_type(model))
+        self.content = joined(self.content)
+        return self.validated(model)
 
     def validated(self, model: type[M]) -> M:
         """The content as a model.

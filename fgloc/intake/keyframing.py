@@ -198,7 +198,7 @@ class KeyframeBuilder:
         for topic, source in self._sources.items():
             if source.patience_ns > self._reorder_ns:
                 notes.append(
-                    f"{topic}: comes later than keyframes.reorder_s after other sensors; waited for up to "
+                    f"{topic}: comes later than expert.keyframes.reorder_s after other sensors; waited for up to "
                     f"{source.patience_ns * 1e-9:.2f} s"
                 )
         return tuple(notes)

@@ -95,7 +95,7 @@ class EventValidator:
             if bad >= 10 and bad > 0.1 * seen:
                 notes.append(
                     f"{bad} of {seen} yaw rates ({reason}) exceed {self._config.max_yaw_rate:g} rad/s: perhaps degrees "
-                    "were given for radians; else raise gate.max_yaw_rate"
+                    "were given for radians; else raise expert.gate.max_yaw_rate"
                 )
         for name, topic in self._topics.items():
             if topic.gaps:

@@ -8,7 +8,7 @@ import yaml
 
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of
+from fgloc.config import Config, config_of_file
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.motion_noise import identify_motion_noise, with_motion_noise
 from fgloc.runner import run
@@ -56,7 +56,7 @@ def factors(bag, with_map: bool):
     found = identify_motion_noise(bag, bag.parent / "map.yaml" if with_map else None, Config())
     if found is None:
         return 1.0, 1.0
-    written, default = yaml.safe_load(found.lines["wheels.noise"]), Config().wheels.noise
+    written, default = yaml.safe_load(found.lines["expert.wheels.noise"]), Config().wheels.noise
     return written["x_per_sqrt_m"] / default.x_per_sqrt_m, written["yaw_per_sqrt_rad"] / default.yaw_per_sqrt_rad
 
 
@@ -80,7 +80,7 @@ def test_init_writes_it_and_the_covariance_is_right_with_it(tmp_path):
     assert [f.code for f in made.found if f not in first.found] == ["wheels.noise"]
 
     def nees(text: str) -> float:
-        result = run(bag, bag.parent / "map.yaml", config_of(yaml.safe_load(text)), "batch")
+        result = run(bag, bag.parent / "map.yaml", config_of_file(yaml.safe_load(text)), "batch")
         return compute_metrics(result, result.config).nees_over_3
 
     assert nees(made.text) < 1.6 < nees(first.text)

@@ -45,7 +45,7 @@ def test_the_tutorial_leads_from_bags_to_a_model(tmp_path):
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
     assert "warning: the size of the markers" in said
     assert len(yaml.safe_load((tmp_path / "bags" / "map.yaml").read_text())["landmarks"]) == 14
-    found = yaml.safe_load((tmp_path / "bags" / "robot.yaml").read_text())["wheels"]["yaw_per_m"]
+    found = yaml.safe_load((tmp_path / "bags" / "robot.yaml").read_text())["expert"]["wheels"]["yaw_per_m"]
     assert found == pytest.approx(-0.015 / 0.26, abs=0.02)  # the wheels differ by 1.5 %, their track is 0.26 m
     assert "the negative log-likelihood got worse" in said
     for name in ("result", "online"):

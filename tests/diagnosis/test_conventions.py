@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of
+from fgloc.config import Config, config_of, config_of_file
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
@@ -118,6 +118,11 @@ def record(folder: Path, wrong: Broken) -> Path:
 def conventions_of(bag: Path, config: Config):
     """Findings of `info` that have a figure or a line, but notes."""
     found = inspect_all(bag, bag.parent / "map.yaml", config).found
+    for key, value in ((key, value) for f in found for key, value in f.lines.items()):
+        line = yaml.safe_load(value)
+        for name in reversed(key.split(".")):
+            line = {name: line}
+        config_of_file(line)  # as a robot.yaml would have it
     return [f for f in found if f.severity is not Severity.NOTE and "." in f.code and not f.code.startswith("setup")]
 
 
@@ -183,13 +188,13 @@ def test_what_init_writes_undoes_what_is_broken(tmp_path):
     bag = record(tmp_path, WRITTEN)
     made = first_settings(bag)
     assert {"sightings.mirrored", "imu.unit", "truth.axes", "map.unit"} <= {f.code for f in made.found}
-    assert not conventions_of(bag, config_of(yaml.safe_load(made.text)))
+    assert not conventions_of(bag, config_of_file(yaml.safe_load(made.text)))
 
 
 def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     bag = record(tmp_path, Broken())
     config = config_of({"landmarks": {"range_along_axis": True}})
-    assert conventions_of(bag, config)[0].lines == {"landmarks.range_along_axis": "false"}
+    assert conventions_of(bag, config)[0].lines == {"expert.landmarks.range_along_axis": "false"}
     depths = record(tmp_path / "depths", Broken(depth=True))
     assert not conventions_of(depths, config)
 

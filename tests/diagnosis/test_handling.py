@@ -12,7 +12,7 @@ from real_data import real_data
 
 from fgloc import run
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of
+from fgloc.config import Config, config_of_file
 from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
@@ -87,7 +87,7 @@ def handled(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module", params=["batch", "online"])
 def ran(handled, request) -> RunResult:
-    return run(handled, None, config_of(yaml.safe_load(first_settings(handled).text)), request.param)
+    return run(handled, None, config_of_file(yaml.safe_load(first_settings(handled).text)), request.param)
 
 
 def codes(found: RunResult | RecordingInfo) -> dict[str, float | None]:
@@ -134,7 +134,7 @@ def test_a_robot_that_nobody_touched_is_not_accused(tmp_path) -> None:
 
 
 def test_the_first_settings_read_the_wheels_where_the_odometry_has_the_gyros_yaw(handled) -> None:
-    wheels = config_of(yaml.safe_load(first_settings(handled).text)).wheels
+    wheels = config_of_file(yaml.safe_load(first_settings(handled).text)).wheels
     assert wheels.source == "ticks"
     assert wheels.left_radius == pytest.approx(RADIUS, rel=0.02)
     assert wheels.track == pytest.approx(TRACK, rel=0.02)
@@ -156,7 +156,7 @@ def test_a_gyro_learns_its_bias_at_rest(ran) -> None:
 )
 def test_a_laboratory_floor_is_flat_although_the_robot_was_lifted_from_it(folder, name, held_s, lifted_s) -> None:
     bag = real_data(folder, name)
-    config = config_of(yaml.safe_load(first_settings(bag).text))
+    config = config_of_file(yaml.safe_load(first_settings(bag).text))
     for found in (codes(inspect_all(bag, None, config)), codes(run(bag, None, config, "online"))):
         assert found.get("motion.held") == (held_s and pytest.approx(held_s, abs=1.0))
         assert found["motion.lifted"] == pytest.approx(lifted_s, abs=1.0)

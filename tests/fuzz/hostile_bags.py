@@ -169,7 +169,7 @@ def _with_images(folder: Path, image: bytes, side: int) -> Path:
             if k == 20:
                 bag.compressed_image("/camera/image/compressed", stamp, image, frame_id="camera")
     (folder / "robot.yaml").write_text(
-        "markers: {dictionary: DICT_4X4_50, default_size_m: 0.1}\ncamera: {rescale: true}\n"
+        "markers: {dictionary: DICT_4X4_50, default_size_m: 0.1}\nexpert: {camera: {rescale: true}}\n"
     )
     return folder
 

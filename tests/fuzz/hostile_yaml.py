@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from fgloc.config import Config
+from fgloc.config import robot_file
 
 _BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
 _MERGES = "a0: &a0 {k: 1}\n" + "".join(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}\n" for i in range(1, 12))
@@ -29,7 +29,7 @@ SYNTAX = {
     "long integer": "estimator: {lag_s: " + "9" * 5000 + "}\n",
     "long hexadecimal": "estimator: {lag_s: 0x" + "f" * 5000 + "}\n",
     "long sexagesimal": "estimator: {lag_s: 1" + ":59" * 3000 + "}\n",
-    "long float": "estimator: {lag_s: 1." + "9" * 5000 + "}\n",
+    "long float": "expert: {estimator: {lag_s: 1." + "9" * 5000 + "}}\n",
     "empty integer": "estimator: {lag_s: !!int ''}\n",
     "integer of a word": "estimator: {lag_s: !!int word}\n",
     "empty float": "estimator: {lag_s: !!float ''}\n",
@@ -75,12 +75,13 @@ SYNTAX = {
     "unknown key": "wheels: {trak: 0.3}\n",
     "section of a word": "wheels: word\n",
     "section of a list": "wheels: [1, 2]\n",
-    "no noise at all": "wheels: {noise: {x_per_sqrt_m: 0, y_per_sqrt_m: 0, yaw_per_sqrt_m: 0, xy_per_sqrt_rad: 0, "
-    "yaw_per_sqrt_rad: 0, xy_per_sqrt_s: 0, yaw_per_sqrt_s: 0}, scale_sigma: 0, turn_scale_sigma: 0}\n",
-    "no sigmas": "estimator: {initial_sigmas: [0, 0, 0]}\n",
+    "no noise at all": "expert: {wheels: {noise: {x_per_sqrt_m: 0, y_per_sqrt_m: 0, yaw_per_sqrt_m: 0, "
+    "xy_per_sqrt_rad: 0, yaw_per_sqrt_rad: 0, xy_per_sqrt_s: 0, yaw_per_sqrt_s: 0}}}\n"
+    "wheels: {scale_sigma: 0, turn_scale_sigma: 0}\n",
+    "no sigmas": "expert: {estimator: {initial_sigmas: [0, 0, 0]}}\n",
     "topic of control characters": 'recording: {topics: {odometry: "\\e[31m/odom"}}\n',
-    "intervals of keyframes in the wrong order": "keyframes: {min_interval_s: 1.0, max_interval_s: 0.1}\n",
-    "distrust in the wrong order": "weights: {distrust: [{source: wheels, start_s: 2, end_s: 1}]}\n",
+    "intervals of keyframes in the wrong order": "expert: {keyframes: {max_interval_s: 0.01}}\n",
+    "distrust in the wrong order": "expert: {weights: {distrust: [{source: wheels, start_s: 2, end_s: 1}]}}\n",
 }
 """Texts by what is wrong with them."""
 
@@ -101,9 +102,9 @@ _VALUES = (
 )
 
 
-def numeric_keys(model: type[BaseModel] = Config, path: str = "") -> Iterator[tuple[str, str, int]]:
+def numeric_keys(model: type[BaseModel] | None = None, path: str = "") -> Iterator[tuple[str, str, int]]:
     """Section, key and length (0: one number) of each numeric value of a configuration."""
-    for name, field in model.model_fields.items():
+    for name, field in (model or robot_file()).model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel):
             yield from numeric_keys(kind, f"{path}{name}.")

@@ -69,7 +69,7 @@ def test_online_the_prior_holds_and_the_run_says_so(long_wheels, kind):
 
 def test_a_range_scale_is_found_with_the_sightings_that_were_refused_online(tmp_path):
     (finding,) = contradictions(smoothed(write_mistaken(tmp_path, range_scale=0.92, seconds=SECONDS)))
-    assert finding.lines.keys() == {"landmarks.range_scale"}
+    assert finding.lines.keys() == {"expert.landmarks.range_scale"}
     assert finding.value == pytest.approx(1.0 / 0.92, rel=0.01)
 
 

@@ -348,7 +348,7 @@ def left_out_note(seconds: float) -> str:
     """Sentence for the user where sightings contradicted the model for so long [s]."""
     return (
         f"The motion model was left out for {seconds:.1f} s: sightings contradict it. It may be of another robot or "
-        "floor: train one of this robot (fgloc train), or set motion.use: false."
+        "floor: train one of this robot (fgloc train), or set expert.motion.use: false."
     )
 
 

@@ -397,7 +397,7 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
         return ()
     sentence = (
         f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
-        f"set wheels.angle_range: {rolled[0]:.4f}."
+        f"set expert.wheels.angle_range: {rolled[0]:.4f}."
     )
     return (RawMistake(sentence, "wheels", {"angle_range": rolled[0]}),)
 

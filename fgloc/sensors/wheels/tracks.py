@@ -565,7 +565,7 @@ class TicksTrack(Track):
         twist = self._twist(left / seconds, right / seconds)
         if abs(twist[0]) > MAX_SPEED or abs(twist[2]) > MAX_TURN:
             self.rejections["wheels.encoder_reset"] += 1
-            hint = "; if the angle rolls over, set wheels.angle_range" if roll is None else ""
+            hint = "; if the angle rolls over, set expert.wheels.angle_range" if roll is None else ""
             self.notes["reset"] = (
                 f"wheel angles jumped {self.rejections['wheels.encoder_reset']} time(s), the last by {left:.3g} and "
                 f"{right:.3g} rad in {seconds:.3g} s: taken as a reset{hint}"
