@@ -20,7 +20,8 @@ from PIL import Image
 from fgloc.ablation.failures import corrupt, generators
 from fgloc.sensors.failures import Scene
 from fgloc.ablation.suite import FailureEntry
-from fgloc.config import load_config
+from fgloc.config import file_content, load_config
+from fgloc.files.settings import joined
 from fgloc.evaluation.report import write_results
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -41,11 +42,11 @@ def report(
     folder: Path, sample: str, mode: str, settings: dict[str, Any], chain: list[Any], mapped: bool = True
 ) -> Path:
     """Run a sample, with other settings and with failures; the report's file."""
-    content = yaml.safe_load((SAMPLES / sample / "robot.yaml").read_text(encoding="utf-8"))
+    content = joined(yaml.safe_load((SAMPLES / sample / "robot.yaml").read_text(encoding="utf-8")))
     for section, values in settings.items():
         content[section] = content.get(section, {}) | values
     file = folder / "robot.yaml"
-    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    file.write_text(yaml.safe_dump(file_content(content)), encoding="utf-8")
     config, bag = load_config(file), SAMPLES / sample / "bag"
     options: dict[str, Any] = {}
     if chain:

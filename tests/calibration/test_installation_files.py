@@ -92,7 +92,7 @@ def test_only_what_is_surely_beyond_the_prior_is_said():
     assert pulled.unpulled == pytest.approx(0.083, abs=0.001)
     state = found({"gyro.scale": (0.03, 0.0005, 0.005)})
     (finding,) = contradictions(InstallationFound(**_fields(state), settings=(odd,)), Config())
-    assert finding.lines == {"gyro.scale": "1.03"}
+    assert finding.lines == {"expert.gyro.scale": "1.03"}
 
 
 def test_pooling_counts_the_prior_once():
