@@ -16,7 +16,8 @@ from fgloc.replay import Progress
 from fgloc.runner import RunResult, run
 from fgloc.sensors import registry
 from fgloc.sensors.base import with_values
-from fgloc.sensors.wheels.sensor import DISTANCE_GAIN, freed
+from fgloc.sensors.wheels.motion import DRIVE
+from fgloc.sensors.wheels.sensor import DISTANCE_GAIN, freed, with_wheels
 from fgloc.types import InstallationFound, Setting
 
 _ROUNDS = 2  # with the gains of the first, other sightings are accepted and rejected than before
@@ -45,9 +46,8 @@ def calibrate(
     for _ in range(_ROUNDS):
         settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
         values = {_key(s): round(s.found, 7) for s in _of_odometer(settings)}
-        now = with_values(now, "wheels", values)
-    before = config.wheels
-    given = {s.name: getattr(before, _key(s)) for s in _of_odometer(settings)}
+        now = with_wheels(now, values)
+    given = {s.name: _given(s, config) for s in _of_odometer(settings)}
     settings = tuple(replace(s, given=given.get(s.name, s.given)) for s in settings)
     _check(settings)
     return with_settings(config, settings), settings
@@ -59,6 +59,13 @@ def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:
 
 def _key(setting: Setting) -> str:
     return setting.name.partition(".")[2]
+
+
+def _given(setting: Setting, config: Config) -> float:
+    drive = config.wheels.drive
+    if drive is not None and setting.name.startswith(DRIVE):
+        return drive.value(setting.name.removeprefix(DRIVE))
+    return float(getattr(config.wheels, _key(setting)))
 
 
 def _check(settings: Sequence[Setting]) -> None:
@@ -84,7 +91,7 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
             f"gains of the wheels; see `fgloc info {bag}`"
         )
     assert result.found is not None
-    gain = next((s for s in result.found.settings if s.name == DISTANCE_GAIN), None)
+    gain = next((s for s in result.found.settings if s.name in (DISTANCE_GAIN, f"{DRIVE}radius")), None)
     if not result.found.wheels or gain is None or gain.sigma > _UNSEEN * gain.prior_sigma:
         raise EstimatorError(
             f"{bag}: the gains of the wheels cannot be determined: between sightings there are no messages of wheels, "

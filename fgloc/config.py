@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 import yaml
 from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
 
+from fgloc.drives.every import AnyDrive
 from fgloc.errors import ConfigError
 from fgloc.extensions import outside_sensors
 from fgloc.files.settings import (
@@ -61,7 +62,13 @@ class WheelsConfig(Section):
     right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
     angle_range: float | None = expert(
-        None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
+        None,
+        ge=1e-3,
+        le=1e15,
+        description="rad (with ticks_per_turn: ticks): the angle rolls over after this much; None: never",
+    )
+    drive: AnyDrive | None = Field(
+        None, description="a drive other than two wheels, by its kind (docs/drives.md); None: two wheels, as above"
     )
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(
@@ -94,6 +101,11 @@ class WheelsConfig(Section):
     )
     slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
     delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
+
+    @property
+    def in_radians(self) -> bool:
+        """Whether the wheels' joints report angles and rates in radians."""
+        return self.drive is None or self.drive.ticks_per_turn is None
 
 
 class GyroConfig(Section):

@@ -100,6 +100,20 @@ def adjoint(pose: Triple) -> FloatArray:
     return np.array([[c, -s, y], [s, c, -x], [0.0, 0.0, 1.0]])
 
 
+def right_jacobian(twist: Triple) -> FloatArray:
+    """Right Jacobian ``(3, 3)`` of the exponential map: ``exp(ξ + δ) = exp(ξ) exp(J δ)`` for small δ.
+
+    Source: Solà et al. 2018, equation 163.
+    """
+    x, y, t = twist
+    if abs(t) < 1e-4:
+        a, b, c, d = 1.0 - t * t / 6.0, 0.5 * t, t / 6.0, 0.5
+    else:
+        s, k = math.sin(t), 1.0 - math.cos(t)
+        a, b, c, d = s / t, k / t, (t - s) / t**2, k / t**2
+    return np.array([[a, b, c * x - d * y], [-b, a, c * y + d * x], [0.0, 0.0, 1.0]])
+
+
 def compose_cov(cov_a: FloatArray, b: Triple, cov_b: FloatArray) -> FloatArray:
     """Covariance ``(3, 3)`` of ``T_a ∘ T_b`` for independent right perturbations of both.
 

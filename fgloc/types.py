@@ -73,6 +73,8 @@ class ControlEvent(MotionEvent):
 
     v: float  # m/s, forward
     omega: float  # rad/s, counter-clockwise
+    vy: float = 0.0  # m/s, to the left: of drives that go sideways
+    steering: float | None = None  # rad, of the steered wheels in place of the yaw rate; None: it is given
 
 
 @dataclass(frozen=True, slots=True, eq=False)

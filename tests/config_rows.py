@@ -23,6 +23,8 @@ def sections(model=PAGES["configuration.md"], path=""):
         if (kind := _section(field)) is not None:
             yield f"{path}{name}", kind
             yield from sections(kind, f"{path}{name}.")
+        for kind in _kinds(field):
+            yield f"{path}{name}: {kind.model_fields['kind'].default}", kind
 
 
 def rows(model):
@@ -37,6 +39,13 @@ def _section(field):
     kinds = [kind for kind in typing.get_args(field.annotation) if kind is not type(None)] or [field.annotation]
     kind = kinds[0]
     return kind if len(kinds) == 1 and isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
+def _kinds(field):
+    """The models of a field that is one of several sections, by its kind."""
+    for part in typing.get_args(field.annotation):
+        if typing.get_origin(part) is typing.Annotated:
+            yield from typing.get_args(typing.get_args(part)[0])
 
 
 def _default(value):

@@ -19,7 +19,7 @@ from fgloc_training.config import TrainConfig
 ROOT = Path(fgloc.__file__).resolve().parent.parent
 PACKAGES = {"fgloc": ROOT, "fgloc_datasets": ROOT / "datasets", "fgloc_training": ROOT / "training"}
 MODULES = sorted(path for name, folder in PACKAGES.items() for path in (folder / name).rglob("*.py"))
-BASE = {"extensions", "files", "types", "errors", "config", "frames", "se2", "stats"}
+BASE = {"extensions", "drives", "files", "types", "errors", "config", "frames", "se2", "stats"}
 PARTS = {"recording", "sensors", "graph"}
 ABOVE = {"evaluation", "ablation"}
 OUTER = {  # which of the two each may import

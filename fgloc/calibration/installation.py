@@ -24,6 +24,7 @@ from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
 from fgloc.sensors import registry
 from fgloc.sensors.base import InstallationState
 from fgloc.sensors.cameras import pinhole
+from fgloc.sensors.wheels.motion import DRIVE
 from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS, rounded
 from fgloc.types import Camera, Finding, FloatArray, InstallationFound, LandmarkMap, Setting, Severity, note
 
@@ -209,11 +210,11 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
     by_name = {s.name: s for s in settings}
 
     def put(key: str, value: Any) -> None:
-        section, name = key.split(".")
+        section, _, name = key.partition(".")
         changes.setdefault(section, {})[name] = value
 
     def spread(key: str, sigma: float) -> None:
-        section, name = key.split(".")
+        section, _, name = key.partition(".")
         if getattr(getattr(config, section), name) > 0.0:
             put(key, max(float(f"{sigma:.4g}"), changes.get(section, {}).get(name, 0.0)))
 
@@ -222,6 +223,11 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
         if s.name in sigmas:
             put(s.name, round(s.found, 7))
             spread(sigmas[s.name], s.sigma / (s.given if "scale" in s.name else 1.0))
+    of_drive = {s.name.removeprefix(DRIVE): s for s in settings if s.name.startswith(DRIVE)}
+    if of_drive and config.wheels.drive is not None:
+        values = {name: round(s.found, 9) for name, s in of_drive.items()}
+        sigmas_found = {name: float(f"{s.sigma:.4g}") for name, s in of_drive.items()}
+        put("wheels.drive", config.wheels.drive.with_values(values, sigmas_found))
     if "camera.x" in by_name:
         pose = [by_name[f"camera.{axis}"] for axis in _AXES]
         put("recording.sightings_pose", tuple(round(s.found, 6) for s in pose))
@@ -264,13 +270,14 @@ def _readable(cov: FloatArray) -> FloatArray:
 
 _SUFFIXES = {"s": "s", "m": "m", "px": "px", "rad": "rad"}
 _UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
-_UNITS |= {"yaw_per_m": "rad/m", "slowdown": "s/rad"}
+_UNITS |= {"yaw_per_m": "rad/m", "slowdown": "s/rad", "steering_zero": "rad", "steering_zeros": "rad"}
+_UNITS |= dict.fromkeys(("radius", "track", "wheelbase", "half_sum", "ring", "axle_x"), "m")
 
 
 def setting_unit(name: str) -> str:
     """Unit of a setting such as ``camera.cx_px``; "-" for a ratio."""
     section, _, key = name.partition(".")
-    named = section if section.startswith("stamp_offset") else key
+    named = section if section.startswith("stamp_offset") else key.removeprefix("drive.").rstrip("_0123456789")
     return _UNITS.get(named) or (_SUFFIXES.get(named.rpartition("_")[2], "-") if "_" in named else "-")
 
 
@@ -395,7 +402,7 @@ def _lines(settings: Sequence[Setting]) -> dict[str, str]:
     """Keys of ``robot.yaml`` with the values of these settings; the camera's pose is in the run's installation.yaml."""
     lines: dict[str, str] = {}
     for s in settings:
-        section, key = s.name.split(".")
+        section, _, key = s.name.partition(".")
         if section == "stamp_offset_s":
             lines["recording.stamp_offset_s"] = f"{{{key}: {s.found:.3f}}}"
         elif key not in _AXES:
@@ -436,7 +443,7 @@ def _is_clock(s: Setting) -> bool:
 
 
 def _line(s: Setting) -> str:
-    if s.name.split(".")[1] in _AXES:
+    if s.name.partition(".")[2] in _AXES:
         return "recording.sightings_pose, as the run's installation.yaml has it"
     return f"{setting(s.name)}: {s.found:.5g}"
 

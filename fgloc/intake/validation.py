@@ -38,6 +38,7 @@ def reported_bounds(config: Config) -> GateConfig:
         "max_speed": gate.max_speed / min(config.wheels.scale_v, 1.0),
         "max_yaw_rate": gate.max_yaw_rate / max(turn, _LEAST_SCALE),
         "max_range": gate.max_range / min(config.landmarks.range_scale, 1.0),
+        "max_wheel_rate": gate.max_wheel_rate if config.wheels.in_radians else math.inf,
         "max_position": gate.max_position / min(config.truth.scale, 1.0),
     }
     return gate.model_copy(update=bounds)

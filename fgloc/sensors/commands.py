@@ -28,7 +28,7 @@ class CommandInput(EventInput):
 
 def from_twist(message: Any, when: When) -> Event:
     """Event of a ``geometry_msgs/Twist``."""
-    return ControlEvent(*when, float(message.linear.x), float(message.angular.z))
+    return ControlEvent(*when, float(message.linear.x), float(message.angular.z), float(message.linear.y))
 
 
 def from_twist_stamped(message: Any, when: When) -> Event:
@@ -36,12 +36,22 @@ def from_twist_stamped(message: Any, when: When) -> Event:
     return from_twist(message.twist, when)
 
 
+def from_ackermann(message: Any, when: When) -> Event:
+    """Event of an ``ackermann_msgs/AckermannDrive``: its yaw rate follows from `wheels.drive`."""
+    return ControlEvent(*when, float(message.speed), 0.0, steering=float(message.steering_angle))
+
+
+def from_ackermann_stamped(message: Any, when: When) -> Event:
+    """Event of an ``ackermann_msgs/AckermannDriveStamped``."""
+    return from_ackermann(message.drive, when)
+
+
 def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:
     """Validator of commands: finite, and within the gate's bounds."""
     bounds = checks.config
 
     def validate(event: ControlEvent) -> Event | str:
-        if not math.isfinite(event.v + event.omega):
+        if not math.isfinite(event.v + event.omega + (event.steering or 0.0)):
             return "non_finite"
         if abs(event.v) > bounds.max_speed:
             return "speed_bound"
@@ -87,8 +97,13 @@ COMMANDS = BuiltIn(
         Stream(
             "command",
             ControlEvent,
-            {"geometry_msgs/msg/Twist": from_twist, "geometry_msgs/msg/TwistStamped": from_twist_stamped},
-            ("cmd_vel",),
+            {
+                "geometry_msgs/msg/Twist": from_twist,
+                "geometry_msgs/msg/TwistStamped": from_twist_stamped,
+                "ackermann_msgs/msg/AckermannDrive": from_ackermann,
+                "ackermann_msgs/msg/AckermannDriveStamped": from_ackermann_stamped,
+            },
+            ("cmd_vel", "ackermann_cmd", "drive"),
             validator=validator,
             findings=CommandChecks,
         ),

@@ -88,7 +88,19 @@ def from_joints(m: Any, when: When) -> Event:
     return JointsEvent(*when, tuple(m.name), vector(m.position), vector(m.velocity), vector(m.effort))
 
 
-_MAX_ANGLE = 1e9  # rad, of a joint
+def from_ackermann(m: Any, when: When) -> Event:
+    """Event of an ``ackermann_msgs/AckermannDrive`` that was measured: joints ``steering_angle`` and ``speed``."""
+    nan = math.nan
+    position, velocity = np.array([m.steering_angle, nan]), np.array([m.steering_angle_velocity, m.speed])
+    return JointsEvent(*when, ("steering_angle", "speed"), position, velocity, np.empty(0))
+
+
+def from_ackermann_stamped(m: Any, when: When) -> Event:
+    """Event of an ``ackermann_msgs/AckermannDriveStamped``, likewise."""
+    return from_ackermann(m.drive, when)
+
+
+_MAX_ANGLE = 1e15  # rad or ticks, of a joint: beyond it a double has no whole ticks
 _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
@@ -135,6 +147,16 @@ def odometry_validator(checks: FieldChecks) -> Callable[[OdometryEvent], Event |
 def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str]:
     """Validator of joint states: entries are judged one by one."""
     bounds = checks.config
+    measured: set[tuple[str, str, str]] = set()  # topic, joint and array of every value that was finite
+
+    def given(event: JointsEvent, name: str, i: int) -> bool:
+        """Whether a NaN is a gap: of a joint that measures this at times, or nothing else now."""
+        at_position = name == "position"
+        other: FloatArray = event.velocity if at_position else event.position
+        otherwise = len(other) == len(event.names) and abs(other[i]) <= (
+            bounds.max_wheel_rate if at_position else _MAX_ANGLE
+        )
+        return not otherwise or (event.topic, event.names[i], name) in measured
 
     def validate(event: JointsEvent) -> Event | str:
         n = len(event.names)
@@ -152,11 +174,17 @@ def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str
             good = [abs(value) <= bound and math.isfinite(value) for value in values]
             if name != "effort":
                 usable += sum(good)
+                measured.update((event.topic, event.names[i], name) for i in range(len(values)) if good[i])
             if all(good):
                 continue
             if all(math.isnan(value) for value in values):  # a driver's way to say that it has none
                 checks.note(f"{event.topic}: every {name} is NaN in some messages; taken as not given")
                 changes[name] = np.empty(0)
+            elif name != "effort" and not any(
+                given(event, name, i) or not math.isnan(values[i]) for i in range(n) if not good[i]
+            ):
+                silent = ", ".join(event.names[i] for i in range(n) if not good[i])
+                checks.note(f"{event.topic}: the {name} of {silent} is NaN; taken as not measured")
             else:
                 finite = all(math.isfinite(value) for value in values)
                 checks.rejections["joints." + (wild if finite else f"{name}_non_finite")] += 1

@@ -13,6 +13,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, Parameter, Rank
+from fgloc.sensors.wheels.driven import DriveTrack
 from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, TicksTrack, Track, TwistTimeline
 from fgloc.types import FloatArray, MotionMeasurement, Setting, Step
 
@@ -80,9 +81,7 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
     """Parameters of the wheels with their priors; without a gyro, other clocks are compared to that of the wheels."""
     wheels = config.wheels
     return (
-        Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn"), lengthens=True),
-        Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",), lengthens=True),
-        Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma, effects=("turn",)),
+        *_geometry(wheels),
         Parameter("wheels.slowdown", wheels.slowdown_sigma),
         Parameter("wheels.delay_s", wheels.delay_sigma_s),
         Parameter(
@@ -94,6 +93,31 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
     )
 
 
+DRIVE = "wheels.drive."
+"""Begins the name of a parameter of a drive."""
+
+
+def _geometry(wheels: WheelsConfig) -> Iterator[Parameter]:
+    """The drive's own parameters, or those of two wheels, which commands of any drive have too."""
+    drive = None if wheels.source == "command" else wheels.drive
+    if drive is None:
+        yield Parameter("wheels.radius", wheels.scale_sigma, effects=("length", "turn"), lengthens=True)
+        yield Parameter("wheels.track", wheels.turn_scale_sigma, effects=("turn",), lengthens=True)
+    else:
+        for name, sigma in drive.states.items():
+            is_radius = name == "radius"
+            yield Parameter(f"{DRIVE}{name}", sigma, effects=("length", "turn") if is_radius else ("turn",))
+    if drive is None or drive.unequal:
+        yield Parameter("wheels.yaw_per_m", wheels.yaw_per_m_sigma, effects=("turn",))
+
+
+def _of_drive(wheels: WheelsConfig) -> Iterator[tuple[str, float]]:
+    """Names of the drive's own parameters, and their values as configured."""
+    if wheels.drive is not None:
+        for name in wheels.drive.states:
+            yield f"{DRIVE}{name}", wheels.drive.value(name)
+
+
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
     """Rows of ``metrics.json`` on the wheels."""
     wheels = config.wheels
@@ -103,6 +127,7 @@ def _found_rows(config: Config) -> tuple[FoundRow, ...]:
         else FoundRow("wheels.yaw_per_m", "wheels.yaw_per_m", wheels.yaw_per_m, 1.0)
     )
     return (
+        *(FoundRow(name, name, value, 1.0) for name, value in _of_drive(wheels)),
         FoundRow("wheels.radius_scale", "wheels.radius", 1.0, 1.0),
         FoundRow("wheels.track_scale", "wheels.track", 1.0, 1.0),
         unequal,
@@ -123,6 +148,8 @@ def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
     gain["wheels.track"] *= -1.0
     yield from state.setting("wheels.scale_omega", wheels.scale_omega, wheels.scale_omega * longer * turn, gain)
     yield from state.setting("wheels.yaw_per_m", wheels.yaw_per_m, pull, {"wheels.yaw_per_m": 1.0})
+    for key, given in _of_drive(wheels):
+        yield from state.setting(key, given, given + state.value(key), {key: 1.0})
     for name in ("slowdown", "delay_s"):
         given = getattr(wheels, name)
         now = max(0.0, given + state.value(f"wheels.{name}"))
@@ -207,13 +234,18 @@ class WheelMotion:
         self._delay_ns = int(config.delay_s * 1e9)
         self._unknown_s = 0.0
         self._segment: int | None = None
-        if config.source == "auto":
+        if config.source == "auto" and config.drive is not None:
+            kinds = ["ticks"]
+        elif config.source == "auto":
             geometry = (config.left_radius, config.right_radius, config.track)
             kinds = ["ticks"] if None not in geometry else []
             kinds += ["twist", "command"]
         else:
             kinds = [] if config.source == "none" else [config.source]
-        self._tracks = [_TRACKS[kind](config) for kind in kinds]  # best first
+        driven = config.drive is not None
+        self._tracks = [
+            (DriveTrack if driven and kind == "ticks" else _TRACKS[kind])(config) for kind in kinds
+        ]  # best first
         self._all = tuple(self._tracks)
         self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
 
@@ -323,7 +355,14 @@ class WheelMotion:
                 start[2] += weight * (first - start[2])
                 end[2] += weight * (last - end[2])
             change = end - se2.adjoint(se2.inverse(m.motion)) @ start
-        return derivatives(m, change, self._config)
+        by = derivatives(m, change, self._config)
+        drive = self._config.drive
+        if drive is not None and self._chosen == "ticks":
+            names = tuple(drive.states)
+            start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
+            D = self._active(step).sensitivity(start_ns, end_ns, len(names))
+            by |= {f"{DRIVE}{name}": D[:, i] for i, name in enumerate(names)}
+        return by
 
     def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
         return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)

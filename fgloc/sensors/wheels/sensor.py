@@ -33,6 +33,8 @@ from fgloc.sensors.wheels.events import (
     JointsEvent,
     OdometryChecks,
     OdometryEvent,
+    from_ackermann,
+    from_ackermann_stamped,
     from_joints,
     from_odometry,
     joints_validator,
@@ -447,12 +449,27 @@ def _jumps(angles: FloatArray) -> list[float]:
 
 DISTANCE_GAIN = "wheels.scale_v"  # the setting that sightings determine wherever the robot moves
 _FREED = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # priors before anything was seen
+_FREED_DRIVE = 10.0  # likewise, times the sigma of a geometry that was measured by hand
 _FREED_COMMANDS = _FREED | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
+
+
+def with_wheels(config: Config, values: Mapping[str, float]) -> Config:
+    """Settings with some values of `wheels` replaced, by their keys; those of its drive begin with "drive."."""
+    own = {key: value for key, value in values.items() if "." not in key}
+    of_drive = {key.partition(".")[2]: value for key, value in values.items() if "." in key}
+    if of_drive and config.wheels.drive is not None:
+        return with_values(config, "wheels", own | {"drive": config.wheels.drive.with_values(of_drive)})
+    return with_values(config, "wheels", own)
 
 
 def freed(config: Config) -> tuple[Config, ...]:
     """Settings with wide priors on the gains, to be calibrated: of the wheels, and of commands in their place."""
     of_commands = with_values(config, "wheels", _FREED_COMMANDS)
+    drive = config.wheels.drive
+    if drive is not None and config.wheels.source != "command":
+        wide = {name: _FREED_DRIVE * sigma for name, sigma in drive.usual_sigmas().items() if sigma > 0.0}
+        sigmas = {name: max(wide.get(name, sigma), sigma) for name, sigma in drive.states.items()}
+        return (with_values(config, "wheels", {**_FREED, "drive": drive.with_values({}, sigmas)}),)
     return (of_commands,) if config.wheels.source == "command" else (with_values(config, "wheels", _FREED), of_commands)
 
 
@@ -472,7 +489,11 @@ WHEELS = BuiltIn(
         Stream(
             "joints",
             JointsEvent,
-            {"sensor_msgs/msg/JointState": from_joints},
+            {
+                "sensor_msgs/msg/JointState": from_joints,
+                "ackermann_msgs/msg/AckermannDrive": from_ackermann,
+                "ackermann_msgs/msg/AckermannDriveStamped": from_ackermann_stamped,
+            },
             ("joint_states",),
             validator=joints_validator,
         ),

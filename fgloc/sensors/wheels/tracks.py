@@ -42,10 +42,15 @@ def _silent_spread(seconds: float) -> float:
 class TwistTimeline:
     """Piecewise constant body twist, contiguous from its first stamp on; pieces may be unknown.
 
-    After the last piece its ``tail`` holds for a while; then nothing is known.
+    After the last piece its ``tail`` holds for a while; then nothing is known. A piece may have derivatives ``(3, p)``
+    of its twist by parameters of the drive.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, slides: bool = False) -> None:
+        """Start empty; ``slides``: the robot goes sideways too, and noise along and across is that of the motion."""
+        self._slides = slides
+        self._by: dict[int, FloatArray] = {}  # derivatives, by start
+        self._tail_by: FloatArray | None = None
         self._starts: list[int] = []
         self._pieces: list[Twist | None] = []  # None: unknown
         self._bridged: dict[
@@ -68,17 +73,19 @@ class TwistTimeline:
         self._starts.clear()
         self._pieces.clear()
         self._bridged.clear()
+        self._by.clear()
         self._starts.append(stamp_ns)
         self._pieces.append(None)
         self._end = self._tail_end = stamp_ns
 
-    def extend(self, end_ns: int, twist: Twist | None, bridged: bool = False) -> None:
+    def extend(self, end_ns: int, twist: Twist | None, bridged: bool = False, by: FloatArray | None = None) -> None:
         """Add a piece from the last one's end to ``end_ns``.
 
         Args:
             end_ns: its end.
             twist: constant over it; None: not known.
             bridged: only its ends were measured: the way between is as noisy as that of a robot that went on as usual.
+            by: derivatives ``(3, p)`` of the twist by the drive's parameters.
         """
         if end_ns <= self._end:
             return
@@ -89,7 +96,9 @@ class TwistTimeline:
             self._known_s += seconds
             self._way += math.hypot(twist[0], twist[1]) * seconds
             self._turned += abs(twist[2]) * seconds
-        if twist != self._pieces[-1]:
+        if by is not None:
+            self._by[self._end] = by
+        if twist != self._pieces[-1] or by is not None:
             self._starts.append(self._end)
             self._pieces.append(twist)
         long = end_ns - self._end >= _STEADY_NS
@@ -103,10 +112,11 @@ class TwistTimeline:
                 del self._starts[:old]
                 del self._pieces[:old]
                 self._bridged = {start: means for start, means in self._bridged.items() if start >= self._starts[0]}
+                self._by = {start: by for start, by in self._by.items() if start >= self._starts[0]}
 
-    def hold(self, twist: Twist, end_ns: int) -> None:
-        """Set the twist that is assumed beyond the last piece, until ``end_ns``."""
-        self._tail = twist
+    def hold(self, twist: Twist, end_ns: int, by: FloatArray | None = None) -> None:
+        """Set the twist that is assumed beyond the last piece, until ``end_ns``, with its derivatives."""
+        self._tail, self._tail_by = twist, by
         self._tail_end = max(end_ns, self._end)
 
     def integrate(self, start_ns: int, end_ns: int, noise: NoiseDensity) -> tuple[FloatArray, FloatArray, float]:
@@ -139,8 +149,9 @@ class TwistTimeline:
             if origin_ns in self._bridged:
                 usual = self._bridged[origin_ns]
                 speed, turn = max(speed, usual[0]), max(turn, usual[1])
-            qx = x2m * speed + xy2r * turn + xy2s
-            qy = y2m * speed + xy2r * turn + xy2s
+            ahead, aside = (abs(vx), abs(vy)) if self._slides else (speed, 0.0)
+            qx = x2m * ahead + y2m * aside + xy2r * turn + xy2s
+            qy = y2m * ahead + x2m * aside + xy2r * turn + xy2s
             qt = t2m * speed + t2r * turn + t2s
             cuts = int(abs(w) * seconds / _MAX_TURN) + 1
             h = seconds / cuts
@@ -154,6 +165,23 @@ class TwistTimeline:
             [[p[0] + _FLOOR, p[1], p[2]], [p[1], p[3] + _FLOOR, p[4]], [p[2], p[4], p[5] + _FLOOR]], dtype=float
         )
         return np.array([x, y, wrap(yaw)]), cov, unknown
+
+    def sensitivity(self, start_ns: int, end_ns: int, width: int) -> FloatArray:
+        """Derivatives ``(3, width)`` of the motion between two times (right perturbation) by the drive's parameters.
+
+        Source: Solà et al. 2018, equations 67 and 163 (right Jacobian and adjoint of SE(2)).
+        """
+        total = np.zeros((3, width))
+        for from_ns, to_ns, twist, origin_ns in self._between(start_ns, end_ns):
+            if twist is None:
+                continue
+            seconds = (to_ns - from_ns) * 1e-9
+            way = np.array(twist) * seconds
+            total = se2.adjoint(se2.inverse(se2.exp(way))) @ total
+            by = self._by.get(origin_ns) if from_ns < self._end else self._tail_by
+            if by is not None:
+                total += se2.right_jacobian(way) @ by * seconds
+        return total
 
     def _between(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, int, Twist | None, int]]:
         """Start, end, twist and, of unknown pieces, where the silence began."""
@@ -236,10 +264,10 @@ class Track:
 
     def __init__(self, config: WheelsConfig) -> None:
         """Start with nothing received."""
-        self.timeline = TwistTimeline()
+        self._config = config
+        self.timeline = self._empty()
         self.rejections: Counter[str] = Counter()
         self.notes: dict[str, str] = {}
-        self._config = config
         self._hold_ns = int(config.hold_s * 1e9)
         self._last_ns: int | None = None  # the newest stamp taken in
         self._given_ns = 0  # motion before this time was given to earlier steps
@@ -256,9 +284,13 @@ class Track:
 
     def reset(self) -> None:
         """Begin a new segment, which is not connected with what came before."""
-        self.timeline = TwistTimeline()
+        self.timeline = self._empty()
         self._last_ns = None
         self._forget()
+
+    def _empty(self) -> TwistTimeline:
+        drive = self._config.drive
+        return TwistTimeline(drive is not None and drive.slides)
 
     def _take(self, event: Any) -> None:
         raise NotImplementedError
@@ -278,22 +310,36 @@ class Track:
         vx, vy = scale * vx, scale * vy
         return vx, vy, config.scale_omega * w + config.yaw_per_m * vx
 
-    def _extend(self, stamp_ns: int, twist: Twist | None, held: Twist | None) -> None:
+    def _true_by(self, twist: Twist, by: FloatArray) -> FloatArray:
+        """Derivatives ``(3, p)`` of the twist of `_true` for those of the reported one."""
+        vx, vy, w = twist
+        config = self._config
+        share = max(0.0, 1.0 - config.slowdown * abs(w))
+        gain = config.scale_v * share * (math.hypot(vx, vy) >= config.zero_speed)
+        turning = config.scale_omega * (abs(w) >= config.zero_yaw_rate)
+        slower = -config.scale_v * config.slowdown * math.copysign(1.0, w) * (share > 0.0)
+        whole = np.array([[gain, 0.0, slower * vx], [0.0, gain, slower * vy], [0.0, 0.0, turning]])
+        whole[2] += config.yaw_per_m * whole[0]
+        return np.asarray(whole @ by)
+
+    def _extend(self, stamp_ns: int, twist: Twist | None, held: Twist | None, by: FloatArray | None = None) -> None:
         """Continue the timeline with ``twist`` or, if that is None, with ``held`` as long as it holds."""
         if self._last_ns is None:
             self.timeline.begin(stamp_ns)
         elif twist is not None:
-            self.timeline.extend(stamp_ns, self._true(twist), stamp_ns - self._last_ns > self._hold_ns)
+            by = None if by is None else self._true_by(twist, by)
+            self.timeline.extend(stamp_ns, self._true(twist), stamp_ns - self._last_ns > self._hold_ns, by)
         else:
             if held is not None:
                 self.timeline.extend(min(stamp_ns, self._last_ns + self._hold_ns), self._true(held))
             self.timeline.extend(stamp_ns, None)
 
-    def _reach(self, stamp_ns: int, held: Twist | None) -> None:
+    def _reach(self, stamp_ns: int, held: Twist | None, by: FloatArray | None = None) -> None:
         """Set the stamp of the newest reading; ``held`` is assumed beyond it."""
         self._last_ns = stamp_ns
         if held is not None:
-            self.timeline.hold(self._true(held), stamp_ns + self._hold_ns)
+            by = None if by is None else self._true_by(held, by)
+            self.timeline.hold(self._true(held), stamp_ns + self._hold_ns, by)
 
 
 class CommandTrack(Track):
@@ -306,9 +352,36 @@ class CommandTrack(Track):
         self._command: Twist | None = None
 
     def _take(self, event: ControlEvent) -> None:
+        twist = self._twist(event)
+        if twist is None:
+            return
         self._extend(event.stamp_ns, None, self._command)
-        self._command = (event.v, 0.0, event.omega)
+        self._command = twist
         self._reach(event.stamp_ns, self._command)
+
+    def _twist(self, event: ControlEvent) -> Twist | None:
+        """Commanded twist; None: the drive cannot be commanded like this.
+
+        Raises:
+            ConfigError: it is commanded by a steering angle, no drive is given, and nothing else measures the motion.
+        """
+        drive = self._config.drive
+        if event.steering is not None:
+            twist = None if drive is None else drive.commanded(event.v, event.steering)
+            if twist is not None:
+                return twist
+            text = "commands give a steering angle (ackermann_msgs): set wheels.drive to a kind that has one, ackermann"
+            if self._config.source == "command":
+                raise ConfigError(text)
+            self.rejections["wheels.command_steering"] += 1
+            self.notes["steering"] = text
+            return None
+        if drive is None or not drive.slides:
+            return event.v, 0.0, event.omega
+        if not math.isfinite(event.vy):
+            self.rejections["wheels.command_non_finite"] += 1
+            return None
+        return event.v, event.vy, event.omega
 
 
 def mean_twist(a: Twist | None, b: Twist | None) -> Twist | None:
@@ -500,7 +573,7 @@ def _differ(a: float, b: float) -> bool:
     return max(a, b) > _CHECK_TURN and not 0.75 * b < a < 1.34 * b
 
 
-_PATIENCE = 20  # messages without the wheels' joints before a note is made
+PATIENCE = 20  # messages without the wheels' joints before a note is made
 
 
 class TicksTrack(Track):
@@ -585,9 +658,9 @@ class TicksTrack(Track):
         if self._wheels is not None and self._wheels[0] in names and self._wheels[1] in names:
             return names.index(self._wheels[0]), names.index(self._wheels[1])
         self._without += 1
-        if self._without == _PATIENCE and self._last_ns is None:
+        if self._without == PATIENCE and self._last_ns is None:
             text = (
-                f"{_PATIENCE} messages of joint states, and none holds both wheels{self._configured(names)}; the last "
+                f"{PATIENCE} messages of joint states, and none holds both wheels{self._configured(names)}; the last "
                 f"holds {', '.join(names)}: set wheels.left_joint and wheels.right_joint"
             )
             if self._config.source == "ticks":

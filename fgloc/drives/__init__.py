@@ -1,0 +1,1 @@
+"""Drives: how wheels move a robot."""
