@@ -62,10 +62,7 @@ class WheelsConfig(Section):
     right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
     angle_range: float | None = expert(
-        None,
-        ge=1e-3,
-        le=1e15,
-        description="rad (with ticks_per_turn: ticks): the angle rolls over after this much; None: never",
+        None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
     )
     drive: AnyDrive | None = Field(
         None, description="a drive other than two wheels, by its kind (docs/drives.md); None: two wheels, as above"

@@ -83,6 +83,9 @@ class Drive(Section):
     ticks_per_turn: float | None = Field(
         None, ge=1e-3, le=1e9, description="positions of the driven joints are encoder ticks, so many a turn; None: rad"
     )
+    rolls_over: float | None = Field(
+        None, ge=1e-3, le=1e15, description="positions of the driven joints roll over after this much; None: never"
+    )
     sigmas: dict[str, Annotated[float, Field(ge=0, le=100)]] = Field(
         {}, description="how far parameters may be off, by name and in their unit; 0: exact; the others as documented"
     )

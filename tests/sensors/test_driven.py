@@ -72,8 +72,8 @@ def twist_of(config, events):
     ("drive", "names", "angles", "more"),
     [
         (MECANUM, WHEELS, turned, {}),
-        (TRICYCLE, ["steering", "traction"], ticks, {"angle_range": 2.0**32}),
-        (TRICYCLE, ["steering", "traction"], ticks, {"angle_range": 2.0**32, "slowdown": 0.3, "scale_v": 1.1}),
+        ({**TRICYCLE, "rolls_over": 2.0**32}, ["steering", "traction"], ticks, {}),
+        ({**TRICYCLE, "rolls_over": 2.0**32}, ["steering", "traction"], ticks, {"slowdown": 0.3, "scale_v": 1.1}),
     ],
 )
 def test_derivatives_over_a_step_are_those_of_differences(drive, names, angles, more):
@@ -93,7 +93,7 @@ def test_derivatives_over_a_step_are_those_of_differences(drive, names, angles, 
 
 
 def test_a_counter_that_rolls_over_goes_on():
-    config = wheels(TRICYCLE, angle_range=2.0**32)
+    config = wheels({**TRICYCLE, "rolls_over": 2.0**32})
     rolled = messages(ticks, ["steering", "traction"], seconds=1.55)
     plain = messages(lambda t: (ticks(t)[0], 2000.0 * t), ["steering", "traction"], seconds=1.55)
     motion, _, measured = motion_over(config, rolled)

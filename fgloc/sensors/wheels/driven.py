@@ -21,7 +21,7 @@ Moved = tuple[Twist, FloatArray]  # twist, and its derivatives (3, p) by the dri
 class DriveTrack(Track):
     """Differences of the wheels' angles or, in messages without angles, their rates, with the steering between them.
 
-    All joints of the drive come in one message. Angles that roll over after ``angle_range`` are unwrapped both ways;
+    All joints of the drive come in one message. Angles that roll over after ``rolls_over`` are unwrapped both ways;
     an encoder that jumps otherwise is re-based. Rates of joints that count ticks are not used: their unit is no one's.
 
     ``rejections`` counts wheels.encoder_reset, and wheels.joints_incomplete: messages that lack one of the joints, or
@@ -73,7 +73,7 @@ class DriveTrack(Track):
         """Mean twist since the last message; None if neither angles nor rates give it."""
         between = steering if self._steering is None else 0.5 * (steering + self._steering)
         if angles is not None and self._angles is not None and seconds <= MAX_GAP_S:
-            turned, roll = angles - self._angles, self._config.angle_range
+            turned, roll = angles - self._angles, self._drive.rolls_over
             if roll is not None:
                 if seconds > self._config.hold_s:  # nobody knows how often it rolled over
                     return None
@@ -82,7 +82,7 @@ class DriveTrack(Track):
             if moved is not None:
                 return moved
             self.rejections["wheels.encoder_reset"] += 1
-            hint = "; if the angle rolls over, set wheels.angle_range" if roll is None else ""
+            hint = "; if the angle rolls over, set rolls_over" if roll is None else ""
             self.notes["reset"] = (
                 f"wheel angles jumped {self.rejections['wheels.encoder_reset']} time(s), the last by "
                 f"{', '.join(f'{turn:.3g}' for turn in turned)} in {seconds:.3g} s: taken as a reset{hint}"
