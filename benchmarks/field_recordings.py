@@ -118,13 +118,14 @@ def _turtlebot_aruco(source: Path, out: Path) -> None:
     _write_map(out, dict(enumerate(data["landmarks"])))
 
 
-def _mecanum(source: Path, out: Path) -> None:
-    """Mecanum robot: the bag, and the odometry of its owner's formula with nominal radius, lengths, gear and ticks."""
+def mecanum(source: Path, out: Path, share: float = 1.0) -> None:
+    """Mecanum robot: the bag, or a share of its beginning, and the odometry of its owner's formula and geometry."""
     radius, half_x, half_y, ticks_per_rad = 0.07, 0.200, 0.169, 5.0 * 42.0 / math.tau
     joints: list[Any] = []
     with AnyReader([source]) as reader, new_bag(out, "mcap") as bag:
         messages: list[Message] = []
-        for connection, received, raw in reader.messages():
+        until = reader.start_time + round(share * reader.duration) + 1
+        for connection, received, raw in reader.messages(stop=until):
             m: Any = reader.deserialize(raw, connection.msgtype)
             stamp = _stamp(m)
             if connection.topic == "/wheel_states":
@@ -148,10 +149,11 @@ def _mecanum(source: Path, out: Path) -> None:
         write_merged(iter(messages), _odometry(bag, times, poses, twists, [received for received, _, _ in joints]))
 
 
-def _tricycle(source: Path, out: Path) -> None:
-    """Tricycle: raw ticks, the owner's odometry (``model_pose``), pose of the laser."""
+def tricycle(source: Path, out: Path, share: float = 1.0) -> None:
+    """Tricycle: raw ticks, the owner's odometry (``model_pose``), pose of the laser; or a share of the beginning."""
     lines = (source / "dataset.txt").read_text(encoding="utf-8").splitlines()
     rows = [line.split() for line in lines if line.startswith("time:")]
+    rows = rows[: round(share * len(rows))]
     stamps = nanoseconds([float(row[1]) for row in rows])
     ticks = np.array([row[3:5] for row in rows], dtype=float)
     model, tracker = (np.array([row[k : k + 3] for row in rows], dtype=float) for k in (6, 10))
@@ -432,7 +434,7 @@ RECORDINGS = (
         "mecanum_bag1",
         "mecanum/bag1.bag",
         "four wheels, ticks of the motor for angles, nominal geometry 7 % short; truth freezes (23 %)",
-        _mecanum,
+        mecanum,
         "/robot/pose",
         lever=True,
         development=True,
@@ -442,7 +444,7 @@ RECORDINGS = (
         "mecanum_bag2",
         "mecanum/bag2.bag",
         "the same; truth freezes (44 %)",
-        _mecanum,
+        mecanum,
         "/robot/pose",
         lever=True,
         landmarks=False,
@@ -452,7 +454,7 @@ RECORDINGS = (
         "tricycle",
         "tricycle",
         "guessed geometry; steering and traction ticks, a counter that wraps",
-        _tricycle,
+        tricycle,
         "/truth",
         lever=True,
         landmarks=False,

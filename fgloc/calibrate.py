@@ -1,16 +1,19 @@
-"""The installation calibrated on whole recordings of one robot, with nothing but its own sightings."""
+"""The installation calibrated on whole recordings: by the robot's sightings or, where it sees nothing, by a truth."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from fgloc.calibration.installation import found_text, settings_found, with_settings
+from fgloc.calibration.truth import calibrate_by_truth
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
+from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
 from fgloc.replay import Progress
 from fgloc.runner import RunResult, run
@@ -30,6 +33,8 @@ def calibrate(
 ) -> tuple[Config, tuple[Setting, ...]]:
     """Find the installation, with wide priors on the gains of the wheels or of commands in their place.
 
+    Recordings without landmarks but with a truth calibrate the wheels alone, by the truth.
+
     Args:
         bags: one or more recordings of the robot.
         map_path: marker map; None: that beside each bag, if any.
@@ -42,6 +47,8 @@ def calibrate(
     Raises:
         FglocError: a recording cannot be used, or holds no wheels or no sightings.
     """
+    if all(map(partial(_only_truth, config=config), bags)):
+        return calibrate_by_truth(bags, config)
     now = config
     for _ in range(_ROUNDS):
         settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
@@ -51,6 +58,13 @@ def calibrate(
     settings = tuple(replace(s, given=given.get(s.name, s.given)) for s in settings)
     _check(settings)
     return with_settings(config, settings), settings
+
+
+def _only_truth(bag: Path, config: Config) -> bool:
+    """Whether nothing but a truth tells where the robot was."""
+    with open_recording(bag, config.recording) as recording:
+        seeing = {"image", "sightings", *(s.role for sensor in registry.sensors() for s in sensor.streams)}
+        return "truth" in recording.roles and not seeing & recording.roles.keys()
 
 
 def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:

@@ -213,7 +213,10 @@ def calibrate(
     map_file: MapOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again."""
+    """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again.
+
+    Recordings without landmarks but with a truth calibrate the wheels alone: their motion is compared with the truth.
+    """
     from fgloc.calibrate import calibrate as calibrated
     from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.config import yaml_of

@@ -449,7 +449,7 @@ def _jumps(angles: FloatArray) -> list[float]:
 
 DISTANCE_GAIN = "wheels.scale_v"  # the setting that sightings determine wherever the robot moves
 _FREED = {"scale_sigma": 0.2, "turn_scale_sigma": 0.2, "yaw_per_m_sigma": 0.2}  # priors before anything was seen
-_FREED_DRIVE = 100.0  # X
+_FREED_DRIVE = 10.0  # likewise, times the sigma of a geometry that was measured by hand
 _FREED_COMMANDS = _FREED | {"slowdown_sigma": 1.0, "delay_sigma_s": 0.2}
 
 

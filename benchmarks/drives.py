@@ -1,0 +1,160 @@
+"""Drives beyond two wheels, on recordings that others made: ``python -m benchmarks.drives [--quick] [--json FILE]``.
+
+The bags are those of `benchmarks.field_recordings`, in their owners' units. A robot is described as its owner does, in
+`wheels.drive`; ``fgloc calibrate`` finds its geometry by the truth of what is named below, and ``fgloc smooth`` runs with it.
+
+- ``mecanum.bag2.{ate_m,nees_over_3}``: wheels' ticks. Calibrated on bag1 and the first half of bag2, reported on all of
+  bag2; ``.second_half.ate_m`` on what calibration did not see, ``.nominal.ate_m`` without it. Poses of the truth that are
+  repeated are left out.
+- ``tricycle.{ate_m,parameters_sigma}``: raw ticks, from the guesses of the file's header. Calibrated and reported on the
+  whole recording, as the fit that it is compared with was: the largest difference of a parameter from that fit, in our
+  sigmas. ``.half.ate_m``: calibrated on the first half, reported on the second. ``.nominal.ate_m``: the guesses.
+
+ATE is the rmse of positions, the truth's frame fitted by a rigid motion. Windows and priors of the calibration were
+chosen on the tricycle and on bag1.
+"""
+
+# ruff: noqa: E501 (lines of the description)
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import Row, main, not_run
+from benchmarks.field_recordings import DATA, RECORDINGS, Recording, mecanum, tricycle
+from fgloc.calibrate import calibrate
+from fgloc.config import Config, config_of
+from fgloc.evaluation.metrics import compute_metrics, match_result
+from fgloc.runner import RunResult, run
+from fgloc.types import FloatArray, Trajectory
+
+MECANUM: dict[str, Any] = {
+    "recording": {"topics": {"odometry": "none"}},
+    "wheels": {
+        "drive": {
+            "kind": "mecanum",
+            "wheels": ["front_left", "front_right", "rear_left", "rear_right"],
+            "radius": 0.07 / 5.0,  # over the gear
+            "ticks_per_turn": 42,
+            "half_sum": 0.200 + 0.169,
+        }
+    },
+    "truth": {"align": "se2"},
+}
+TRICYCLE: dict[str, Any] = {
+    "recording": {"topics": {"odometry": "none"}},
+    "wheels": {
+        "drive": {
+            "kind": "tricycle",
+            "wheel": "traction_wheel",
+            "ticks_per_turn": 5000,
+            "rolls_over": 2.0**32,
+            "radius": 0.0106141 / math.tau,
+            "steering_joint": "steering",
+            "steering_ticks": 8192,
+            "steering_ratio": 0.1,
+            "wheelbase": 1.4,
+            # They are guesses, which the header says
+            "sigmas": {"radius": 0.001, "steering_ratio": 1.0, "wheelbase": 0.5, "steering_zero": 0.3},
+        }
+    },
+    "truth": {"align": "se2", "offset_m": [1.5, 0.0]},
+}
+REFIT = {
+    "wheels.drive.radius": 0.011215 / math.tau,
+    "wheels.drive.steering_ratio": 0.5790,
+    "wheels.drive.wheelbase": 1.628,
+    "wheels.drive.steering_zero": -0.0706,
+    "truth.x": 1.795,
+    "truth.y": -0.004,
+}
+"""Fit of the whole path to the whole reference, which nobody of fgloc's tuning used."""
+
+
+def measure(quick: bool) -> Iterator[Row]:
+    """Rows of all recordings; a quick run leaves out what was calibrated on halves."""
+    if not DATA.is_dir():
+        yield from not_run(["mecanum.bag2.ate_m", "tricycle.ate_m"], f"no {DATA}; set FGLOC_REAL_DATA")
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        yield from _mecanum(Path(scratch), quick)
+        yield from _tricycle(Path(scratch), quick)
+
+
+def _mecanum(scratch: Path, quick: bool) -> Iterator[Row]:
+    config, (bag1, bag2) = config_of(MECANUM), (named(f"mecanum_{name}") for name in ("bag1", "bag2"))
+    whole, first_half = bag2.bag(scratch / "m2"), half(bag2, mecanum).bag(scratch / "m2_half")
+    found, _ = calibrate([bag1.bag(scratch / "m1"), first_half], None, config)
+    result = smoothed(whole, found)
+    yield Row("mecanum.bag2.ate_m", ate(result), unit="m")
+    yield Row("mecanum.bag2.nees_over_3", compute_metrics(result, found).nees_over_3)
+    yield Row("mecanum.bag2.second_half.ate_m", ate(second_half(result)), unit="m")
+    yield Row("mecanum.bag2.nominal.ate_m", ate(smoothed(whole, config)), unit="m")
+    if not quick:
+        yield Row("mecanum.bag1.ate_m", ate(smoothed(scratch / "m1" / "bag", found)), unit="m")
+
+
+def _tricycle(scratch: Path, quick: bool) -> Iterator[Row]:
+    config, recording = config_of(TRICYCLE), named("tricycle")
+    bag = recording.bag(scratch / "t")
+    found, settings = calibrate([bag], None, config)
+    result = smoothed(bag, found)
+    off = {s.name: abs(s.found - REFIT[s.name]) / s.sigma for s in settings if s.name in REFIT}
+    furthest = max(off, key=lambda name: off[name])
+    yield Row("tricycle.ate_m", ate(result), unit="m")
+    yield Row("tricycle.parameters_sigma", off[furthest], n=len(off), unit=furthest)
+    yield Row("tricycle.nees_over_3", compute_metrics(result, found).nees_over_3)
+    yield Row("tricycle.nominal.ate_m", ate(smoothed(bag, config)), unit="m")
+    if not quick:
+        by_half, _ = calibrate([half(recording, tricycle).bag(scratch / "t_half")], None, config)
+        yield Row("tricycle.half.ate_m", ate(second_half(smoothed(bag, by_half))), unit="m")
+
+
+def named(name: str) -> Recording:
+    """The recording of this name."""
+    return next(recording for recording in RECORDINGS if recording.name == name)
+
+
+def half(recording: Recording, make: Any) -> Recording:
+    """The first half of a recording, by its converter."""
+    return replace(recording, make=partial(make, share=0.5))
+
+
+def smoothed(bag: Path, config: Config) -> RunResult:
+    """The run in batch, without corrections of the set-up by what is recorded."""
+    return run(bag, None, config, "batch", check=False)
+
+
+def second_half(result: RunResult) -> RunResult:
+    """The same run, from the middle of its poses on."""
+    t = result.trajectory
+    k = len(t) // 2
+    covs = None if t.covs is None else t.covs[k:]
+    return replace(result, trajectory=Trajectory(t.stamps_ns[k:], t.poses[k:], covs))
+
+
+def ate(result: RunResult) -> float:
+    """Rmse of positions [m] at the poses of the run, by fresh poses of the truth alone, its frame fitted."""
+    assert result.truth is not None
+    truth = without_repetitions(result.truth)
+    matched = match_result(replace(result, truth=truth), result.config or Config())
+    assert matched is not None
+    return float(np.sqrt(np.mean(matched.distances**2)))
+
+
+def without_repetitions(truth: Trajectory) -> Trajectory:
+    """The truth without poses that repeat the one before."""
+    fresh: FloatArray = np.abs(np.diff(truth.poses, axis=0)).max(axis=1)
+    keep = np.append(True, fresh > 0.0)
+    return Trajectory(truth.stamps_ns[keep], truth.poses[keep])
+
+
+if __name__ == "__main__":
+    main(measure, __doc__ or "")

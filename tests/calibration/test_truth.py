@@ -1,0 +1,96 @@
+"""Wheels calibrated by a truth, where no landmark is seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fgloc import se2
+from fgloc.calibrate import calibrate
+from fgloc.config import Config
+from fgloc.errors import EstimatorError
+from fgloc.runner import run
+from fgloc_datasets.bag import BagWriter
+
+START_NS = 1_700_000_000_000_000_000
+GUESS = {
+    "kind": "tricycle",
+    "wheel": "traction",
+    "steering_joint": "steering",
+    "radius": 0.09,
+    "wheelbase": 1.0,
+    "steering_ratio": 0.2,
+    "sigmas": {"radius": 0.05, "wheelbase": 0.5, "steering_ratio": 1.0, "steering_zero": 0.3},
+}
+TRUE = {"radius": 0.1, "wheelbase": 1.2, "steering_ratio": 0.5, "steering_zero": -0.06}
+BODY = (0.8, -0.1, 0.3)  # of what the truth tracks, on the robot
+LATE_S = 0.05
+
+
+def settings(drive):
+    return Config.model_validate({"wheels": {"drive": drive}, "truth": {"align": "se2"}})
+
+
+def write_tricycle(folder, seconds=80.0, truth=True):
+    """A tricycle that winds along; a truth of its body at 20 Hz, late, with jitter, frozen now and then."""
+    rng = np.random.default_rng(5)
+    true = settings({**GUESS, **TRUE}).wheels.drive
+    pose, travel, told = np.zeros(3), 0.0, None
+    with BagWriter(folder / "bag") as bag:
+        for k in range(round(seconds * 100)):
+            t, stamp = 0.01 * k, START_NS + k * 10_000_000
+            steering = 0.8 * math.sin(0.4 * t) + 0.3 * math.sin(1.1 * t)
+            rate = 5.0 + 2.0 * math.sin(0.2 * t)
+            if k % 4 == 0:
+                bag.joints("/joints", stamp, ["steering", "traction"], [steering, travel])
+            if k % 5 == 0 and truth:
+                if told is None or t % 10.0 > 1.0:
+                    told = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
+                half = 0.5 * told[2]
+                later = stamp + round(LATE_S * 1e9)
+                bag.truth("/truth", later, (*told[:2], 0.0), (0.0, 0.0, math.sin(half), math.cos(half)))
+            twist, _, _ = true.moves([rate], [steering])
+            noise = rng.normal(0.0, 1.0, 3) * (0.003, 0.003, 0.003) * math.sqrt(0.005)
+            pose = se2.compose(pose, se2.exp(twist * 0.01 + noise))
+            travel += rate * 0.01
+    return folder / "bag"
+
+
+def test_geometry_that_is_far_off_is_found_with_the_place_of_the_body(tmp_path):
+    bag = write_tricycle(tmp_path)
+    found, listed = calibrate([bag], None, settings(GUESS))
+    by_name = {s.name: s for s in listed}
+    for name, value in TRUE.items():
+        s = by_name[f"wheels.drive.{name}"]
+        assert abs(s.found - value) < 4.0 * s.sigma, s
+        assert s.sigma < 0.02
+        assert found.wheels.drive.value(name) == pytest.approx(s.found)
+        assert found.wheels.drive.states[name] == pytest.approx(s.sigma, rel=1e-3)
+    assert found.truth.offset_m == pytest.approx(BODY[:2], abs=0.02)
+    assert found.truth.yaw_offset_rad == pytest.approx(BODY[2], abs=0.02)
+    assert found.recording.stamp_offset_s["truth"] == pytest.approx(-LATE_S, abs=0.02)
+    assert found.wheels.noise.yaw_per_sqrt_m < settings(GUESS).wheels.noise.yaw_per_sqrt_m
+    result = run(bag, None, found, "batch", check=False)
+    known = result.trajectory.stamps_ns <= result.truth.stamps_ns[-1]
+    assert known.sum() > 100
+    before = run(bag, None, settings(GUESS), "batch", check=False)
+    ends = [np.ptp(r.trajectory.poses[:, 0]) for r in (result, before)]
+    true_extent = np.ptp(result.truth.poses[:, 0])
+    assert abs(ends[0] - true_extent) < 0.3 * abs(ends[1] - true_extent)
+
+
+def test_wheels_that_do_not_follow_the_truth_are_named(tmp_path):
+    exchanged = {"kind": "ackermann", "wheels": ["steering"], "steering_joints": ["traction"], "wheelbase": 1.2}
+    bag = write_tricycle(tmp_path)
+    with pytest.raises(EstimatorError, match=r"do not follow the truth.*kind of drive"):
+        calibrate([bag], None, settings(exchanged))
+
+
+def test_a_truth_of_a_few_seconds_determines_nothing(tmp_path):
+    with pytest.raises(EstimatorError, match="windows of 4 s"):
+        calibrate([write_tricycle(tmp_path, seconds=20.0)], None, settings(GUESS))
+
+
+def test_without_truth_and_landmarks_the_error_says_so(tmp_path):
+    with pytest.raises(EstimatorError, match="no sighting of a landmark"):
+        calibrate([write_tricycle(tmp_path, seconds=20.0, truth=False)], None, settings(GUESS))
