@@ -34,6 +34,7 @@ from fgloc.types import FloatArray, InstallationFound, IntArray, MotionEvent, Se
 
 _WINDOW_S = 4.0  # over it errors of wheels add up beyond the truth's noise
 _GAP_S = 0.2  # between poses of the truth about the end of a window: no frozen one, no silence
+_GAPS = 2.5  # likewise, times the usual step of a slow truth
 _LONGEST_S = 10.0  # of a window that the truth's gaps make longer
 _FEWEST = 10  # windows
 _ROUNDS, _STEPS = 4, 30  # of noise and weights; of Gauss-Newton in each
@@ -146,8 +147,9 @@ def _windows(times: FloatArray, origin_ns: int, motion: IntArray) -> Iterator[tu
     """Start and end [ns] of the windows: at poses of the truth that have others just before and after."""
     if len(times) < 3 or len(motion) < 3:
         return
-    near = np.append(np.inf, np.diff(times)) < _GAP_S
-    near &= np.append(np.diff(times), np.inf) < _GAP_S
+    apart = np.diff(times)
+    longest = max(_GAP_S, _GAPS * float(np.median(apart)))
+    near = (np.append(np.inf, apart) < longest) & (np.append(apart, np.inf) < longest)
     ends = origin_ns + np.round(times[near] * 1e9).astype(np.int64)
     ends = ends[(ends > motion[0] + 200_000_000) & (ends < motion[-1] - 200_000_000)]
     start = None

@@ -133,7 +133,10 @@ def test_wheels_that_never_spoke_are_not_calibrated(commanded):
 
 
 def test_a_run_without_sightings_tells_no_gains(commanded):
-    deaf = {"recording": {"topics": {"sightings": "none"}}, "estimator": {"initial_pose": [0.0, 0.0, 0.0]}}
+    deaf = {
+        "recording": {"topics": {"sightings": "none", "truth": "none"}},
+        "estimator": {"initial_pose": [0.0, 0.0, 0.0]},
+    }
     config = Config.model_validate(settings("command").model_dump(exclude_unset=True) | deaf)
     with pytest.raises(EstimatorError, match="no sighting of a landmark was used"):
         calibrate([commanded], commanded.parent / "map.yaml", config)
