@@ -11,8 +11,8 @@ Each convention of each sensor is broken, one at a time, in recordings that agre
   ``conventions.online_false``: what a running check names meanwhile of the recordings as they are.
 
 Recordings: two samples of the simulator, and those of other people that the folder ``FGLOC_REAL_DATA`` holds; two of
-these have surveyed maps (of text, `benchmarks.field_recordings` makes bags). Markers in images, and the map and camera
-with them, are compared by fits: `benchmarks.gross`. The half of the mistakes that ``--quick`` has was looked at while
+these have surveyed maps (of text, `benchmarks.field_recordings` makes bags). Where there are images, findings are those
+of `fgloc info`, which fits what they show. The half of the mistakes that ``--quick`` has was looked at while
 thresholds were chosen; the other was not.
 """
 
@@ -22,9 +22,11 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import yaml
@@ -33,13 +35,15 @@ from benchmarks.common import Row, main
 from benchmarks.field_recordings import RECORDINGS as FIELD
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of_file
+from fgloc.config import Config, Role, config_of_file
+from fgloc.diagnosis import mistakes as diagnosis
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.signals import SignalCollector
 from fgloc.errors import FglocError
 from fgloc.recording.reader import Recording
-from fgloc.recording.storage import find_beside
+from fgloc.recording.storage import RawMessage, find_beside
 from fgloc.sensor_setup import recorded_setup
+from fgloc.sensors.maps import write_map
 from fgloc.sensors.marker_pose import MarkerPose
 from fgloc.sensors.range_bearing import RangeBearing
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
@@ -168,7 +172,18 @@ def _map(change: Callable[[int, Any], tuple[int, Any]]) -> Change:
     return changed
 
 
+def _mirror(landmark_map: LandmarkMap) -> LandmarkMap:
+    """The sign of y changed; markers look along the mirrored direction, upright as before."""
+    flip, across = np.diag([1.0, -1.0, 1.0]), np.diag([-1.0, 1.0, 1.0])
+    every = {
+        i: replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ across)
+        for i, m in landmark_map.landmarks.items()
+    }
+    return replace(landmark_map, landmarks=every)
+
+
 _CLOCKS = "clock.imu|clock.odometry|clock.joints|clock.sightings"  # of two, either may be wrong
+_COMMANDS = "wheels.scale|sightings.scale|commands.unit"  # the first two where commands stand in for wheels
 MISTAKES: dict[str, Mistake] = {
     "sightings mirrored": Mistake(SightingsEvent, _sightings(_mirrored), "sightings.mirrored|sightings.axes"),
     "sightings axes": Mistake(SightingsEvent, _sightings(_axes), "sightings.axes", choice=False),
@@ -205,17 +220,13 @@ MISTAKES: dict[str, Mistake] = {
     "joints 0.3 s late": Mistake(JointsEvent, _late(0.3), _CLOCKS, 0.3, 0.05, choice=False),
     "joints reversed": Mistake(JointsEvent, _joints(-1.0), "yaw.sign|wheels.sign|wheels.reversed"),
     "joints in degrees": Mistake(JointsEvent, _joints(180.0 / math.pi), "wheels.unit|odometry.yaw_unit", choice=False),
-    "commands in mm/s": Mistake(
-        ControlEvent, lambda e: replace(e, v=1e3 * e.v), "wheels.scale|sightings.scale", 1e3, 0.1, choice=False
-    ),
-    "commands in feet/s": Mistake(
-        ControlEvent, lambda e: replace(e, v=e.v / 0.3048), "wheels.scale|sightings.scale", 0.3048, 0.1
-    ),
+    "commands in mm/s": Mistake(ControlEvent, lambda e: replace(e, v=1e3 * e.v), _COMMANDS, 1e3, 0.15, choice=False),
+    "commands in feet/s": Mistake(ControlEvent, lambda e: replace(e, v=e.v / 0.3048), _COMMANDS, 0.3048, 0.15),
     "map in feet": Mistake(LandmarkMap, _map(lambda i, p: (i, p / 0.3048)), "map.unit", 0.3048),
     "map x 0.3048": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.3048)), "map.unit", 0.3048, choice=False),
     "map in cm": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 100.0)), "map.unit", 0.01, choice=False),
     "map in km": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.001)), "map.unit", 1e3),
-    "map mirrored": Mistake(LandmarkMap, _map(lambda i, p: (i, p * [1.0, -1.0, 1.0])), "map.mirrored"),
+    "map mirrored": Mistake(LandmarkMap, _mirror, "map.mirrored"),
     "ids off by one": Mistake(LandmarkMap, _map(lambda i, p: (i + 1, p)), "map.ids", choice=False),
     "truth in NED": Mistake(TruthEvent, _ned, "truth.axes"),
     "truth 0.5 s late": Mistake(TruthEvent, _late(0.5), "clock.truth", 0.5, 0.05),
@@ -272,8 +283,21 @@ def heard(bag: Path, config: Config) -> Heard:
         )
 
 
+class _Broken(Recording):
+    """A recording with one convention broken in what is decoded."""
+
+    mistake: Mistake | None = None
+
+    def decode(self, message: RawMessage, role: Role | None) -> list[Event]:
+        """Events of a message, as the mistake has them."""
+        made, events = self.mistake, super().decode(message, role)
+        return [made.change(event) if made is not None and isinstance(event, made.of) else event for event in events]
+
+
 def found_in(recording: Heard, mistake: Mistake | None) -> tuple[Finding, ...]:
     """Findings on a recording with one convention broken; none broken: as it is."""
+    if any(role == "image" for role in recording.roles):
+        return _found_by_info(recording, mistake)
     collector, landmark_map = SignalCollector(recording.config, recording.roles), recording.landmark_map
     for event in recording.broken(mistake):
         collector.add(event)
@@ -281,6 +305,19 @@ def found_in(recording: Heard, mistake: Mistake | None) -> tuple[Finding, ...]:
         landmark_map = mistake.change(landmark_map)
     found = conventions(collector.found, recording.config, recording.T_base_sensor, recording.imu_up, landmark_map)
     return tuple(sorted(found.findings, key=lambda f: -f.severity))
+
+
+def _found_by_info(recording: Heard, mistake: Mistake | None) -> tuple[Finding, ...]:
+    """Findings of `fgloc info` where images tell too: the same comparisons, then fits of what the images show."""
+    opened = type("Opened", (_Broken,), {"mistake": mistake})
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as patches:
+        patches.enter_context(mock.patch.object(diagnosis, "Recording", opened))
+        patches.enter_context(mock.patch.object(diagnosis, "open_recording", opened))
+        map_path = recording.map_path
+        if recording.landmark_map is not None and mistake is not None and mistake.of is LandmarkMap:
+            map_path = Path(folder) / "map.yaml"
+            write_map(mistake.change(recording.landmark_map), map_path)
+        return diagnosis.inspect_all(recording.bag, map_path, recording.config).found
 
 
 def _turned_imu(R: Any, event: Event) -> Event:

@@ -58,8 +58,10 @@ class WheelsConfig(Section):
     )
     left_joint: str | None = None
     right_joint: str | None = None
-    left_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
-    right_radius: float | None = Field(None, ge=1e-3, le=2.0, description="m")
+    left_radius: float | None = Field(
+        None, ge=1e-6, le=2.0, description="m: way of one unit of the angle, which is usually a radian"
+    )
+    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="m")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
     angle_range: float | None = expert(
         None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
@@ -653,6 +655,19 @@ def files_of(config: type[Config]) -> Iterator[tuple[str, str]]:
             for key, field in section.annotation.model_fields.items():
                 if Path in (field.annotation, *get_args(field.annotation)):
                     yield name, key
+
+
+def one_line(value: Any) -> str:
+    """A setting's value as YAML in one line; floats to six decimals."""
+    return yaml.safe_dump(_rounded(value), default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 6) + 0.0
+    if isinstance(value, dict):
+        return {key: _rounded(v) for key, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 def yaml_of(config: Config, folder: Path) -> str:

@@ -352,7 +352,8 @@ def contradiction_findings(
     """
     if contradiction is None:
         return []
-    names, rivals = _listed(s.name for s in _settings(found, contradiction.names, config)), contradiction.rivals
+    settings, rivals = _settings(found, contradiction.names, config), contradiction.rivals
+    names = _listed([s.name for s in settings] or contradiction.names)
     text = (
         f"The recording contradicts what was given of {names} by more than {PRIOR_GATE:g} sigmas, and it was not used"
     )
@@ -362,7 +363,8 @@ def contradiction_findings(
         return [Finding(CODES[0], f"{text}{_UNEXPLAINED}", Severity.ERROR)]
     options = [_told(found, rival, config) for rival in rivals]
     lines = _lines(options[0]) if len(rivals) == 1 and rivals[0].sensible else {}
-    shown = " or ".join(" with ".join(f"{s.name} {_number(s)}" for s in option) for option in options)
+    said = [[f"{s.name} {_number(s)}" for s in option] for option in options]
+    shown = " or ".join(" with ".join(own or rival.names) for own, rival in zip(said, rivals, strict=True))
     if lines:
         told = f"{text}: {shown} explains it best. Set {', '.join(f'{key}: {value}' for key, value in lines.items())}."
     elif len(rivals) > 1:
@@ -371,7 +373,7 @@ def contradiction_findings(
         told = (
             f"{text}: {shown} would explain it, which is no installation. Look for a wrong axis, sign, unit or clock."
         )
-    value = (options[0][0].found, options[0][0].sigma) if len(rivals) == 1 else (None, None)
+    value = (options[0][0].found, options[0][0].sigma) if len(rivals) == 1 and options[0] else (None, None)
     return [Finding(CODES[0], told, Severity.ERROR, lines, *value)]
 
 

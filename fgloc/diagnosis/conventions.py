@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fgloc import se2
-from fgloc.config import Config, Role, WheelsConfig, setting, with_value
+from fgloc.config import Config, Role, WheelsConfig, one_line, setting, with_value
 from fgloc.diagnosis.handling import Handling, Span, cut, handling, outside
 from fgloc.diagnosis.pairs import (
     AXES,
@@ -34,6 +33,7 @@ from fgloc.diagnosis.pairs import (
     fit_on_map,
     fit_rate,
     fit_sightings,
+    fit_way,
     irls,
     jackknife,
     planar,
@@ -89,6 +89,9 @@ _DRIFTED_S, _LAG_SIGMAS = 0.06, 3.5  # of the lag's change from half to half; a 
 
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # share by which a scale may miss a unit's
+_ROUGHLY = 0.35  # logarithm of a scale: nothing else is so near to degrees for radians
+_SHARED = 0.9  # share of a turn that another explains: one measurement
+_OBEYED = 0.2  # logarithm of the share of its commands by which a robot moves more or less
 
 
 @dataclass
@@ -117,7 +120,7 @@ class Conventions:
 
     def add(self, code: str, text: str, lines: Mapping[str, Any], figure: Figure | None, severity: Severity) -> None:
         """Note a finding, and set its lines."""
-        shown = {setting(key): _yaml(value) for key, value in lines.items()}
+        shown = {setting(key): one_line(value) for key, value in lines.items()}
         value, sigma = (None, None) if figure is None else (figure.value, figure.sigma)
         remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
         self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
@@ -152,8 +155,15 @@ def conventions(
         if (rates := signals.rates()) is not None:
             _gravity(found, rates[2], _unit(imu_up))
         return found
+    path = _angles(found, signals, path, imu_up)
+    _commands(found, signals, path)
+    by_odometry = _gyro_by_odometry(found, signals, path, imu_up)
     signals, path = _by_hand(found, signals, path, imu_up)
+    driver = _driver_late(found, signals, path)
     gyro = _gyro(found, signals, path, imu_up)
+    if by_odometry is not None and driver is not None and (gyro is None or gyro.share < _TELLS):
+        late_s = Figure(by_odometry.late_s.value + driver.value, math.hypot(by_odometry.late_s.sigma, driver.sigma))
+        gyro = replace(by_odometry, late_s=late_s)
     seen = signals.sightings()
     undecided = found.opposite and not _opposite(found, signals, path, seen, T_base_sensor)
     if found.opposite and not undecided:
@@ -164,7 +174,7 @@ def conventions(
     undecided &= not any(finding.code == "imu.sign" for finding in found.findings)
     truth = None if undecided else _true_body(found, signals, path)  # wheels that may turn the wrong way judge no truth
     gyro, sensor = None if "imu" in drifting else gyro, None if "sightings" in drifting else sensor
-    later_s = _clocks(found, signals, path, gyro, sensor, truth)
+    later_s = _clocks(found, signals, path, gyro, driver, sensor, truth)
     _first_pose(found, path, seen, T_base_sensor, landmark_map)
     if truth is not None:
         late_s = replace(truth.late_s, value=truth.late_s.value - later_s)
@@ -177,8 +187,6 @@ def conventions(
     return found
 
 
-def _yaml(value: Any) -> str:
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
 
 
 def unit_of(scale: float) -> tuple[float, str] | None:
@@ -194,10 +202,13 @@ def unit_of(scale: float) -> tuple[float, str] | None:
 
 
 def _odometry(found: Conventions, signals: Signals) -> None:
-    rows = in_order(signals.odometry)
-    if len(rows) < 50:
+    pose = signals.odometry_path()
+    if pose is None:
         return
-    times, yaw = rows[:, 0], np.unwrap(rows[:, 3])
+    rows, times, yaw = in_order(signals.odometry), pose.times, pose.poses[:, 2]
+    late_s = _twist_late(found, pose, rows[:, 6])
+    if late_s:
+        rows[:, 4:] = np.column_stack([np.interp(times + late_s, times, column) for column in rows[:, 4:].T])
     place = rows[:, 1] + 1j * rows[:, 2]
     span = max(1, round(0.4 / max(float(np.median(np.diff(times))), 1e-3)))
     dt = times[span:] - times[:-span]
@@ -209,10 +220,11 @@ def _odometry(found: Conventions, signals: Signals) -> None:
     # medians: drivers that differentiate a pose report spikes where its yaw wraps or its stamps jitter
     twists = np.median(np.lib.stride_tricks.sliding_window_view(rows[:-1, 4:7], span, axis=0), axis=2).T
     source = found.config.wheels.source
+    if source == "auto" and signals.path(found.config) is not None and signals.by_twist:
+        source = "twist"
     grave = Severity.ERROR if source == "twist" else Severity.WARNING if source == "auto" else Severity.NOTE
     _twist_speed(found, (moved / dt)[whole], middle[whole], (twists[0] + 1j * twists[1])[whole], grave)
     _twist_rate(found, (turned / dt)[whole], twists[2][whole], moved[whole], middle[whole], grave)
-    _twist_late(found, rows, yaw)
     body = (moved * np.exp(-1j * middle) / dt)[whole]
     aside, most = float(np.abs(body.imag).sum()), float(np.abs(body).sum())
     if aside > _ASIDE * most and np.ptp(twists[1]) > 0.0 and np.corrcoef(body.imag, twists[1][whole])[0, 1] > _TELLS:
@@ -288,24 +300,23 @@ def _twist_rate(
             found.add("odometry.yaw_sign", text, {"wheels.source": "pose"}, Figure(c, 0.0), grave)
         else:
             found.add("odometry.yaw_sign", f"{text}, whose own path contradicts that yaw", {}, Figure(c, 0.0), grave)
-    elif abs(math.log(abs(c) * math.pi / 180.0)) < 0.2:
+    elif abs(math.log(abs(c) * math.pi / 180.0)) < _ROUGHLY:
         lines = _of_twist(found, {"wheels.scale_omega": round(math.pi / 180.0 * found.config.wheels.scale_omega, 7)})
         text = f"The odometry's yaw rate is in degrees: it is {c:.3g} times the change of its pose's yaw"
         found.add("odometry.yaw_unit", text, lines, Figure(1.0 / c, 0.0), grave)
 
 
-def _twist_late(found: Conventions, rows: FloatArray, yaw: FloatArray) -> None:
-    """Name a twist that follows its own pose late: it is smoothed, or computed from older poses."""
-    times = rows[:, 0]
+def _twist_late(found: Conventions, pose: Path, rates: FloatArray) -> float:
+    """Name a twist that follows its own pose late: it is smoothed, or computed from older poses; its lag [s]."""
+    times, yaw = pose.times, pose.poses[:, 2]
     known = (np.diff(times) > 0.0) & (np.diff(times) < _SILENT_S)
     turns = np.diff(yaw)[known] / np.diff(times)[known]
-    if not len(turns) or min(np.std(turns), np.std(rows[:, 6])) < _VARIED:
-        return  # a constant turn has no lag, and a pose that does not move has none either
-    gaps = np.cumsum(np.append(0.0, np.diff(times)) > _SILENT_S, dtype=np.int64)
-    fit = fit_rate(Path(times, np.column_stack([rows[:, 1:3], yaw]), gaps), times, turn_by(times, rows[:, 6]))
+    if not len(turns) or min(np.std(turns), np.std(rates)) < _VARIED:
+        return 0.0  # a constant turn has no lag, and a pose that does not move has none either
+    fit = fit_rate(pose, times, turn_by(times, rates))
     interval_s = float(np.median(np.diff(times)))  # a mean twist of the last interval is half of it late
     if fit is None or fit.share < _TELLS or not fit.late_s.off(0.0, _TWIST_LATE_S + 0.5 * interval_s):
-        return
+        return 0.0
     late, used = fit.late_s, found.config.wheels.source == "twist"
     text = (
         f"The odometry's twist is {abs(late.value):.2f} ± {late.sigma:.2f} s {'late' if late.value > 0 else 'early'} "
@@ -314,11 +325,99 @@ def _twist_late(found: Conventions, rows: FloatArray, yaw: FloatArray) -> None:
     lines = {"wheels.source": "pose"} if used else {}
     severity = Severity.WARNING if used else Severity.NOTE
     found.add("odometry.twist_late", text if used else f"{text}; the pose is used", lines, late, severity)
+    return late.value
 
 
 def _of_twist(found: Conventions, lines: dict[str, Any]) -> dict[str, Any]:
     """Lines that undo an error of the twist alone: those given if the twist has to be used, else the source "pose"."""
     return lines if found.config.wheels.source == "twist" else {"wheels.source": "pose"}
+
+
+# --- the wheels' angles against the driver's odometry, and commands ---------------------------------------------------
+
+
+def _angles(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> Path:
+    """Compare signs and unit of the wheels' angles with the driver's odometry; the path with what is wrong undone."""
+    driver = signals.odometry_path()
+    if signals.source != "ticks" or driver is None:
+        return path
+    way, turn = fit_way(path, driver.times, driver.way), fit_rate(path, driver.times, driver.poses[:, 2])
+    factor = 0.0 if way is None or way.share < _TELLS else way.scale.value  # by the angles, over the odometry's
+    turns = 0.0 if turn is None or turn.share < _TELLS else turn.scale.value
+    wheels, rates = found.config.wheels, signals.rates()
+    if turns < 0.0 and rates is not None:
+        gyro = fit_rate(path, rates[0], turn_by(rates[0], rates[1] @ _unit(imu_up)) * found.config.gyro.scale)
+        if gyro is not None and gyro.share > _TELLS and gyro.scale.value > 0.0:
+            return path  # the odometry is wrong, and not used
+    fitted, radius = settings_of(signals.motion), wheels.left_radius
+    unit = 1.0 if fitted is None or radius is None else fitted["left_radius"] / radius
+    if fitted is not None and abs(math.log(unit * 180.0 / math.pi)) < _ROUGHLY:
+        text = (
+            f"The wheels' angles are in degrees: by them the robot goes {1.0 / unit:.4g} times as far as its odometry"
+        )
+        given = {"left_radius": wheels.left_radius, "right_radius": wheels.right_radius}
+        lines = {f"wheels.{key}": round(value * math.pi / 180.0, 8) for key, value in given.items() if value}
+        found.add("wheels.unit", text, lines, Figure(1.0 / unit, 0.0), Severity.ERROR)
+    elif factor < 0.0:
+        text = "The wheels' angles count backward when the robot goes forward, by the driver's odometry"
+        found.add("wheels.reversed", text, {"wheels.source": "pose"}, None, Severity.ERROR)
+    elif turns < 0.0:
+        text = "The wheels' angles turn the other way than the driver's odometry: left and right are exchanged"
+        swapped = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
+        found.add("wheels.sign", text, swapped if all(swapped.values()) else {}, None, Severity.ERROR)
+    else:
+        return path
+    return signals.path(found.config) or path
+
+
+def _gyro_by_odometry(found: Conventions, signals: Signals, path: Path, imu_up: FloatArray | None) -> RateFit | None:
+    """Compare the gyro with an odometry whose yaw is the gyro's, where the wheels' angles do not tell its turns."""
+    driver, rates = signals.odometry_path(), signals.rates()
+    if signals.source != "ticks" or driver is None or rates is None:
+        return None
+    turned = np.column_stack([turn_by(rates[0], rate) for rate in rates[1].T])
+    by_angles = [fit_rate(path, rates[0], column) for column in turned.T]
+    if any(fit is not None and fit.share > _TELLS for fit in by_angles):
+        return None
+    trial = Conventions(found.config)
+    fit = _gyro(trial, signals, driver, imu_up)
+    if fit is None or fit.share < _SHARED:
+        return None
+    found.findings += trial.findings
+    found.config = trial.config
+    return fit
+
+
+def _driver_late(found: Conventions, signals: Signals, path: Path) -> Figure | None:
+    """Lag of the driver's odometry against the wheels' angles; None: the odometry is the path, or nothing tells."""
+    driver = signals.odometry_path()
+    if signals.source != "ticks" or driver is None:
+        return None
+    fits = [fit_way(path, driver.times, driver.way)]
+    if not any(f.code == "odometry.yaw_is_gyro" for f in found.findings):
+        fits.append(fit_rate(path, driver.times, driver.poses[:, 2]))
+    lags = [fit.late_s for fit in fits if fit is not None and fit.share > _TELLS]
+    return weighted(lags) if lags else None
+
+
+def _commands(found: Conventions, signals: Signals, path: Path) -> None:
+    """Name commands in another unit than the motion that follows them; where they are the motion, others tell."""
+    commanded = signals.commanded(found.config.wheels.hold_s)
+    if signals.source not in _WHEELS or commanded is None:
+        return
+    times, integrals = commanded
+    fit = fit_way(path, times, integrals[:, 0])
+    if fit is None or fit.share < FOLLOWS or fit.scale.value <= 0.0:
+        return
+    units = {**_UNITS, **{1.0 / factor: f"metres for {name}" for factor, name in _UNITS.items()}}
+    factor = min(units, key=lambda unit: abs(math.log(fit.scale.value / unit)))
+    if abs(math.log(fit.scale.value / factor)) > _OBEYED:
+        return
+    text = (
+        f"The commanded speeds are in {units[factor]}: the robot moves {fit.scale.value:.4g} ± {fit.scale.sigma:.2g} "
+        "times as fast. A learned motion reads them; correct whoever publishes them"
+    )
+    found.add("commands.unit", text, {}, fit.scale, Severity.WARNING)
 
 
 # --- one measurement twice, and hands ---------------------------------------------------------------------------------
@@ -538,7 +637,7 @@ def _axis_text(axis: FloatArray) -> str:
 def _gyro_scale(found: Conventions, fit: RateFit, given: float) -> RateFit:
     """Unit of the gyro, or a track that the turn refutes."""
     factor = fit.scale.value  # wheels' turn over the gyro's as configured
-    if abs(math.log(max(factor, 1e-9) * 180.0 / math.pi)) < 0.35:
+    if abs(math.log(max(factor, 1e-9) * 180.0 / math.pi)) < _ROUGHLY:
         sign = math.copysign(1.0, found.config.gyro.scale)
         found.add(
             "imu.unit",
@@ -547,7 +646,7 @@ def _gyro_scale(found: Conventions, fit: RateFit, given: float) -> RateFit:
             fit.scale,
             Severity.ERROR,
         )
-    elif abs(math.log(max(factor, 1e-9) * math.pi / 180.0)) < 0.35:
+    elif abs(math.log(max(factor, 1e-9) * math.pi / 180.0)) < _ROUGHLY:
         found.add(
             "odometry.yaw_unit",
             f"The wheels' yaw rate is {factor:.1f} times the gyro's: it is in degrees",
@@ -602,16 +701,21 @@ def _sensor(
         as_given, ranged = _as_configured(found.config, seen, T_base_sensor)
         fits = fit_sightings(path, as_given, turn_sigma=turn_sigma) or fits
         best = _best(fits)
-    sound = fits.get("body")
-    if best.axes == "body" or (
+    sound, turned_over = fits.get("body"), fits.get("body, upside down")
+    by_map = _mirrored(path, as_given, sound, turned_over, landmark_map)
+    usual = best.axes == "body" or (
         sound is not None and sound.misfit < (_WORSE if seen.spatial else _MIRRORED) * best.misfit
-    ):
+    )
+    if by_map and turned_over is not None:
+        best = turned_over
+    elif usual:
         assert sound is not None
         return _constants(found, path, as_given, sound, T, landmark_map)
     raw = Sightings(seen.times, seen.ids, ranged, seen.spatial)
-    chosen = (
-        best if T_base_sensor is None else _best(fit_sightings(path, raw, turn_sigma=turn_sigma) or {best.axes: best})
-    )
+    chosen = best
+    if T_base_sensor is not None:
+        fits = fit_sightings(path, raw, turn_sigma=turn_sigma) or {best.axes: best}
+        chosen = min(fits.values(), key=lambda m: m.misfit) if by_map else _best(fits)
     pose = _pose_of(chosen, T)
     lines: dict[str, Any] = {}
     off_mm = 1e3 * chosen.scale.value * chosen.misfit
@@ -639,6 +743,18 @@ def _sensor(
         _scale(found, path, raw, chosen, landmark_map)
     found.noise = track_noise(path, raw, chosen)
     return chosen
+
+
+def _mirrored(
+    path: Path, seen: Sightings, sound: Mounting | None, turned_over: Mounting | None, landmark_map: LandmarkMap | None
+) -> bool:
+    """Whether bearings are a mirror image by the wheels and by the map alike, where the wheels alone are not sure."""
+    if seen.spatial or landmark_map is None or sound is None or turned_over is None:
+        return False
+    if turned_over.misfit >= sound.misfit:
+        return False
+    fit = fit_map(path, seen, sound, {i: lm.position[:2] for i, lm in landmark_map.landmarks.items()})
+    return fit is not None and fit.mirrored and fit.misfit < _NO_MAP
 
 
 def _as_configured(config: Config, seen: Sightings, T_base_sensor: FloatArray | None) -> tuple[Sightings, FloatArray]:
@@ -809,7 +925,8 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting, landmar
             return
         if fit is not None:
             if fit.shift:
-                found.add("map.ids", f"The map's ids are {fit.shift:+d} against those seen", {}, None, Severity.ERROR)
+                text = f"The map's ids are {fit.shift:+d} against those seen"
+                found.add("map.ids", text, {}, Figure(fit.shift, 0.0), Severity.ERROR)
             if fit.mirrored:
                 text = "The map is a mirror image of what is seen: change the sign of all its y"
                 found.add("map.mirrored", text, {}, None, Severity.ERROR)
@@ -917,10 +1034,11 @@ def _clocks(
     signals: Signals,
     path: Path,
     gyro: RateFit | None,
+    driver: Figure | None,
     sensor: Mounting | None,
     truth: BodyFit | None,
 ) -> float:
-    """Name whose stamps are late, by the lags of gyro, landmarks and truth against the wheels.
+    """Name whose stamps are late, by the lags of gyro, odometry, landmarks and truth against the wheels.
 
     Two that are late alike say that it is the wheels' clock. Commands have a lag of another kind: the robot follows
     them late.
@@ -931,6 +1049,8 @@ def _clocks(
     late: dict[str, Figure] = {}
     if gyro is not None and gyro.share > _TELLS:
         late["imu"] = gyro.late_s
+    if driver is not None and _varied(path):
+        late["odometry"] = driver
     if sensor is not None and _varied(path):
         lag, true = sensor.late_s, None if truth is None or truth.share < _TELLS else truth.late_s.value
         refuting = true is not None and lag.off(true, _LATE_S, _LATE_SIGMAS)  # a truth that is late all by itself

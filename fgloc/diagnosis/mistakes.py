@@ -19,7 +19,7 @@ from fgloc import se2
 from fgloc.config import Config, Role
 from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
 from fgloc.diagnosis.handling import FloorWatch
-from fgloc.diagnosis.setup import Checked, check_fit
+from fgloc.diagnosis.setup import Checked, by_places, check_fit, shown
 from fgloc.diagnosis.setup_fit import Excerpt, ExcerptCollector, read_excerpt
 from fgloc.diagnosis.signals import (
     SightingCollector,
@@ -35,6 +35,7 @@ from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.base import with_values
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberedDetections
+from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.sensor import mistakes
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
@@ -121,7 +122,7 @@ class _Search:
         self._path, self._map_path = path, map_path
         self.config = self._given = config
         self.landmark_map: LandmarkMap | None = None
-        self.sentences: list[str] = []
+        self._setup: list[Finding] = []
         self._conventions: list[Finding] = []
         self._compared = False
         self.detections: dict[bytes, Any] = {}
@@ -129,7 +130,7 @@ class _Search:
     @property
     def findings(self) -> list[Finding]:
         """Everything that was found: conventions, then what the fits of the set-up name."""
-        return [*self._conventions, *note("setup", self.sentences, Severity.ERROR)]
+        return [*self._conventions, *self._setup]
 
     def run(self) -> None:
         """Read the excerpt, and check it."""
@@ -165,8 +166,8 @@ class _Search:
         roles = other_clocks(delays)
         given = self.config.recording.received_stamps
         if roles and not set(roles) <= set(given):
-            self.sentences.append(clock_sentence(roles, delays, given))
-            self._change("recording", received_stamps=(*given, *roles))
+            sentence = clock_sentence(roles, delays, given)
+            self._correct("clock.received", sentence, "recording", received_stamps=(*given, *roles))
             return True
         if not self._compared:
             self._compared = True
@@ -177,8 +178,7 @@ class _Search:
             if changed:
                 return True
         for mistake in mistakes(signals.motion, self.config):
-            self.sentences.append(mistake.sentence)
-            self._change(mistake.section, **mistake.values)
+            self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
         if parts.landmark_map is None:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):
@@ -199,7 +199,7 @@ class _Search:
         """Report why no marker is found; whether another dictionary finds them."""
         assert parts.detector is not None
         hints, fitting = parts.detector.hints(recording)
-        self.sentences += hints
+        self._setup += note("markers.unseen" if fitting is None else "markers.dictionary", hints, Severity.ERROR)
         if fitting is not None:
             self._change("markers", dictionary=fitting)
         return fitting is not None
@@ -220,17 +220,44 @@ class _Search:
             self._conventions = [f for f in self._conventions if f not in apart]
         elif before != self.config:
             checked = check_fit(excerpt, self.config, landmark_map, camera, up, image)
+        if checked.poor or not checked.stretches:
+            for finding, changed in self._map_by_places(excerpt, parts, up):
+                again = check_fit(excerpt, self.config, changed, camera, up, image)
+                if again.stretches and not again.poor:
+                    self._setup.append(finding)
+                    self.landmark_map = landmark_map = changed
+                    checked = again
+                    break
         if checked.unexplained:
-            self.sentences.append(
+            text = (
                 f"What the camera saw does not fit {self._map_path}, and no single mistake of the set-up explains it: "
                 "check that it is the map of this place, then the positions of its markers and the camera's transform."
             )
+            self._setup.append(Finding("map.contradiction", text, Severity.ERROR))
         if checked.correction is not None:
-            self.sentences.append(checked.correction.sentence)
+            self._setup.append(checked.correction.finding)
             self.config, changed = checked.correction.config, checked.correction.landmark_map
             self.landmark_map = None if changed is landmark_map else changed
         if checked.corrected is not None:
             self._frames(excerpt, checked)
+
+    def _map_by_places(
+        self, excerpt: Excerpt, parts: SensorSetup, up: FloatArray | None
+    ) -> Iterator[tuple[Finding, LandmarkMap]]:
+        """Unit, mirror image or shifted ids of the map, by the markers' places that images show; the map without it."""
+        camera, landmark_map = parts.camera, parts.landmark_map
+        assert camera is not None
+        assert landmark_map is not None
+        config = with_values(self.config, "recording", {"sightings_axes": "optical"})
+        sensor = LandmarkSensor(config, landmark_map, camera, None)  # what it refuses does not count
+        corners = SightingCollector(config, landmark_map, sensor, camera.T_base_cam)
+        signals = replace(excerpt.signals, seen=[], spatial=True)
+        for picture in (p for row in excerpt.pictures for p in row):
+            event = CornersEvent(picture.stamp_ns, picture.stamp_ns, "", "", picture.seen)
+            at_s = (picture.stamp_ns - signals.origin_ns) * 1e-9
+            signals.seen.extend((at_s, s.landmark_id, *s.point.tolist()) for s in corners.sightings(event, at_s))
+        found = conventions(signals, config, camera.T_base_cam, up, landmark_map).findings
+        yield from filter(None, (by_places(finding, landmark_map) for finding in found))
 
     def _frames(self, excerpt: Excerpt, checked: Checked) -> None:
         assert checked.corrected is not None
@@ -240,12 +267,10 @@ class _Search:
         started = self._started(excerpt.signals, times[0], poses[0])
         sentence = None if started is None else first_pose_sentence(self.config, started)
         if sentence is not None:
-            self.sentences.append(sentence)
-            self._change("estimator", initial_pose=None)
+            self._correct("frame.first_pose", sentence, "estimator", initial_pose=None)
         sentence = truth_sentence(self.config, excerpt.signals.true_poses(), times, poses)
         if sentence is not None:
-            self.sentences.append(sentence)
-            self._change("truth", align="se2")
+            self._correct("truth.frame", sentence, "truth", align="se2")
 
     def _started(self, signals: Signals, at_s: float, pose: FloatArray) -> FloatArray | None:
         """The pose at the run's start ``(3,)``, by the wheels, if that was not long before."""
@@ -255,6 +280,11 @@ class _Search:
         first, now = path.at(np.array([path.times[0], at_s]))
         return se2.compose(pose, se2.between(now, first))
 
+    def _correct(self, code: str, text: str, section: str, **values: object) -> None:
+        lines = shown(section, {key: value for key, value in values.items() if value is not None})
+        self._setup.append(Finding(code, text, Severity.ERROR, lines))
+        self._change(section, **values)
+
     def _change(self, section: str, **values: object) -> None:
         part = getattr(self.config, section).model_copy(update=values)
         self.config = self.config.model_copy(update={section: part})
@@ -263,7 +293,7 @@ class _Search:
 # --- While a run goes on ----------------------------------------------------------------------------------------------
 
 _FIRST_S, _GROWTH = 20.0, 2.0  # signals of a first comparison, and how many times as much the next one needs
-_FIRST_MOVING_S, _GROWTH_MOVING = 5.0, 1.4  # likewise, of motion: until `_FIRST_S` of it, four more comparisons
+_FIRST_MOVING_S, _GROWTH_MOVING = 5.0, 1.25  # likewise, of motion: until `_FIRST_S` of it, six more comparisons
 _MOVES_M_S, _MOVES_RAD_S = 0.01, 0.02  # by the wheels: below, the robot stands
 _SCALES = ("sightings.scale", "wheels.scale", "map.unit", "scales", "sightings.range")
 _TURNED_RAD = 0.3  # of a camera: more than the turn by which wheels are off

@@ -516,6 +516,12 @@ def fit_rate(path: Path, times: FloatArray, integral: FloatArray, longest_s: flo
     return RateFit(Figure(scale, float(sigmas[0])), Figure(late, float(sigmas[1]) + 0.002), share)
 
 
+def fit_way(path: Path, times: FloatArray, way: FloatArray) -> RateFit | None:
+    """Scale and lag of a way ahead ``(n,)`` [m] against that of the wheels, as `fit_rate` has them of turns."""
+    along = np.column_stack([np.zeros((len(path.times), 2)), path.way])
+    return fit_rate(Path(path.times, along, path.gaps), times, way)
+
+
 def best_lag(share: Callable[[float], float], longest_s: float) -> tuple[float, float]:
     """Lag [s] at which two signals share most, and that share."""
     coarse = np.arange(-longest_s, longest_s + 1e-9, 0.05)

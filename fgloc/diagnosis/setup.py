@@ -13,13 +13,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, one_line, setting
+from fgloc.diagnosis.conventions import unit_of
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
-from fgloc.frames import OPTICAL_TO_BODY, rotation_of, rpy_matrix, sensor_pose
+from fgloc.frames import OPTICAL_TO_BODY, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
 from fgloc.sensors.base import with_values
 from fgloc.sensors.wheels.sensor import SetupMistake, correct
-from fgloc.types import Camera, FloatArray, Landmark, LandmarkMap
+from fgloc.types import Camera, Finding, FloatArray, Landmark, LandmarkMap, Severity
 
 _WIDE = 0.5  # prior sigma of what may be grossly off: a share, rad, m or s
 _LEAST = {  # smaller deviations are an ordinary installation's, which the run estimates; at least five of its sigmas
@@ -79,6 +81,7 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
     yield from (Change("mounting", _mounted(setup, T), turned) for T in _mountings(setup.camera.T_base_cam))
     yield Change("position", setup, {f"camera.{axis}_m": _WIDE for axis in "xyz"})
     yield Change("mirrored", replace(setup, landmark_map=mirrored(setup.landmark_map)))
+    yield Change("quaternions", replace(setup, landmark_map=reordered(setup.landmark_map)))
     for a, b in _swaps(fit) if fit is not None else ():
         yield Change("ids", replace(setup, landmark_map=swapped(setup.landmark_map, a, b)))
     moving = source in ("ticks", "odometry")
@@ -162,6 +165,57 @@ def mirrored(landmark_map: LandmarkMap) -> LandmarkMap:
     return replace(landmark_map, landmarks=known)
 
 
+def by_places(finding: Finding, landmark_map: LandmarkMap) -> tuple[Finding, LandmarkMap] | None:
+    """The map without the mistake that a comparison of marker's places names, and the finding as a map has it.
+
+    Places of markers by an image are in the unit of the map's sizes: "sightings.scale" is a wrong size, and a scale of
+    the wheels that is a unit's is that of the whole map.
+
+    Args:
+        finding: of `fgloc.diagnosis.conventions`, on markers' places in the camera's axes.
+        landmark_map: as given.
+
+    Returns:
+        None: the finding is on something else.
+    """
+    known, value = landmark_map.landmarks, finding.value
+    unit = None if value is None else unit_of(value)
+    factor = unit[0] if unit is not None else value or 1.0
+    changed: dict[int, Landmark] = {}
+    if finding.code == "map.mirrored":
+        return finding, mirrored(landmark_map)
+    if finding.code == "map.ids" and value is not None:
+        moved = {i - round(value): m for i, m in known.items()}
+        changed = {i: replace(m, landmark_id=i) for i, m in moved.items() if i >= 0}
+    elif finding.code == "map.unit":
+        changed = {i: replace(m, position=factor * m.position) for i, m in known.items()}
+    elif finding.code == "sightings.scale":
+        changed = {i: replace(m, size_m=factor * m.size_m) for i, m in known.items()}
+        text = (
+            f"The markers' sizes are {1.0 / factor:.4g} times those that wheels and map agree on: correct them there."
+        )
+        finding = replace(finding, code="map.size", text=text, lines={})
+    elif finding.code == "wheels.scale" and unit is not None:
+        factor = 1.0 / factor
+        changed = {i: replace(m, position=factor * m.position, size_m=factor * m.size_m) for i, m in known.items()}
+        text = (
+            f"Positions and sizes on the map are {1.0 / factor:.4g} times what the wheels show: they are in another "
+            f"unit, or the wheels' are; if it is the map, set {setting('map.scale')} and {setting('map.size_scale')}: {factor:.4g}."
+        )
+        lines = shown("map", {"scale": factor, "size_scale": factor})
+        finding = replace(finding, code="map.unit", text=text, lines=lines, value=factor)
+    return (finding, replace(landmark_map, landmarks=changed)) if changed else None
+
+
+def reordered(landmark_map: LandmarkMap) -> LandmarkMap:
+    """The map with its quaternions read as w, x, y, z instead of x, y, z, w."""
+    known = {}
+    for i, m in landmark_map.landmarks.items():
+        w, x, y, z = Rotation.from_matrix(m.rotation).as_quat().tolist()
+        known[i] = replace(m, rotation=quaternion_matrix((x, y, z, w)))
+    return replace(landmark_map, landmarks=known)
+
+
 def swapped(landmark_map: LandmarkMap, a: int, b: int) -> LandmarkMap:
     """The map with two landmarks in each other's place."""
     known: dict[int, Landmark] = dict(landmark_map.landmarks)
@@ -238,15 +292,15 @@ _ABOUT_DEG = 20.0  # degrees within which a camera counts as upside down, or as 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """A sentence that names the mistake and the line to be set, and the settings with that line."""
+    """Finding that names the mistake with the lines to be set, and the settings and the map with the mistake undone."""
 
-    sentence: str
+    finding: Finding
     config: Config
-    landmark_map: LandmarkMap | None
+    landmark_map: LandmarkMap
 
 
 def correction(change: Change, given: Setup, source: str, image: Role, wheels: Role) -> Correction:
-    """The sentence for a change, and the settings with it.
+    """The finding for a change, and the settings with it.
 
     Args:
         change: that was found.
@@ -261,7 +315,7 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
             return _size(given, math.exp(values["size"]))
         case "map_scale":
             return _map_scale(given, math.exp(values["map_scale"]))
-        case "mirrored" | "ids":
+        case "mirrored" | "quaternions" | "ids":
             return _map(change, given)
         case "focal" | "resolution" | "distortion":
             return _lens(change, given)
@@ -283,35 +337,44 @@ def _size(given: Setup, factor: float) -> Correction:
     if len(sizes) == 1:
         shown, line = f"{sizes[0]:.4g} m", f"set size: {sizes[0] * factor:.4g} for every marker"
     known = {i: replace(m, size_m=factor * m.size_m) for i, m in given.landmark_map.landmarks.items()}
-    return Correction(
+    text = (
         f"The markers' size is {shown} by the map, and {factor:.3f} times that by their places and the images: "
-        f"{line} in the map.",
-        given.config,
-        replace(given.landmark_map, landmarks=known),
+        f"{line} in the map."
     )
+    finding = Finding("map.size", text, Severity.ERROR, value=factor)
+    return Correction(finding, given.config, replace(given.landmark_map, landmarks=known))
 
 
 def _map_scale(given: Setup, factor: float) -> Correction:
     known = {i: replace(m, position=factor * m.position) for i, m in given.landmark_map.landmarks.items()}
-    return Correction(
-        f"Distances on the map are {1.0 / factor:.3f} times those that wheels and markers show: the map's scale is "
-        f"wrong; multiply its positions by {factor:.4f}.",
-        given.config,
-        replace(given.landmark_map, landmarks=known),
+    scale = given.config.map.scale * factor
+    text = (
+        f"Distances on the map are {1.0 / factor:.4g} times those that wheels and markers show: the map's scale is "
+        f"wrong; multiply its positions by {factor:.5g}, or set {setting('map.scale')}: {scale:.5g}."
     )
+    finding = Finding("map.unit", text, Severity.ERROR, shown("map", {"scale": round(scale, 6)}), factor)
+    return Correction(finding, given.config, replace(given.landmark_map, landmarks=known))
 
 
 def _map(change: Change, given: Setup) -> Correction:
+    code = "map.mirrored"
     if change.kind == "mirrored":
         sentence = (
             "The map is mirrored against what wheels and camera show: change the sign of the y of all its positions "
             "(and of its markers' directions)."
         )
+    elif change.kind == "quaternions":
+        code = "map.quaternions"
+        sentence = (
+            "The map's quaternions are in the order w, x, y, z: so the markers face the way that the camera sees them; "
+            "write them as x, y, z, w."
+        )
     else:
+        code = "map.ids"
         before, after = given.landmark_map.landmarks, change.setup.landmark_map.landmarks
         a, b = sorted(i for i in before if not np.array_equal(before[i].position, after[i].position))
         sentence = f"The map has ids {a} and {b} in each other's place: exchange ids {a} and {b} in the map."
-    return Correction(sentence, given.config, change.setup.landmark_map)
+    return Correction(Finding(code, sentence, Severity.ERROR), given.config, change.setup.landmark_map)
 
 
 def _lens(change: Change, given: Setup) -> Correction:
@@ -322,7 +385,7 @@ def _lens(change: Change, given: Setup) -> Correction:
             f"The camera's distortion is not as given, k1 {k1_of(given):.3g}: by the markers it is about {k1:.3g}; set "
             f"expert.camera.k1: {k1:.3f} and expert.camera.k2: {k2:.3f}, or better calibrate it."
         )
-        return Correction(sentence, _set(given.config, "camera", k1=k1, k2=k2), given.landmark_map)
+        return _set(given, "camera.distortion", sentence, "camera", {"k1": round(k1, 3), "k2": round(k2, 3)})
     factor = float(after.K[0, 0] / before.K[0, 0])
     scale = given.config.camera.focal_scale * factor
     line = f"set expert.camera.focal_scale: {scale:.4f}"
@@ -337,21 +400,23 @@ def _lens(change: Change, given: Setup) -> Correction:
         f"The camera's calibration {what}: {before.K[0, 0]:.1f} px given, {after.K[0, 0]:.1f} px seen; {line}, or "
         "better calibrate it."
     )
-    return Correction(sentence, _set(given.config, "camera", **values), given.landmark_map)
+    code = "camera.resolution" if change.kind == "resolution" else "camera.focal"
+    return _set(given, code, sentence, "camera", values, factor)
 
 
 def _mounting(change: Change, given: Setup) -> Correction:
     before, after = given.camera.T_base_cam, change.setup.camera.T_base_cam
     pose = sensor_pose(after, optical=True)
-    config = _set(given.config, "recording", sightings_pose=pose, sightings_axes="optical")
+    values = {"sightings_pose": pose, "sightings_axes": "optical"}
     shown = ", ".join(f"{round(v, 4) + 0.0:g}" for v in pose)
     line = f"correct the transform, or set recording.sightings_pose: [{shown}]"
     if change.kind == "position":
         moved = before[:3, :3].T @ (after[:3, 3] - before[:3, 3])
         x, y, z = moved
         sentence = f"The camera sits {z:+.2f} m ahead, {x:+.2f} m right, {y:+.2f} m below its transform: {line}."
-        return Correction(sentence, config, given.landmark_map)
-    return Correction(f"The camera {_turned(before, after)}: {line}.", config, given.landmark_map)
+    else:
+        sentence = f"The camera {_turned(before, after)}: {line}."
+    return _set(given, "sightings.mounting", sentence, "recording", values)
 
 
 def _turned(before: FloatArray, after: FloatArray) -> str:
@@ -393,20 +458,29 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
         f"The stamps of the {name} are {abs(late_s):.3f} s {side} against the others: set recording.stamp_offset_s: "
         f"{{{role}: {offset:.3f}}}."
     )
-    return Correction(
-        sentence, _set(given.config, "recording", stamp_offset_s=offsets | {role: offset}), given.landmark_map
-    )
+    values = {"stamp_offset_s": offsets | {role: offset}}
+    return _set(given, f"clock.{role}", sentence, "recording", values, late_s)
 
 
 def _odometer(change: Change, given: Setup, source: str) -> Correction:
     values = dict(zip(EXTRAS, change.setup.extras.tolist(), strict=True))
     mistake = SetupMistake(change.kind, math.exp(values.get(change.kind, 0.0)), change.setup.turned, source)
     found = correct(mistake, given.config)
-    return Correction(found.sentence, _set(given.config, found.section, **found.values), given.landmark_map)
+    value = mistake.factor if change.kind in ("radius", "track") else None
+    return _set(given, found.code, found.sentence, found.section, found.values, value)
 
 
-def _set(config: Config, section: str, **values: Any) -> Config:
-    return with_values(config, section, values)
+def _set(
+    given: Setup, code: str, text: str, section: str, values: Mapping[str, Any], value: float | None = None
+) -> Correction:
+    """Correction by settings of one section alone."""
+    finding = Finding(code, text, Severity.ERROR, shown(section, values), value)
+    return Correction(finding, with_values(given.config, section, values), given.landmark_map)
+
+
+def shown(section: str, values: Mapping[str, Any]) -> dict[str, str]:
+    """Lines of a finding: ``section.key`` of robot.yaml to the value as YAML."""
+    return {setting(f"{section}.{key}"): one_line(value) for key, value in values.items()}
 
 
 # --- The check --------------------------------------------------------------------------------------------------------
@@ -435,6 +509,7 @@ class Checked:
         corrected: the fit without the mistake, or `fit`; None where neither determines the poses.
         stretches: that were fitted.
         unexplained: whether the sightings fit the map nowhere, and no mistake explains it.
+        poor: whether wheels and sightings contradict each other, and no mistake explains it.
     """
 
     fit: Fit | None
@@ -442,6 +517,7 @@ class Checked:
     corrected: Fit | None
     stretches: Sequence[Stretch]
     unexplained: bool = False
+    poor: bool = False
 
 
 def check_fit(
@@ -482,7 +558,7 @@ def check_fit(
     sure = [e for e in ended if gross(e[0], setup) and _explains(fit, e[1], expected)]
     if not sure:
         seen_right = fit is not None and fit.misfit < _SEEN_RIGHT
-        return Checked(fit, None, fit if seen_right else None, stretches, not seen_right)
+        return Checked(fit, None, fit if seen_right else None, stretches, not seen_right, fit is None or poor)
     change, better = min(sure, key=lambda e: e[1].cost)
     wheels: Role = "joints" if excerpt.wheel_source == "ticks" else "odometry"
     sentence = correction(change, setup, excerpt.wheel_source, image, wheels)

@@ -18,8 +18,10 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
+    ControlEvent,
     Event,
     FloatArray,
     InertialEvent,
@@ -90,6 +92,13 @@ class Path:
         return Path(self.times, np.column_stack([place.real, place.imag, factor * yaw]), self.gaps)
 
     @property
+    def way(self) -> FloatArray:
+        """Way ahead ``(n,)`` until each time [m]; what is driven backward counts negative."""
+        yaw = 0.5 * (self.poses[1:, 2] + self.poses[:-1, 2])
+        steps = np.diff(self.poses[:, 0] + 1j * self.poses[:, 1]) * np.exp(-1j * yaw)
+        return np.append(0.0, np.cumsum(steps.real))
+
+    @property
     def length_m(self) -> float:
         """Distance travelled."""
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
@@ -121,6 +130,7 @@ class Signals:
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
         delays: received minus stamped [s], by role.
         source: of the motion, as the odometer has it: "ticks", "odometry", "command"; "": no path was asked for.
+        by_twist: whether it is an odometry's twist.
     """
 
     origin_ns: int = 0
@@ -134,6 +144,7 @@ class Signals:
     images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
     source: str = ""
+    by_twist: bool = False
 
     def late_s(self) -> dict[Role, float]:
         """Median of received minus stamped [s] of each role with enough messages."""
@@ -170,10 +181,27 @@ class Signals:
             yaw += float(motion[2])
             poses.append(np.array([pose[0], pose[1], yaw]))
             gaps.append(gap)
-        self.source = wheels.source
+        self.source, self.by_twist = wheels.source, wheels.by_twist
         if not self.source:
             return None
         return Path((grid - self.origin_ns) * 1e-9, np.array(poses), np.array(gaps, dtype=np.int64))
+
+    def odometry_path(self) -> Path | None:
+        """Motion by the odometry's poses; None: too few."""
+        rows = in_order(self.odometry)
+        if len(rows) < 50:
+            return None
+        gaps = np.cumsum(np.diff(rows[:, 0], prepend=rows[0, 0]) > _SILENT_S, dtype=np.int64)
+        return Path(rows[:, 0], np.column_stack([rows[:, 1:3], np.unwrap(rows[:, 3])]), gaps)
+
+    def commanded(self, hold_s: float) -> tuple[FloatArray, FloatArray] | None:
+        """Times ``(n,)`` of the commands and their integrals ``(n, 2)`` [m, rad], each held so long; None: too few."""
+        rows = in_order([(e.stamp_ns, e.v, e.omega) for e in self.motion if isinstance(e, ControlEvent)])
+        if len(rows) < 20:
+            return None
+        times = (rows[:, 0] - self.origin_ns) * 1e-9
+        steps = rows[:-1, 1:] * np.minimum(np.diff(times), hold_s)[:, None]
+        return times, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
     def rates(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Times ``(n,)``, rates and forces ``(n, 3)`` of the IMU in order of time; None: too few."""
@@ -208,8 +236,10 @@ class SignalCollector:
         """
         self.found = Signals(images="image" in (roles or {}))
         self._role_of = {topic: role for role, topic in (roles or {}).items()}
-        any_unit = {"max_range": _FARTHEST, "max_position": _FARTHEST}
+        any_unit = dict.fromkeys(("max_range", "max_position"), _FARTHEST)
         self._gate = EventValidator(reported_bounds(config).model_copy(update=any_unit))
+        any_speed = any_unit | dict.fromkeys(("max_speed", "max_yaw_rate", "max_wheel_rate"), _FARTHEST)
+        self._fast = EventValidator(reported_bounds(config).model_copy(update=any_speed))
         self._first_ns: int | None = None
 
     def add(self, event: Event) -> bool:
@@ -230,7 +260,9 @@ class SignalCollector:
             if event.stamp_ns > 0 and all(map(math.isfinite, row)):
                 self.found.imu.append((*row, *event.linear_acceleration.tolist()))
             return True
-        passed = self._gate.check(event)
+        # a driver's twist has spikes; commands and angles have none, and may be in another unit
+        gate = self._fast if isinstance(event, (ControlEvent, JointsEvent)) else self._gate
+        passed = gate.check(event)
         if passed is None:
             return True
         at_s = (passed.stamp_ns - self.found.origin_ns) * 1e-9

@@ -218,11 +218,13 @@ class RawMistake(NamedTuple):
     """Mistake in the settings of a sensor, as a recording shows it.
 
     Attributes:
+        code: of the finding.
         sentence: for the user.
         section: of ``robot.yaml``.
         values: that undo it; empty where no settings do.
     """
 
+    code: str
     sentence: str
     section: str
     values: Mapping[str, object]

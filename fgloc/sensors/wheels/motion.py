@@ -255,6 +255,11 @@ class WheelMotion:
         return self._chosen
 
     @property
+    def by_twist(self) -> bool:
+        """Whether the motion is the twist of an odometry, not the change of its pose."""
+        return any(isinstance(t, OdometryTrack) and t.by_twist and t.kind == self._chosen for t in self._all)
+
+    @property
     def from_commands(self) -> bool:
         """Whether there is no wheel odometry, and commands replace it."""
         return self._chosen == "command"

@@ -339,7 +339,7 @@ def correct(mistake: SetupMistake, config: Config) -> RawMistake:
                 f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
                 "set wheels.source: pose, or correct its child_frame_id."
             )
-            return RawMistake(sentence, "wheels", {"source": "pose"})
+            return RawMistake("odometry.twist_frame", sentence, "wheels", {"source": "pose"})
         case _:
             return _sides(mistake, wheels)
 
@@ -350,7 +350,7 @@ def _track(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
     else:
         new = {"scale_omega": wheels.scale_omega / mistake.factor}
     sentence = f"The wheels turn the robot {1.0 / mistake.factor:.3f} times as far as given: set {_lines(new)}."
-    return RawMistake(sentence, "wheels", new)
+    return RawMistake("wheels.turn", sentence, "wheels", new)
 
 
 def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
@@ -361,7 +361,7 @@ def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
     else:
         new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
         sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
-    return RawMistake(sentence, "wheels", new)
+    return RawMistake("wheels.scale", sentence, "wheels", new)
 
 
 def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
@@ -371,14 +371,16 @@ def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
             "The left and the right wheel are exchanged: set wheels.left_joint: "
             f"{wheels.right_joint} and wheels.right_joint: {wheels.left_joint}."
         )
-        return RawMistake(sentence, "wheels", {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint})
+        swapped = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
+        return RawMistake("wheels.sign", sentence, "wheels", swapped)
     how = {
         "exchanged": "turn the robot the other way (left and right exchanged)",
         "reversed": "turn backward when the robot goes forward",
         "both_reversed": "turn backward when the robot goes forward, and left and right are exchanged",
     }[mistake.kind]
     line = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
-    return RawMistake(f"The wheels {how}: {line}.", "wheels", {})
+    code = "wheels.sign" if mistake.kind == "exchanged" else "wheels.reversed"
+    return RawMistake(code, f"The wheels {how}: {line}.", "wheels", {})
 
 
 def _lines(values: Mapping[str, float]) -> str:
@@ -401,7 +403,7 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
         f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
         f"set expert.wheels.angle_range: {rolled[0]:.4f}."
     )
-    return (RawMistake(sentence, "wheels", {"angle_range": rolled[0]}),)
+    return (RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}),)
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:

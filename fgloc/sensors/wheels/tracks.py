@@ -425,6 +425,11 @@ class OdometryTrack(Track):
         self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
         self._across = np.zeros(3)  # sums over these products of |.|², |.|² angle, |.|² angle² [m⁴]
 
+    @property
+    def by_twist(self) -> bool:
+        """Whether the motion is the twist's, as configured or because the poses are not its integral."""
+        return self._mode == "twist"
+
     def _forget(self) -> None:
         self._pose: Pose | None = None
         self._twist: Twist | None = None
