@@ -658,13 +658,13 @@ def files_of(config: type[Config]) -> Iterator[tuple[str, str]]:
 
 
 def one_line(value: Any) -> str:
-    """A setting's value as YAML in one line; floats to six decimals."""
+    """A setting's value as YAML in one line; floats to nine decimals."""
     return yaml.safe_dump(_rounded(value), default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
 
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, float):
-        return round(value, 6) + 0.0
+        return round(value, 9) + 0.0
     if isinstance(value, dict):
         return {key: _rounded(v) for key, v in value.items()}
     return [_rounded(v) for v in value] if isinstance(value, (list, tuple)) else value

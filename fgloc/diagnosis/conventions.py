@@ -187,8 +187,6 @@ def conventions(
     return found
 
 
-
-
 def unit_of(scale: float) -> tuple[float, str] | None:
     """Factor and name of the unit of length that a scale (true over reported) is near; None: no usual one."""
     for factor, name in _UNITS.items():

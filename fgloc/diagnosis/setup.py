@@ -198,11 +198,13 @@ def by_places(finding: Finding, landmark_map: LandmarkMap) -> tuple[Finding, Lan
     elif finding.code == "wheels.scale" and unit is not None:
         factor = 1.0 / factor
         changed = {i: replace(m, position=factor * m.position, size_m=factor * m.size_m) for i, m in known.items()}
+        lines = shown("map", {"scale": factor, "size_scale": factor})
         text = (
             f"Positions and sizes on the map are {1.0 / factor:.4g} times what the wheels show: they are in another "
-            f"unit, or the wheels' are; if it is the map, set {setting('map.scale')} and {setting('map.size_scale')}: {factor:.4g}."
+            "unit, or the wheels' are; if it is the map, set "
+            + " and ".join(f"{key}: {value}" for key, value in lines.items())
+            + "."
         )
-        lines = shown("map", {"scale": factor, "size_scale": factor})
         finding = replace(finding, code="map.unit", text=text, lines=lines, value=factor)
     return (finding, replace(landmark_map, landmarks=changed)) if changed else None
 

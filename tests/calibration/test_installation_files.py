@@ -11,11 +11,18 @@ from typer.testing import CliRunner
 
 from fgloc import cli
 from fgloc.calibrate import pooled
-from fgloc.calibration.installation import contradicted, contradictions, settings_found, with_settings
+from fgloc.calibration.installation import (
+    contradicted,
+    contradiction_findings,
+    contradictions,
+    settings_found,
+    with_settings,
+)
 from fgloc.config import Config, load_config, yaml_of
+from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
-from fgloc.types import Camera, Finding, InstallationFound, Setting
+from fgloc.types import Camera, Finding, InstallationFound, Setting, Severity
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "installed_run"
 
@@ -139,3 +146,12 @@ def _distortion(name: str) -> Setting:
 def _fields(state: InstallationFound) -> dict[str, object]:
     names = ("names", "mean", "cov", "prior_cov", "camera", "seen_by", "wheels")
     return {name: getattr(state, name) for name in names}
+
+
+def test_a_contradiction_of_constants_without_a_setting_names_the_constants():
+    state = found({"gyro.bias": (0.2, 0.001, 0.02)})
+    rival = Rival(("gyro.bias",), np.array([0.2]), np.array([0.001]), True, 1.0, np.zeros((1, 3)))
+    (finding,) = contradiction_findings(state, Contradiction(("gyro.bias",), state, (rival,)), Config())
+    assert "gyro.bias" in finding.text
+    assert not finding.lines
+    assert finding.severity is Severity.ERROR

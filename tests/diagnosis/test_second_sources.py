@@ -1,0 +1,151 @@
+"""Motion sources held against each other, and maps against the places of markers in images."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fgloc.calibration.first_settings import first_settings
+from fgloc.config import config_of_file, with_value
+from fgloc.diagnosis.conventions import conventions
+from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.signals import SignalCollector
+from fgloc.recording.reader import open_recording
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import ControlEvent, InertialEvent, Severity
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "installed_run"
+
+
+@pytest.fixture(scope="module")
+def config():
+    return config_of_file(yaml.safe_load(first_settings(SAMPLE / "bag").text))
+
+
+@pytest.fixture(scope="module")
+def recorded(config):
+    with open_recording(SAMPLE / "bag", config.recording) as recording:
+        role_of = {topic: r for r, topic in recording.roles.items() if r not in ("image", "camera_info", "truth")}
+        events = [e for m in recording.messages(role_of.keys()) for e in recording.decode(m, role_of[m[0]])]
+        return events, dict(recording.roles)
+
+
+@pytest.fixture
+def found(recorded, config):
+    events, roles = recorded
+
+    def compare(kind, change):
+        collector = SignalCollector(config, roles)
+        for event in events:
+            collector.add(change(event) if isinstance(event, kind) else event)
+        return conventions(collector.found, config).findings
+
+    return compare
+
+
+def late(seconds):
+    return lambda e: dataclasses.replace(e, stamp_ns=e.stamp_ns + round(seconds * 1e9))
+
+
+def turned(factor):
+    return lambda e: dataclasses.replace(e, position=factor * e.position, velocity=factor * e.velocity)
+
+
+def test_sound_sources_agree(found):
+    assert not found(JointsEvent, lambda e: e)
+
+
+def test_angles_in_degrees(found, config):
+    (finding,) = found(JointsEvent, turned(180.0 / math.pi))
+    assert finding.code == "wheels.unit"
+    assert float(finding.lines["wheels.left_radius"]) == pytest.approx(
+        config.wheels.left_radius * math.pi / 180.0, rel=1e-4
+    )
+
+
+def test_angles_that_count_backward(found):
+    (finding,) = found(JointsEvent, turned(-1.0))
+    assert (finding.code, finding.lines["wheels.source"]) == ("wheels.reversed", "pose")
+
+
+def test_exchanged_wheels_by_the_odometry(found, config):
+    def exchanged(e):
+        return dataclasses.replace(e, position=e.position[::-1], velocity=e.velocity[::-1])
+
+    found_first = found(JointsEvent, exchanged)[0]
+    assert found_first.code == "wheels.sign"
+    assert found_first.lines["wheels.left_joint"] == config.wheels.right_joint
+
+
+@pytest.mark.parametrize(("kind", "code"), [(OdometryEvent, "clock.odometry"), (JointsEvent, "clock.joints")])
+def test_who_is_late_by_two_against_one(found, kind, code):
+    (finding,) = found(kind, late(0.3))
+    assert finding.code == code
+    assert finding.value == pytest.approx(0.3, abs=0.02)
+
+
+def test_gyro_that_is_late_beside_two_sources(found):
+    (finding,) = found(InertialEvent, late(0.2))
+    assert finding.code == "clock.imu"
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1.0 / 0.3048])
+def test_commands_in_another_unit(found, factor):
+    (finding,) = found(ControlEvent, lambda e: dataclasses.replace(e, v=factor * e.v))
+    assert (finding.code, finding.severity) == ("commands.unit", Severity.WARNING)
+    assert finding.value * factor == pytest.approx(0.95, abs=0.1)
+
+
+def in_feet(landmark):
+    landmark["position"] = [v / 0.3048 for v in landmark["position"]]
+
+
+def all_in_feet(landmark):
+    in_feet(landmark)
+    landmark["size"] /= 0.3048
+
+
+def in_centimetres(landmark):
+    landmark["position"] = [100.0 * v for v in landmark["position"]]
+
+
+def w_first(landmark):
+    x, y, z, w = landmark["quaternion"]
+    landmark["quaternion"] = [w, x, y, z]
+
+
+def shifted(landmark):
+    landmark["id"] += 1
+
+
+def half_the_size(landmark):
+    landmark["size"] *= 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "value"),
+    [
+        (in_feet, "map.unit", 0.3048),
+        (all_in_feet, "map.unit", 0.3048),
+        (in_centimetres, "map.unit", 0.01),
+        (w_first, "map.quaternions", None),
+        (shifted, "map.ids", 1.0),
+        (half_the_size, "map.size", 2.0),
+    ],
+)
+def test_a_map_that_images_contradict_is_named_with_its_mistake(tmp_path, config, change, code, value):
+    content = yaml.safe_load((SAMPLE / "map.yaml").read_text())
+    for landmark in content["landmarks"]:
+        change(landmark)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content))
+    found = inspect_all(SAMPLE / "bag", tmp_path / "map.yaml", config)
+    assert found.exit_code == 3
+    first = found.found[0]
+    assert first.code == code
+    assert value is None or first.value == pytest.approx(value, rel=0.02)
+    for key, shown in first.lines.items():
+        names = key.removeprefix("expert.")
+        assert np.isfinite(getattr(with_value(config, names, float(shown)).map, names.split(".")[1]))
