@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -44,6 +44,7 @@ McapOption = Annotated[
     Path | None,
     typer.Option("--mcap", metavar="FILE", dir_okay=False, help="also write the run as a bag of standard messages"),
 ]
+ForceOption = Annotated[bool, typer.Option("--force", help="write over a map or a configuration that is read")]
 FigureFormat = Literal["png", "svg", "pdf"]
 FiguresOption = Annotated[
     str | None,
@@ -92,6 +93,33 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
         return with_model(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+
+
+_RESULTS = ("map.yaml", "installation.yaml")  # of a result folder, which the next run may read
+
+
+def spare_inputs(
+    out: Path, bag: Path, map_file: Path | None, config: Path | None, force: bool, folder: bool = True
+) -> None:
+    """Find out before a command runs whether it would write over a map or a configuration that it reads.
+
+    Args:
+        out: file, or folder of results.
+        bag: recording; what is not given is read from beside it.
+        map_file: as given.
+        config: as given.
+        force: it may.
+        folder: whether ``out`` is a folder.
+
+    Raises:
+        OutputError: it would.
+    """
+    from fgloc.recording.storage import find_beside
+
+    written = {(out / name).resolve() for name in _RESULTS} if folder else {out.resolve()}
+    for given in (map_file or find_beside(bag, "map.yaml"), config or find_beside(bag, "robot.yaml")):
+        if given is not None and given.resolve() in written and not force:
+            raise OutputError(f"--out {out}: {given} is read and would be written over; give another --out, or --force")
 
 
 # --- Extras -----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgloc.cli.options import Bag, Bags, ConfigOption, MapOption, ModelOption, configured
+from fgloc.cli.options import Bag, Bags, ConfigOption, ForceOption, MapOption, ModelOption, configured, spare_inputs
 from fgloc.cli.terminal import exit_unless_trusted, next_step, run_bar, say, say_table, shown_path, typed, warn
 from fgloc.errors import ConfigError, MapError, OutputError, RecordingError
 from fgloc.files.atomic import check_out
@@ -108,6 +108,7 @@ def make_map(
     ] = None,
     model: ModelOption = None,
     config: ConfigOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Survey the landmarks of recordings. Without --anchor the first pose is the map's origin.
 
@@ -117,6 +118,7 @@ def make_map(
     from fgloc.sensors.maps import configured_map, write_map
 
     check_out(out, folder=False)
+    spare_inputs(out, bags[0], anchor, config, force, folder=False)
     settings = configured(bags[0], config, model)
     given = None if anchor is None else configured_map(anchor, settings, size)
     settings = _with_markers(settings, dictionary, size, given)
@@ -212,6 +214,7 @@ def calibrate(
     ],
     map_file: MapOption = None,
     config: ConfigOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again.
 
@@ -223,6 +226,7 @@ def calibrate(
     from fgloc.files.outputs import write_text
 
     check_out(out, folder=False)
+    spare_inputs(out, bags[0], map_file, config, force, folder=False)
     before = configured(bags[0], config, None)
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)

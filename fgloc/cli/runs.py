@@ -17,6 +17,7 @@ from fgloc.cli.options import (
     ConfigOption,
     FigureFormat,
     FiguresOption,
+    ForceOption,
     MapOption,
     McapOption,
     ModelOption,
@@ -27,6 +28,7 @@ from fgloc.cli.options import (
     configured,
     figure_formats,
     need,
+    spare_inputs,
 )
 from fgloc.cli.terminal import (
     EXIT_BAD_INPUT,
@@ -102,6 +104,7 @@ def smooth(
     rrd: RrdOption = None,
     mcap: McapOption = None,
     figures: FiguresOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Estimate the trajectory of a whole recording. Several bags get a folder each in DIR."""
     if len(bags) > 1:
@@ -111,6 +114,7 @@ def smooth(
         return
     (bag,) = bags
     forms = figure_formats(figures)
+    spare_inputs(out, bag, map_file, config, force)
     result = _localize(bag, map_file, configured(bag, config, model), out, "batch")
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
@@ -125,10 +129,12 @@ def online(
     rrd: RrdOption = None,
     mcap: McapOption = None,
     figures: FiguresOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Replay a recording as on a live robot. Each pose depends only on what came before."""
     forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
+    spare_inputs(out, bag, map_file, config, force)
     result = _localize(bag, map_file, configured(bag, config, model), out, "online", pace)
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 

@@ -25,7 +25,7 @@ from fgloc.live import LivePose
 from fgloc.live.wire import node, play
 from fgloc.live.wire.node import Node, Teller
 from fgloc.live.wire.outputs import SPAN_S, OdomFrame, RecentPoses
-from fgloc.live.wire.participant import Participant
+from fgloc.live.wire.participant import Participant, Sample
 from fgloc.live.wire.play import Player
 from fgloc.recording.storage import Storage
 from fgloc.runner import run
@@ -370,3 +370,39 @@ def test_what_cannot_be_done_is_said_in_a_line(arguments, why):
     assert done.stderr.startswith("error: ")
     assert why in done.stderr
     assert os.linesep not in done.stderr.strip()
+
+
+@pytest.mark.parametrize(
+    ("x", "variance", "norm", "cut"),
+    [
+        (1e300, 1e-4, 1.0, 0),
+        (float("nan"), 1e-4, 1.0, 0),
+        (1.0, 1e300, 1.0, 0),
+        (1.0, 1e-4, 0.0, 0),
+        (1.0, 1e-4, 1.0, 9),
+    ],
+)
+def test_a_given_pose_of_any_content_is_refused_and_counted(x, variance, norm, cut):
+    with Session(Config()) as session, Participant(DOMAIN) as one:
+        variances = np.zeros((6, 6))
+        variances[[0, 1, 5], [0, 1, 5]] = variance
+        pose = {"position": {"x": x}, "orientation": {"w": norm}}
+        message = {"header": {"frame_id": "map"}, "pose": {"pose": pose, "covariance": variances.ravel()}}
+        cdr = one.messages.encode(POSE, message)
+        session.node._on_initial_pose(Sample("/initialpose", POSE, cdr[: len(cdr) - cut], 0))
+        assert session.node.refused["/initialpose"] == 1
+
+
+def test_text_that_is_no_text_in_a_given_pose_is_refused():
+    with Session(Config()) as session, Participant(DOMAIN) as one:
+        message = {"header": {"frame_id": "map"}, "pose": {"pose": {"orientation": {"w": 1.0}}}}
+        damaged = one.messages.encode(POSE, message).replace(b"map", b"\xff\xfe\xfd")
+        session.node._on_initial_pose(Sample("/initialpose", POSE, damaged, 0))
+        assert session.node.refused["/initialpose"] == 1
+
+
+def test_an_impossible_odometry_moves_no_frame():
+    frame = OdomFrame(Config().recording)
+    for position in ([1.0, 2.0, 0.0], [1e300, 0.0, 0.0], [np.nan, 0.0, 0.0]):
+        frame.add(TransformEvent(1, 1, "/tf", "odom", "base_link", np.array(position), np.array([0.0, 0, 0, 1]), False))
+    assert frame.latest().T_odom_base == pytest.approx([1.0, 2.0, 0.0])

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -176,6 +177,7 @@ class Node:
         live: the run; None until the topics that it needs are there.
         intake: what comes in.
         published: messages sent, by kind.
+        refused: messages of people that could not be used, by topic.
         watch: given every event that comes in, also a truth's.
     """
 
@@ -203,9 +205,10 @@ class Node:
         self._subscribers: list[Callable[[Estimate], None]] = [self._on_estimate]
         self._clock = WireClock(participant)
         self._outputs = Outputs(participant)
-        self._odom = OdomFrame(config.recording)
+        self._odom = OdomFrame(config.recording, config.gate.max_position)
         self.intake = Intake(participant, self._clock, config.recording, self._push)
         self.published: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
         self._messages = participant.messages
         self._failure: FglocError | None = None
         self._notes: list[str] = []  # to be told
@@ -292,19 +295,39 @@ class Node:
         self.published["pose"] += 1
 
     def _on_initial_pose(self, sample: Sample) -> None:
-        message = self._messages.decode(sample.message_type, sample.cdr)
-        frame = message.header.frame_id.lstrip("/")
-        if frame not in ("", MAP_FRAME):
-            self._notes.append(f"{_INITIAL_POSE} is in frame {frame!r}, expected {MAP_FRAME!r}: not used.")
+        """Take a pose that a person gave; one of any other content is counted and said, and the run goes on."""
+        try:
+            message = self._messages.decode(sample.message_type, sample.cdr)
+            frame = message.header.frame_id.lstrip("/")
+            if frame not in ("", MAP_FRAME):
+                raise ValueError(f"it is in frame {frame!r}, expected {MAP_FRAME!r}")
+            self._given = self._planar(message.pose)
+        except Exception as error:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
+            self.refused[_INITIAL_POSE] += 1
+            why = error if isinstance(error, ValueError) and not isinstance(error, UnicodeError) else "it is damaged"
+            self._notes.append(f"{_INITIAL_POSE} is not used: {why}.")
             return
-        pose, variances = message.pose.pose, np.asarray(message.pose.covariance)[[0, 7, 35]]
-        if not (variances > 0.0).all():
-            variances = np.square(self._config.estimator.initial_sigmas)
-        q = pose.orientation
-        yaw = quaternion_yaw((q.x, q.y, q.z, q.w))
-        self._given = (pose.position.x, pose.position.y, yaw), tuple(np.sqrt(variances).tolist())
         if self.live is not None:
             self._take_given(self.live)
+
+    def _planar(self, given: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Pose and sigmas of a message.
+
+        Raises:
+            ValueError: values that no pose in a map has.
+        """
+        q, variances = given.pose.orientation, np.asarray(given.covariance)[[0, 7, 35]]
+        if not (variances > 0.0).all():
+            variances = np.square(self._config.estimator.initial_sigmas)
+        pose = (given.pose.position.x, given.pose.position.y, quaternion_yaw((q.x, q.y, q.z, q.w)))
+        farthest, widest = self._config.gate.max_position, self._config.gate.max_variance
+        if not max(abs(pose[0]), abs(pose[1])) <= farthest:
+            raise ValueError(f"position {pose[0]:g}, {pose[1]:g} m, expected within {farthest:g} m")
+        if not variances.max() <= widest:
+            raise ValueError(f"a variance of {variances.max():g}, expected at most {widest:g}")
+        if not abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) <= 0.1:
+            raise ValueError("its quaternion is none of a rotation")
+        return pose, tuple(np.sqrt(variances).tolist())
 
     def _take_given(self, live: Live) -> None:
         """Go on from the pose that was given last, if one was."""
@@ -314,6 +337,7 @@ class Node:
         try:
             live.reset_pose(*given)
         except FglocError as error:
+            self.refused[_INITIAL_POSE] += 1
             self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
 
     def _take_notes(self) -> list[str]:
@@ -356,6 +380,7 @@ class Node:
     def _diagnose(self, status: LiveStatus | None) -> None:
         mode = None if status is None else status.mode
         message, values = described(status)
+        values |= {f"refused {topic}": str(n) for topic, n in self.refused.items()}
         wrong = status is not None and any(f.severity is Severity.ERROR for f in status.findings)
         self._outputs.diagnostics(self._clock.now_ns(), mode, message, values, wrong)
         self.published["diagnostics"] += 1

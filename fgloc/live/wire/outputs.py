@@ -30,12 +30,15 @@ class OdomPose:
     T_odom_base: FloatArray  # (3,)
 
 
+_MOST_FRAMES = 1000  # names that are kept: a robot has tens
+
+
 class OdomFrame:
     """Collects the robot's frames and its odometry from messages."""
 
-    def __init__(self, config: RecordingConfig) -> None:
-        """Start without messages."""
-        self._config = config
+    def __init__(self, config: RecordingConfig, farthest_m: float = 1e6) -> None:
+        """Start without messages; a pose further off than this, or none at all, is not taken."""
+        self._config, self._farthest_m = config, farthest_m
         self._lock = threading.Lock()
         self._frames: set[str] = set()
         self._child = ""  # of the odometry
@@ -45,7 +48,7 @@ class OdomFrame:
     def add(self, event: Event) -> None:
         """Add an event of any kind."""
         if isinstance(event, MotionEvent):
-            if (told := event.odometer) is None:
+            if (told := event.odometer) is None or not self._plausible(told.pose):
                 return
             with self._lock:
                 self._child = event.base_frame_id.lstrip("/")
@@ -53,9 +56,15 @@ class OdomFrame:
         elif isinstance(event, TransformEvent):
             parent, child = event.parent.lstrip("/"), event.child.lstrip("/")
             with self._lock:
-                self._frames.update((parent, child))
+                if len(self._frames) < _MOST_FRAMES:
+                    self._frames.update((parent, child))
                 if not event.static and child == self._base():
-                    self._by_tf = OdomPose(event.stamp_ns, parent, _planar(event.translation, event.rotation))
+                    pose = _planar(event.translation, event.rotation)
+                    if self._plausible(pose):
+                        self._by_tf = OdomPose(event.stamp_ns, parent, pose)
+
+    def _plausible(self, pose: FloatArray) -> bool:
+        return bool(np.isfinite(pose).all() and np.abs(pose[:2]).max() <= self._farthest_m)
 
     @property
     def base(self) -> str:
