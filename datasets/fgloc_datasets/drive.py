@@ -35,6 +35,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgloc.errors import ConfigError, RecordingError
+from fgloc.files.documents import check_regular
 from fgloc.files.outputs import write_text
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
@@ -43,6 +44,7 @@ from fgloc_datasets.convert import Message, new_bag, read_table, write_merged, w
 WHEEL_RADIUS_M = 0.1651
 TRACK_M = 0.5708
 _JOINTS = ("left_wheel", "right_wheel")
+_MOST_BYTES = 1 << 30  # of the windows: 3.5 MB
 _STEP_NS = 50_000_000
 _EPOCH_NS = 1_000_000_000 * 1_000_000_000
 _APART_NS = 100 * 1_000_000_000  # more than gate.clock_jump_s
@@ -137,6 +139,7 @@ def robot_settings() -> dict[str, Any]:
 
 def _read(source: Path) -> dict[str, FloatArray]:
     """Columns of the CSV file by name, ordered by window and row."""
+    check_regular(source, RecordingError, "give the CSV file of the windows", _MOST_BYTES)
     try:
         with source.open(encoding="utf-8", newline="") as file:
             names = next(csv.reader(file), [])

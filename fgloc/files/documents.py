@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import stat
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ _MAX_BYTES = 20_000_000
 _MAX_DEPTH = 64
 _FREE_VALUES = 100_000  # values that aliases may repeat, beside one for each character of the file
 _MAX_DIGITS = 40
+_OPENCV, _OPENCV_MATRIX = "%YAML:", "!!opencv-matrix"
 _TAG = "tag:yaml.org,2002:"
 
 
@@ -271,10 +273,36 @@ def read_text(path: Path, error: type[FglocError], remedy: str, max_bytes: int =
         raise error(f"{path}: not a text file: {cause}") from cause
 
 
+def nested(text: str, most: int = _MAX_DEPTH) -> bool:
+    """Whether brackets are nested deeper than this, as no reader has to bear; those in texts count too."""
+    depth = 0
+    for bracket in re.findall(r"[\[\]{}]", text):
+        depth += 1 if bracket in "[{" else -1
+        if depth > most:
+            return True
+    return False
+
+
+def check_regular(path: Path, error: type[FglocError], remedy: str, max_bytes: int) -> None:
+    """Find out before another reader opens a file whether it is a regular one, and not too large.
+
+    Raises:
+        FglocError: of the given type; it is not, or not there.
+    """
+    try:
+        state = path.stat()
+    except (OSError, ValueError) as cause:
+        raise error(f"{str(path)!r}: cannot be read ({cause}); {remedy}") from cause
+    if not stat.S_ISREG(state.st_mode):
+        raise error(f"{path}: not a regular file; {remedy}")
+    if state.st_size > max_bytes:
+        raise error(f"{path}: {state.st_size} bytes, expected less than {max_bytes}; is it the right file?")
+
+
 def read_document(
     path: Path, error: type[FglocError], max_bytes: int = _MAX_BYTES, remedy: str = "give a YAML or JSON file"
 ) -> Item:
-    """Read a YAML or JSON file.
+    """Read a YAML or JSON file, or one that OpenCV wrote: its head and its tags are no YAML, and are left out.
 
     Args:
         path: the file.
@@ -286,6 +314,9 @@ def read_document(
         FglocError: of the given type; the file is missing, no regular file, too large, empty, not YAML, or hostile.
     """
     text = read_text(path, error, remedy, max_bytes)
+    if text.startswith(_OPENCV) or _OPENCV_MATRIX in text:
+        text = text.removeprefix(text.partition("\n")[0] if text.startswith(_OPENCV) else "")
+        text = text.replace(_OPENCV_MATRIX, "")
     try:
         node = parse(text, str(path))
     except yaml.YAMLError as cause:

@@ -20,6 +20,7 @@ from fgloc.types import Camera, CameraInfoEvent, FloatArray, Landmark
 _FISHEYE = ("equidistant", "fisheye")
 _MODELS = ("plumb_bob", "radtan", "none", "rational_polynomial", *_FISHEYE)
 _UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+_LARGEST_PX = 100_000  # no camera has more on a side
 
 
 def camera_from_info(event: CameraInfoEvent, T_base_cam: FloatArray) -> Camera:
@@ -45,15 +46,10 @@ def load_camera(path: Path, T_base_cam: FloatArray, name: str | None = None) -> 
     Raises:
         CameraError: the file is none of these, or its calibration cannot be used.
     """
-    # FileStorage writes "%YAML:1.0" and "!!opencv-matrix", which YAML readers refuse.
-    try:
-        head = path.read_bytes()[:4096]
-    except OSError as error:
-        raise CameraError(f"{path}: cannot be read ({error.strerror}); give a calibration YAML file") from error
-    if head.startswith(b"%YAML:") or b"opencv-matrix" in head:
-        return _opencv(path, T_base_cam)
-    root = read_document(path, CameraError)
+    root = read_document(path, CameraError, remedy="give a calibration YAML file")
     keys = dict(root.pairs())
+    if "camera_matrix" in keys and "distortion_model" not in keys and "camera_name" not in keys:
+        return _opencv(path, root, T_base_cam)
     if "camera_matrix" in keys:
         return _ros(path, root, T_base_cam)
     cameras = {key: item for key, item in keys.items() if item.is_mapping and item.get("intrinsics") is not None}
@@ -144,25 +140,15 @@ def _ros(path: Path, root: Item, T_base_cam: FloatArray) -> Camera:
     return _checked(str(path), (width, height), "" if model is None else model.text(), K, D, T_base_cam, frame)
 
 
-def _opencv(path: Path, T_base_cam: FloatArray) -> Camera:
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        nodes = {
-            key: storage.getNode(key)
-            for key in ("camera_matrix", "distortion_coefficients", "image_width", "image_height", "fisheye_model")
-        }
-        K, D = (nodes[key].mat() for key in ("camera_matrix", "distortion_coefficients"))
-        width, height, fisheye = (
-            0 if nodes[key].empty() else int(nodes[key].real())
-            for key in ("image_width", "image_height", "fisheye_model")
-        )
-    except (cv2.error, SystemError) as error:
-        raise CameraError(f"{path}: not a calibration of OpenCV: {error}") from error
-    if K is None:
-        raise CameraError(f"{path}: no camera_matrix in it; expected a calibration file of OpenCV")
-    coefficients = np.zeros(0) if D is None else np.asarray(D, dtype=np.float64)
-    model = "fisheye" if fisheye else "plumb_bob"
-    return _checked(str(path), (width, height), model, np.asarray(K, dtype=np.float64), coefficients, T_base_cam, "")
+def _opencv(path: Path, root: Item, T_base_cam: FloatArray) -> Camera:
+    K = root.need("camera_matrix").need("data").numbers(9).reshape(3, 3)
+    distortion, fisheye = root.get("distortion_coefficients"), root.get("fisheye_model")
+    D = np.zeros(0) if distortion is None else distortion.need("data").numbers()
+    width, height = (
+        0 if item is None else round(item.number()) for item in map(root.get, ("image_width", "image_height"))
+    )
+    model = "fisheye" if fisheye is not None and fisheye.number() else "plumb_bob"
+    return _checked(str(path), (width, height), model, K, D, T_base_cam, "")
 
 
 def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: str | None) -> Camera:
@@ -195,6 +181,8 @@ def _checked(
     frame_id: str,
 ) -> Camera:
     matrix, coefficients = np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()
+    if not all(0 <= side <= _LARGEST_PX for side in size):
+        raise CameraError(f"{source}: an image of {size[0]}x{size[1]} pixels; expected 0 to {_LARGEST_PX} on a side")
     if not matrix.any():
         raise CameraError(f"{source}: the camera matrix K is all zeros: the camera is not calibrated; calibrate it")
     if not (np.isfinite(matrix).all() and np.isfinite(coefficients).all()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -148,3 +149,12 @@ def test_the_real_windows(tmp_path: Path) -> None:
     speeds = np.array([m.velocity for _, m in messages["/joint_states"]])
     assert abs(speeds).max() * WHEEL_RADIUS_M == pytest.approx(1.1, abs=0.1)  # the Husky's top speed: rad/s it is
     assert len((tmp_path / "windows.csv").read_text().splitlines()) == 101
+
+
+def test_a_pipe_or_a_sparse_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(8 << 30)
+    for source in (tmp_path / "pipe", tmp_path / "sparse", Path("/dev/zero")):
+        with pytest.raises(RecordingError):
+            convert(source, tmp_path / "out")

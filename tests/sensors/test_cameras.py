@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -194,7 +195,7 @@ def test_kalibr_camera_can_be_chosen(tmp_path: Path) -> None:
         (KALIBR.replace("pinhole", "omni", 1), r"camera.yaml:3.*'omni' is not supported"),
         ("a: 1", "expected camera_matrix"),
         ("", "empty"),
-        ("%YAML:1.0\n---\na: 1\n", "no camera_matrix"),
+        ("%YAML:1.0\n---\na: 1\n", "expected camera_matrix"),
         ("{", "not YAML"),
     ],
 )
@@ -216,3 +217,24 @@ def test_opencvs_own_calibrations_are_read() -> None:
     sizeless = load_camera(real_data("marker_images", "opencv_aruco", "tutorial_camera_params.yml"), T)
     assert sizeless.width == 0
     assert "no image size" in sizeless.notes[0]
+
+
+@pytest.mark.parametrize("head", ["", "%YAML:1.0\n---\n", "a: !!opencv-matrix\n"])
+def test_deep_nesting_ends_no_process(tmp_path: Path, head: str) -> None:
+    with pytest.raises(CameraError):
+        load_camera(written(tmp_path, head + "camera_matrix: " + "[" * 100_000), T)
+
+
+@pytest.mark.parametrize("width", [".Inf", ".NaN", "1e300", "-640."])
+def test_a_size_that_is_none_is_refused(tmp_path: Path, width: str) -> None:
+    with pytest.raises(CameraError):
+        load_camera(written(tmp_path, OPENCV.replace("image_width: 640", f"image_width: {width}")), T)
+
+
+def test_only_a_regular_file_of_some_size_is_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(8 << 30)
+    for path in (Path("/dev/zero"), tmp_path / "pipe", tmp_path / "sparse", tmp_path / "a\0b"):
+        with pytest.raises(CameraError):
+            load_camera(path, T)

@@ -19,7 +19,7 @@ from cv2.typing import MatLike
 from fgloc.config import Config, MarkersConfig
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_file
-from fgloc.files.documents import read_text
+from fgloc.files.documents import nested, read_text
 from fgloc.sensors.markers.edges import (
     ALL_WINDOWS,
     SMALLEST,
@@ -121,8 +121,10 @@ def load_dictionary(name: str) -> cv2.aruco.Dictionary:
     if Path(name).suffix.lower() not in _FILE_SUFFIXES:
         raise ConfigError(f"marker dictionary '{name}' is not known; known are {', '.join(known.values())}")
     dictionary = cv2.aruco.Dictionary()
+    text = read_text(Path(name), ConfigError, "give the name or the file of a marker dictionary", _MAX_BYTES)
+    if nested(text):  # OpenCV's reader would exhaust the stack
+        raise ConfigError(f"{name}: not a marker dictionary of OpenCV: brackets are nested too deeply")
     try:
-        text = read_text(Path(name), ConfigError, "give the name or the file of a marker dictionary", _MAX_BYTES)
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         good = storage.isOpened() and dictionary.readDictionary(storage.root())
         storage.release()
