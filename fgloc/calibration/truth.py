@@ -203,12 +203,8 @@ class _Fit:
 
     @property
     def noise(self) -> NoiseDensity:
-        """Noise densities of the wheels, by the factors found.
-
-        Errors that last longer than a window seem smaller than they are: a factor below 1 is replaced by its root.
-        """
-        logs = self._logs[:2]
-        of_way, of_yaw = np.exp(np.where(logs < 0.0, 0.5 * logs, logs)).tolist()
+        """Noise densities of the wheels, by the factors found."""
+        of_way, of_yaw = np.exp(self._logs[:2]).tolist()
         given = self._given.wheels.noise.model_dump()
         return NoiseDensity(
             **{k: float(f"{v * (of_yaw if k.startswith('yaw') else of_way):.3g}") for k, v in given.items()}

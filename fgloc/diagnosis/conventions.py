@@ -42,8 +42,9 @@ from fgloc.diagnosis.pairs import (
 )
 from fgloc.diagnosis.signals import Path, Sightings, Signals, in_order, turn_by
 from fgloc.frames import rotation_of, sensor_pose
+from fgloc.sensors.wheels.naming import goes_sideways
 from fgloc.sensors.wheels.sensor import settings_of
-from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
+from fgloc.types import ControlEvent, Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
 _LATE_SIGMAS = 4.0  # of a lag that is corrected: its sigma is the larger of two jackknives
@@ -155,6 +156,7 @@ def conventions(
         if (rates := signals.rates()) is not None:
             _gravity(found, rates[2], _unit(imu_up))
         return found
+    _sideways(found, signals)
     path = _angles(found, signals, path, imu_up)
     _commands(found, signals, path)
     by_odometry = _gyro_by_odometry(found, signals, path, imu_up)
@@ -185,6 +187,31 @@ def conventions(
                 severity = _refuted(figure, found.config.wheels.scale_sigma)
             found.add(code, text, lines, figure, severity)
     return found
+
+
+def _yaml(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+
+
+def _sideways(found: Conventions, signals: Signals) -> None:
+    """Motion to the side by odometry or commands, of a drive that cannot make it."""
+    drive = found.config.wheels.drive
+    if signals.source not in ("ticks", "command") or (drive is not None and drive.slides):
+        return
+    told: dict[str, list[tuple[float, ...]]] = {
+        "odometry": [row[4:6] for row in signals.odometry],
+        "commands": [(e.v, e.vy) for e in signals.motion if isinstance(e, ControlEvent)],
+    }
+    for name, rows in told.items():
+        share = goes_sideways(rows)
+        if share is not None:
+            kind = "two wheels" if drive is None else f"a drive of kind {drive.kind}"
+            text = (
+                f"By its {name} the robot goes sideways in {share:.0%} of its motion, which {kind} cannot: the wheels' "
+                "motion lacks it. Set wheels.drive to a kind that can (mecanum, omni, swerve; docs/drives.md)"
+            )
+            found.add("wheels.sideways", text, {}, Figure(share, 0.0), Severity.ERROR)
+            return
 
 
 def unit_of(scale: float) -> tuple[float, str] | None:

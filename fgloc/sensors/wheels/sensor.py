@@ -41,6 +41,7 @@ from fgloc.sensors.wheels.events import (
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
+from fgloc.sensors.wheels.naming import NamedDrive, name_drive
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
@@ -267,10 +268,17 @@ def _first_section(look: FirstLook) -> FirstSection:
     head = f"# Joints in the recording: {', '.join(names)}."
     if pair is not None and geometry is not None:
         return FirstSection((head, *_found(pair, geometry)))
+    drive = name_drive(joints, odometry, commands)
+    if drive is not None:
+        missing = (
+            f"the geometry of the drive: by its joints its kind is {drive.kind} ({drive.why}); fill in "
+            "wheels.drive, which is in the file as a comment (docs/drives.md)"
+        )
+        return FirstSection((head, *_drive_to_fill_in(drive)), (missing,))
     if pair is None:
         missing = (
             f"which joints are the wheels: {', '.join(names)}; give wheels.left_joint and wheels.right_joint, their "
-            "radii and the track"
+            "radii and the track, or wheels.drive (docs/drives.md) if it has another drive than two wheels"
         )
     else:
         missing = "radii and track of the wheels: measure them (wheels.left_radius, right_radius, track)"
@@ -289,6 +297,17 @@ def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
         f"  right_radius: {geometry.radius_m:.4g}",
         f"  track: {geometry.track_m:.4g}  # m, between the wheels' contact points",
         "  # scale_sigma: 0.01  # how far the radii may be off; fgloc calibrate finds by how much they are",
+    )
+
+
+def _drive_to_fill_in(drive: NamedDrive) -> tuple[str, ...]:
+    return (
+        f"# By its joints a drive of kind {drive.kind}: {drive.why}.",
+        "# Fill in to use them (with ticks_per_turn where positions are no radians; all keys: docs/drives.md):",
+        "# wheels:",
+        "#   drive:",
+        f"#     kind: {drive.kind}",
+        *(f"#     {line}" for line in drive.lines),
     )
 
 
