@@ -189,10 +189,6 @@ def conventions(
     return found
 
 
-def _yaml(value: Any) -> str:
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
-
-
 def _sideways(found: Conventions, signals: Signals) -> None:
     """Motion to the side by odometry or commands, of a drive that cannot make it."""
     drive = found.config.wheels.drive
